@@ -1,0 +1,1 @@
+"""Metal artefact reduction methods to compare with."""

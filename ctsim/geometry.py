@@ -1,0 +1,130 @@
+"""Cone-beam geometry: where source, detector pixels and voxels are.
+
+Right-handed x, y, z in mm with the origin at the isocentre; rotation about +z, counter-clockwise seen
+from +z. At view angle a the source is at dso·(cos a, sin a, 0), the detector's u axis is
+(−sin a, cos a, 0) and its v axis is +z; row 0 is at the bottom. Volumes are [z, y, x], projections
+[view, v, u]. This is the frame of TIGRE and LEAP.
+"""
+
+import math
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.errors import InputError
+
+Triple = tuple[float, float, float]
+Pair = tuple[float, float]
+Count = Annotated[int, msgspec.Meta(ge=1)]
+
+
+class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A scan's geometry: source and detector poses, detector pixels, and the reconstruction grid.
+
+    Lengths are mm. `n_voxel`, `d_voxel`, `off_origin` are (z, y, x); `n_detector`, `d_detector`,
+    `off_detector` are (v, u). Views lie at start_deg + k·arc_deg/n_views, or at `angles_deg`, or at
+    `poses` (one 12-vector a view: source, detector centre, u step, v step; each x, y, z in mm, the
+    steps one pixel long), which then replace dso, dsd and the offsets for the rays.
+    """
+
+    dso: float
+    dsd: float
+    n_voxel: tuple[Count, Count, Count]
+    d_voxel: Triple
+    n_detector: tuple[Count, Count]
+    d_detector: Pair
+    n_views: Count
+    off_origin: Triple = (0.0, 0.0, 0.0)
+    off_detector: Pair = (0.0, 0.0)
+    start_deg: float = 0.0
+    arc_deg: float = 360.0
+    angles_deg: tuple[float, ...] | None = None
+    poses: tuple[tuple[float, ...], ...] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("dso", "dsd", "d_voxel", "d_detector", "off_origin", "off_detector", "start_deg", "arc_deg"):
+            if not np.all(np.isfinite(getattr(self, name))):
+                raise InputError(f"{name} must be finite, got {getattr(self, name)}")
+        for name in ("n_voxel", "n_detector", "n_views"):
+            if np.min(getattr(self, name)) < 1:
+                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("d_voxel", "d_detector"):
+            if np.min(getattr(self, name)) <= 0:
+                raise InputError(f"{name} must be positive (mm), got {getattr(self, name)}")
+        if not 0 < self.dso < self.dsd:
+            raise InputError(f"expected 0 < dso < dsd (mm), got dso = {self.dso} and dsd = {self.dsd}")
+        if not 0 < abs(self.arc_deg) <= 360:
+            raise InputError(f"arc_deg must be within (0, 360] in magnitude, got {self.arc_deg}")
+        if self.angles_deg is not None and self.poses is not None:
+            raise InputError("give angles_deg or poses, not both")
+        for name in ("angles_deg", "poses"):
+            given = getattr(self, name)
+            if given is not None and len(given) != self.n_views:
+                raise InputError(f"{name} has {len(given)} entries but n_views is {self.n_views}")
+            if given is not None and not all(np.all(np.isfinite(row)) for row in given):
+                raise InputError(f"{name} must be finite")
+        if self.poses is not None and any(len(row) != 12 for row in self.poses):
+            raise InputError("every pose needs 12 numbers: source, detector centre, u step, v step (x, y, z each)")
+
+    @property
+    def angles(self) -> NDArray[np.float64]:
+        """View angles in radians, [view]."""
+        if self.angles_deg is not None:
+            return np.radians(np.asarray(self.angles_deg, np.float64))
+        return np.radians(self.start_deg + np.arange(self.n_views) * (self.arc_deg / self.n_views))
+
+    @property
+    def s_voxel(self) -> Triple:
+        """Extent of the reconstruction grid (z, y, x) in mm."""
+        z, y, x = (n * d for n, d in zip(self.n_voxel, self.d_voxel, strict=True))
+        return z, y, x
+
+    @property
+    def s_detector(self) -> Pair:
+        """Extent of the detector (v, u) in mm."""
+        v, u = (n * d for n, d in zip(self.n_detector, self.d_detector, strict=True))
+        return v, u
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape of the projections, (view, v, u)."""
+        return (self.n_views, *self.n_detector)
+
+    def pose_array(self) -> NDArray[np.float64]:
+        """Source, detector centre, u step and v step of each view: [view, 12], mm, x y z order.
+
+        Pixel (v, u) has its centre at centre + (u − (n_u−1)/2)·u_step + (v − (n_v−1)/2)·v_step.
+        """
+        if self.poses is not None:
+            return np.asarray(self.poses, np.float64)
+        a = self.angles
+        cos, sin, zero = np.cos(a), np.sin(a), np.zeros_like(a)
+        e_r = np.stack([cos, sin, zero], 1)
+        e_u = np.stack([-sin, cos, zero], 1)
+        e_v = np.stack([zero, zero, zero + 1], 1)
+        off_v, off_u = self.off_detector
+        d_v, d_u = self.d_detector
+        centre = -(self.dsd - self.dso) * e_r + off_u * e_u + off_v * e_v
+        return np.concatenate([self.dso * e_r, centre, d_u * e_u, d_v * e_v], 1)
+
+    def voxel_centres(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Coordinates of the voxel centres along z, y and x in mm."""
+        z, y, x = (
+            (np.arange(n) + 0.5 - n / 2) * d + o
+            for n, d, o in zip(self.n_voxel, self.d_voxel, self.off_origin, strict=True)
+        )
+        return z, y, x
+
+    @property
+    def fov_radius(self) -> float:
+        """Radius in mm of the cylinder about the axis that every view's fan covers (0 if none).
+
+        For a laterally offset detector over a full turn this is the covered half plus its mirror:
+        the larger of the two sides.
+        """
+        half, off = self.s_detector[1] / 2, self.off_detector[1]
+        full_turn = abs(self.arc_deg) >= 360 - 1e-9 and self.angles_deg is None
+        edge = half + abs(off) if full_turn else half - abs(off)
+        return self.dso * math.sin(math.atan(edge / self.dsd)) if edge > 0 else 0.0

@@ -1,0 +1,124 @@
+"""The values that travel down the street: Phantom, Scanner, Scan, Volume, Status."""
+
+import enum
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ctsim.detector import Detector
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry, Triple
+from ctsim.noise import Noise
+from ctsim.scatter import Scatter
+from ctsim.solids import Solid
+from ctsim.spectrum import Tube
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Phantom:
+    """What is scanned: a label volume, an optional density map, and analytic solids that replace it.
+
+    `labels` is uint8 [z, y, x]; label k is `materials[k]` and label 0 is always air, which does not
+    attenuate (the flat field is taken through air). `density` is relative to the material's nominal
+    density, float32 [z, y, x]. `d_voxel` and `off_origin` (z, y, x) are mm.
+    """
+
+    labels: NDArray[np.uint8]
+    materials: tuple[str, ...]
+    d_voxel: Triple
+    off_origin: Triple = (0.0, 0.0, 0.0)
+    density: NDArray[np.float32] | None = None
+    solids: tuple[Solid, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.labels.ndim != 3 or self.labels.dtype != np.uint8:
+            raise InputError(f"labels must be uint8 [z, y, x], got {self.labels.dtype} of shape {self.labels.shape}")
+        if not self.materials or self.materials[0] != "air":
+            raise InputError(f"materials[0] must be 'air', got {self.materials[:1]}")
+        if self.labels.size and int(self.labels.max()) >= len(self.materials):
+            raise InputError(f"label {int(self.labels.max())} has no material: only {len(self.materials)} are named")
+        if min(self.d_voxel) <= 0:
+            raise InputError(f"d_voxel must be positive (mm), got {self.d_voxel}")
+        if self.density is not None:
+            if self.density.shape != self.labels.shape:
+                raise InputError(f"density has shape {self.density.shape}, labels {self.labels.shape}")
+            if not np.isfinite(self.density).all() or self.density.min() < 0:
+                raise InputError("density must be finite and not negative")
+        for solid in self.solids:
+            if solid.material not in self.materials:
+                raise InputError(f"solid {solid.name!r}: material {solid.material!r} is not among {self.materials}")
+
+    def without_metal(self) -> "Phantom":
+        """Return the same body with its metal inserts taken out."""
+        kept = tuple(s for s in self.solids if not s.metal)
+        return Phantom(
+            labels=self.labels,
+            materials=self.materials,
+            d_voxel=self.d_voxel,
+            off_origin=self.off_origin,
+            density=self.density,
+            solids=kept,
+        )
+
+
+class Scanner(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Everything about the machine: geometry, tube, detector, dose, noise and scatter.
+
+    `i0` is the number of photons that reach an open pixel in one view.
+    """
+
+    geometry: Geometry
+    tube: Tube = Tube()
+    detector: Detector = Detector()
+    i0: Annotated[float, msgspec.Meta(gt=0, le=1e12)] = 1e5
+    noise: Noise = Noise()
+    scatter: Scatter = Scatter()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scan:
+    """All that a reconstruction method gets.
+
+    `counts` [view, v, u] is what the detector wrote (uint16 where there is an ADC, else float32);
+    `flat` [v, u] float32 is the open-field image and `dark` the pedestal, both in counts. `e_max` is
+    the highest photon energy (keV); `i0` the photons per open pixel and view.
+    """
+
+    geometry: Geometry
+    counts: torch.Tensor
+    flat: torch.Tensor
+    dark: float = 0.0
+    i0: float = 1e5
+    e_max: float = 90.0
+
+    def __post_init__(self) -> None:
+        if tuple(self.counts.shape) != self.geometry.shape:
+            raise InputError(f"counts have shape {tuple(self.counts.shape)}, the geometry says {self.geometry.shape}")
+        if tuple(self.flat.shape) != self.geometry.n_detector:
+            raise InputError(f"flat has shape {tuple(self.flat.shape)}, the detector {self.geometry.n_detector}")
+
+
+class Status(enum.StrEnum):
+    """How a run ended."""
+
+    OK = "ok"
+    SKIPPED = "skipped"
+    NONFINITE = "nonfinite"
+    DIVERGED = "diverged"
+    OUT_OF_MEMORY = "out_of_memory"
+    TIMEOUT = "timeout"
+    ERROR = "error"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Volume:
+    """A reconstruction: `values` float32 [z, y, x] in 1/mm on the geometry's grid, and how it ended."""
+
+    values: torch.Tensor
+    status: Status = Status.OK
+    reason: str = ""
+    details: dict[str, Any] = field(default_factory=dict)

@@ -1,0 +1,1 @@
+"""Scene recipes: procedural bodies, inserts, and the scanners that scan them."""
