@@ -1,0 +1,245 @@
+"""What things are made of, and how they attenuate.
+
+A material is a composition and a density. Attenuation comes from xraylib's `CS_Total` (photoelectric,
+Compton and Rayleigh); `CS_Energy` is never used, it is wrong by up to 37 %. Energies are keV, lengths
+mm, densities g/cm3.
+"""
+
+import difflib
+import functools
+import math
+import re
+from collections.abc import Iterable
+from types import ModuleType
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctsim.errors import InputError
+
+E_MIN, E_MAX = 1.0, 800.0  # the energies (keV) where the tables of every element hold
+_ELECTRON_REST = 510.998950  # keV
+_HC = 12.3984198  # keV·Å
+
+# Compositions in percent by weight, densities in g/cm3. Tissues: ICRU Report 44 (1989), lung inflated.
+# Compounds and elements: NIST, physics.nist.gov/PhysRefData/XrayMassCoef. Enamel and dentin: 95 and 70 %
+# hydroxyapatite, 4 and 10 % water, the rest collagen. Alloys: nominal ASTM F75, AISI 316L and 6061.
+_TABLE: dict[str, tuple[str, float]] = {
+    "air": ("C 0.0124 N 75.5268 O 23.1781 Ar 1.2827", 1.20479e-3),
+    "water": ("H2O", 1.0),
+    "soft_tissue": ("H 10.2 C 14.3 N 3.4 O 70.8 Na 0.2 P 0.3 S 0.3 Cl 0.2 K 0.3", 1.06),
+    "lung": ("H 10.3 C 10.5 N 3.1 O 74.9 Na 0.2 P 0.2 S 0.3 Cl 0.3 K 0.2", 0.26),
+    "adipose": ("H 11.4 C 59.8 N 0.7 O 27.8 Na 0.1 S 0.1 Cl 0.1", 0.95),
+    "muscle": ("H 10.2 C 14.3 N 3.4 O 71.0 Na 0.1 P 0.2 S 0.3 Cl 0.1 K 0.4", 1.05),
+    "brain": ("H 10.7 C 14.5 N 2.2 O 71.2 Na 0.2 P 0.4 S 0.2 Cl 0.3 K 0.3", 1.04),
+    "blood": ("H 10.2 C 11.0 N 3.3 O 74.5 Na 0.1 P 0.1 S 0.2 Cl 0.3 K 0.2 Fe 0.1", 1.06),
+    "cortical_bone": ("H 3.4 C 15.5 N 4.2 O 43.5 Na 0.1 Mg 0.2 P 10.3 S 0.3 Ca 22.5", 1.92),
+    "enamel": ("H 0.7 C 0.5 N 0.2 O 43.1 P 17.6 Ca 37.9", 2.96),
+    "dentin": ("H 2.7 C 10.2 N 3.4 O 42.9 P 12.9 Ca 27.9", 2.14),
+    "PLA": ("C3H4O2", 1.24),
+    "PMMA": ("C5H8O2", 1.18),
+    "PE": ("CH2", 0.93),
+    "cellulose": ("C6H10O5", 1.5),
+    "glass": ("O 45.98 Na 9.64 Si 33.66 Ca 10.72", 2.40),
+    "Al": ("Al", 2.699),
+    "Al6061": ("Al 97.9 Mg 1.0 Si 0.6 Cu 0.3 Cr 0.2", 2.70),
+    "Ti": ("Ti", 4.506),
+    "Fe": ("Fe", 7.874),
+    "Cu": ("Cu", 8.96),
+    "Sn": ("Sn", 7.31),
+    "W": ("W", 19.3),
+    "Au": ("Au", 19.32),
+    "CoCr": ("Co 64.0 Cr 28.5 Mo 6.0 Si 0.7 Mn 0.5 Fe 0.3", 8.30),
+    "steel": ("Fe 65.5 Cr 17.0 Ni 12.0 Mo 2.5 Mn 2.0 Si 1.0", 7.99),
+    "GOS": ("Gd2O2S", 7.34),
+    "CsI": ("CsI", 4.51),
+}
+_BY_WEIGHT = re.compile(r"[A-Z][a-z]?\s+[0-9.]+(\s+[A-Z][a-z]?\s+[0-9.]+)*")
+
+
+class Material(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A composition and a density (g/cm3).
+
+    `formula` is chemical ("Gd2O2S") or lists symbols and weights ("H 11.2 O 88.8"), which are normalised.
+    """
+
+    name: str
+    formula: str
+    density: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.density) and 0 < self.density < 100):
+            raise InputError(f"material {self.name!r}: density must be within (0, 100) g/cm3, got {self.density}")
+        _mass_fractions(self.formula)
+
+    @property
+    def mass_fractions(self) -> dict[int, float]:
+        """Atomic number to mass fraction; the fractions sum to 1."""
+        return dict(_mass_fractions(self.formula))
+
+
+def _xraylib() -> ModuleType:
+    """Load xraylib at first use, so that importing ctsim stays light."""
+    import xraylib
+
+    return xraylib
+
+
+@functools.lru_cache(maxsize=256)
+def _mass_fractions(formula: str) -> tuple[tuple[int, float], ...]:
+    xrl = _xraylib()
+    try:
+        if _BY_WEIGHT.fullmatch(formula):
+            words = formula.split()
+            pairs = [(xrl.SymbolToAtomicNumber(s), float(w)) for s, w in zip(words[::2], words[1::2], strict=True)]
+        else:
+            parsed = xrl.CompoundParser(formula)
+            pairs = list(zip(parsed["Elements"], parsed["massFractions"], strict=True))
+        total = sum(w for _, w in pairs)
+        if not total > 0:
+            raise ValueError("weights must be positive")
+    except ValueError as error:
+        raise InputError(
+            f"formula {formula!r} cannot be read ({error}); expected one like 'NaI' or 'H 11.2 O 88.8'"
+        ) from None
+    return tuple((int(z), w / total) for z, w in pairs)
+
+
+def names() -> tuple[str, ...]:
+    """Return the names that `material` knows."""
+    return tuple(_TABLE)
+
+
+@functools.lru_cache(maxsize=256)
+def material(name: str) -> Material:
+    """Look a material up by name, or build one from "formula@density" ("NaI@3.67").
+
+    Raises InputError naming near matches where the name is unknown.
+    """
+    if name in _TABLE:
+        formula, density = _TABLE[name]
+        return Material(name=name, formula=formula, density=density)
+    formula, at, density_text = name.partition("@")
+    if at:
+        try:
+            density = float(density_text)
+        except ValueError:
+            raise InputError(f"material {name!r}: expected formula@density with a density in g/cm3") from None
+        return Material(name=name, formula=formula, density=density)
+    lower = {known.lower(): known for known in _TABLE}
+    near = [lower[k] for k in difflib.get_close_matches(name.lower(), lower, n=3, cutoff=0.5)]
+    hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(_TABLE)}"
+    raise InputError(f"unknown material {name!r}: {hint} (or give a formula and density, 'NaI@3.67')")
+
+
+def _as_material(which: str | Material) -> Material:
+    return which if isinstance(which, Material) else material(which)
+
+
+def _as_energies(energies: ArrayLike) -> NDArray[np.float64]:
+    e = np.ascontiguousarray(np.atleast_1d(np.asarray(energies, dtype=np.float64)))
+    if e.ndim != 1:
+        raise InputError(f"energies must be one-dimensional, got shape {e.shape}")
+    if e.size and not (np.all(np.isfinite(e)) and e.min() >= E_MIN and e.max() <= E_MAX):
+        raise InputError(f"energies must be within [{E_MIN}, {E_MAX}] keV, got {e.min()} to {e.max()}")
+    return e
+
+
+@functools.lru_cache(maxsize=1024)
+def _per_element(function: str, z: int, energies: bytes) -> NDArray[np.float64]:
+    """Evaluate one xraylib function of (Z, E) at energies packed as float64; cached, read-only."""
+    call: Any = getattr(_xraylib(), function)
+    out = np.array([call(z, e) for e in np.frombuffer(energies).tolist()])
+    out.flags.writeable = False
+    return out
+
+
+def _mixture(which: Material, function: str, energies: NDArray[np.float64]) -> NDArray[np.float64]:
+    key = energies.tobytes()
+    out = np.zeros(energies.size)
+    for z, w in _mass_fractions(which.formula):
+        out += w * _per_element(function, z, key)
+    return out
+
+
+def mass_attenuation(which: str | Material, energies: ArrayLike) -> NDArray[np.float64]:
+    """Return μ/ρ (cm2/g) at `energies` [n] keV, coherent scatter included; within 0.1 % of NIST."""
+    return _mixture(_as_material(which), "CS_Total", _as_energies(energies))
+
+
+def attenuation(which: str | Material, energies: ArrayLike) -> NDArray[np.float64]:
+    """Return the linear attenuation coefficient (1/mm) [n] at `energies` [n] keV, coherent scatter included."""
+    m = _as_material(which)
+    return 0.1 * m.density * mass_attenuation(m, energies)
+
+
+def k_edges(which: Iterable[str | Material], e_min: float, e_max: float) -> tuple[float, ...]:
+    """Return the K-edges (keV) of all elements of the materials that lie inside (e_min, e_max), ascending."""
+    xrl = _xraylib()
+    elements = {z for w in which for z, _ in _mass_fractions(_as_material(w).formula)}
+    edges = {float(xrl.EdgeEnergy(z, xrl.K_SHELL)) for z in elements}
+    return tuple(sorted(e for e in edges if e_min < e < e_max))
+
+
+@functools.lru_cache(maxsize=256)
+def _compton_transfer_share(z: int, energies: bytes) -> NDArray[np.float64]:
+    """Mean share of the photon's energy that a Compton collision gives to the electron.
+
+    Klein–Nishina times the incoherent scattering function, which takes the forward directions away.
+    """
+    scatter_function: Any = _xraylib().SF_Compt
+    e = np.frombuffer(energies)[:, None]
+    mu, w = np.polynomial.legendre.leggauss(24)
+    ratio = 1 / (1 + (e / _ELECTRON_REST) * (1 - mu))
+    q = e / _HC * np.sqrt((1 - mu) / 2)
+    bound = np.array([scatter_function(z, v) for v in q.ravel().tolist()]).reshape(q.shape)
+    density = ratio**2 * (ratio + 1 / ratio - 1 + mu**2) * w * bound
+    return (density * (1 - ratio)).sum(1) / density.sum(1)
+
+
+@functools.lru_cache(maxsize=512)
+def _fluorescence(z: int) -> tuple[float, float]:
+    """K-edge (keV) and mean fluorescence energy emitted per K vacancy (keV); 0 where xraylib has none."""
+    xrl = _xraylib()
+    try:
+        edge, fluorescence_yield = xrl.EdgeEnergy(z, xrl.K_SHELL), xrl.FluorYield(z, xrl.K_SHELL)
+        mean = sum(
+            xrl.RadRate(z, line) * xrl.LineEnergy(z, line) for line in (xrl.KA_LINE, xrl.KB_LINE) if _has_line(z, line)
+        )
+    except ValueError:  # no such shell
+        return 0.0, 0.0
+    return float(edge), float(fluorescence_yield * mean)
+
+
+def _has_line(z: int, line: int) -> bool:
+    xrl = _xraylib()
+    try:
+        return bool(xrl.RadRate(z, line) > 0 and xrl.LineEnergy(z, line) > 0)
+    except ValueError:
+        return False
+
+
+def mass_energy_transfer(which: str | Material, energies: ArrayLike) -> NDArray[np.float64]:
+    """Return μ_tr/ρ (cm2/g) [n]: photoelectric less K fluorescence, plus Compton's share to the electron.
+
+    Within 0.5 % of NIST's μ_en/ρ for light materials at 10–150 keV, where bremsstrahlung is negligible.
+    """
+    xrl = _xraylib()
+    m, e = _as_material(which), _as_energies(energies)
+    out = np.zeros(e.size)
+    key = e.tobytes()
+    for z, w in _mass_fractions(m.formula):
+        edge, emitted = _fluorescence(z)
+        kept = np.ones(e.size)
+        if emitted > 0:
+            try:
+                jump = xrl.JumpFactor(z, xrl.K_SHELL)
+            except ValueError:
+                jump = 1.0
+            above = e > edge
+            kept[above] -= (1 - 1 / jump) * emitted / e[above]
+        compton = _per_element("CS_Compt", z, key) * _compton_transfer_share(z, key)
+        out += w * (_per_element("CS_Photo", z, key) * kept + compton)
+    return out
