@@ -1,0 +1,112 @@
+"""What every recipe shares, and the recipes that consist of analytic solids only."""
+
+import math
+from collections.abc import Sequence
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from ctsim.errors import InputError
+from ctsim.geometry import Triple
+from ctsim.solids import FRUSTUM, Primitive, Solid, Vector
+from ctsim.types import Phantom
+
+Shape = tuple[int, int, int]
+Millimetres = Annotated[float, msgspec.Meta(gt=0, le=2000)]
+Side = Annotated[int, msgspec.Meta(ge=1, le=2048)]
+Inserts = Annotated[int, msgspec.Meta(ge=0, le=16)]
+
+
+class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="recipe"):
+    """Settings common to all recipes.
+
+    `size` is the edge of the object's cube in mm; the object stays inside 92 % of it. `n_voxel`
+    (z, y, x) is the label grid over that cube: it sets how finely the body is drawn, never its shape.
+    `metal` names the inserts' material, or "none"; `n_inserts` and `insert_mm` (diameter) override
+    the recipe's own number and size.
+    """
+
+    n_voxel: tuple[Side, Side, Side] = (96, 96, 96)
+    size: Millimetres = 60.0
+    metal: str = "Fe"
+    n_inserts: Inserts | None = None
+    insert_mm: Millimetres | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.size) and 0 < self.size <= 2000):
+            raise InputError(f"size must be within (0, 2000] mm, got {self.size}")
+        if not all(1 <= n <= 2048 for n in self.n_voxel):
+            raise InputError(f"n_voxel must be within 1 to 2048 along every axis, got {self.n_voxel}")
+        if self.n_inserts is not None and not 0 <= self.n_inserts <= 16:
+            raise InputError(f"n_inserts must be 0 to 16, got {self.n_inserts}")
+        if self.insert_mm is not None and not 0 < self.insert_mm <= 0.25 * self.size:
+            raise InputError(f"insert_mm must be positive and at most a quarter of size {self.size}: {self.insert_mm}")
+        if self.metal != "none":
+            from ctsim.materials import material
+
+            material(self.metal)
+
+    @property
+    def recipe(self) -> str:
+        """The recipe's name in scene files."""
+        return str(type(self).__struct_config__.tag)
+
+    @property
+    def d_voxel(self) -> Triple:
+        """Voxel size of the label grid (z, y, x) in mm."""
+        z, y, x = (self.size / n for n in self.n_voxel)
+        return z, y, x
+
+
+def half_box(n: Shape, d_voxel: Triple) -> float:
+    """Half the shortest edge of the grid in mm: the unit that recipes are drawn in."""
+    return min(k * d for k, d in zip(n, d_voxel, strict=True)) / 2
+
+
+def assemble(
+    labels: np.ndarray, d_voxel: Triple, materials: Sequence[str], solids: Sequence[Solid]
+) -> Phantom:
+    """Make a phantom, adding the solids' materials to the table."""
+    names = list(materials)
+    for solid in solids:
+        if solid.material not in names:
+            names.append(solid.material)
+    return Phantom(labels=labels, materials=tuple(names), d_voxel=d_voxel, solids=tuple(solids))
+
+
+def upright(name: str, material: str, centre: Vector, size: tuple[float, float], *, metal: bool = False) -> Solid:
+    """Return a cylinder along z; `size` is (radius, half height) in mm."""
+    radius, half = size
+    return Solid(
+        name=name,
+        material=material,
+        metal=metal,
+        primitives=(Primitive(kind=FRUSTUM, centre=centre, params=(half, radius, radius)),),
+    )
+
+
+class Validation(Recipe, frozen=True, kw_only=True, tag="validation"):
+    """Three rods in a water cylinder of 55/60 of the cube; rods of 5, 6 and 8 mm at 60 mm."""
+
+    metal: str = "Al"
+
+
+def validation(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Validation) -> Phantom:
+    """Three rods in a water cylinder (diameter 55 mm in a 60 mm cube), all analytic; labels are air.
+
+    The layout is fixed: with the seed only its angle turns (seed-dependent, so that no rod pair
+    aligns with the first view by construction).
+    """
+    unit = half_box(n, d_voxel)
+    half = 0.9 * unit
+    solids = [upright("water", "water", (0.0, 0.0, 0.0), (55 / 60 * unit, half))]
+    turn = rng.uniform(0, 2 * math.pi)
+    if params.metal != "none":
+        count = 3 if params.n_inserts is None else params.n_inserts
+        for k in range(count):
+            angle = turn + 2 * math.pi * k / count
+            diameter = params.insert_mm or (5.0, 6.0, 8.0)[k % 3] * unit / 30
+            centre = (0.5 * unit * math.cos(angle), 0.5 * unit * math.sin(angle), 0.0)
+            solids.append(upright(f"rod{k}", params.metal, centre, (diameter / 2, 0.85 * unit), metal=True))
+    return assemble(np.zeros(n, np.uint8), d_voxel, ("air",), solids)

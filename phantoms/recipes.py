@@ -1,0 +1,34 @@
+"""The table of recipes: settings type → function that builds the phantom.
+
+Every function is `(n (z, y, x), d_voxel (mm), rng, params) -> Phantom`, seeded and independent of the
+grid: shapes are drawn in units of the box, so 64³ and 256³ show the same object.
+"""
+
+import hashlib
+
+import numpy as np
+
+from ctsim.errors import InputError
+from ctsim.types import Phantom
+from phantoms.bodies import Recipe, Validation, validation
+
+AnyRecipe = Validation
+
+BUILDERS = {Validation: validation}
+
+NAMES = tuple(str(kind.__struct_config__.tag) for kind in BUILDERS)
+
+
+def build_recipe(params: Recipe, seed: int) -> Phantom:
+    """Build the phantom of a recipe; the same settings and seed give the same phantom.
+
+    Raises `InputError` when nothing is left to scan.
+    """
+    digest = hashlib.sha256(f"{params.recipe}/{seed}".encode()).digest()
+    rng = np.random.default_rng(np.frombuffer(digest, np.uint32))
+    phantom = BUILDERS[type(params)](params.n_voxel, params.d_voxel, rng, params)
+    if not phantom.labels.any() and not phantom.solids:
+        raise InputError(
+            f"recipe {params.recipe!r}: the scene is empty at n_voxel = {params.n_voxel}; expected a finer grid"
+        )
+    return phantom

@@ -1,0 +1,158 @@
+"""Scanner presets, and the scanner table of a scene file.
+
+Distances are those of machines one can buy, rounded; the panel is binned so that the asked number of
+pixels covers the object's shadow, as an operator would choose the binning and the collimation.
+"""
+
+import math
+from typing import Annotated, Literal, NamedTuple
+
+import msgspec
+
+from ctsim.detector import Detector
+from ctsim.errors import InputError
+from ctsim.geometry import Count, Geometry, Pair, Triple
+from ctsim.noise import Noise
+from ctsim.scatter import Scatter
+from ctsim.spectrum import Filter, Tube
+from ctsim.types import Scanner
+
+REACH = 0.92
+"""Every object stays within this share of its cube: radius and half height are REACH·size/2."""
+
+MARGIN = 1.06  # air beside the object's shadow, so that filters and flat-field checks see open pixels
+
+
+class Machine(NamedTuple):
+    """Fixed properties of a machine: distances and panel (v, u) in mm, arc, tube and detector."""
+
+    dso: float
+    dsd: float
+    panel: Pair
+    arc_deg: float
+    tube: Tube
+    detector: Detector
+
+
+MACHINES: dict[str, Machine] = {
+    # desktop micro-CT: half-metre source to panel, 3072 x 1944 pixels of 75 um, GOS screen
+    "skyscan1273": Machine(
+        250.0, 500.0, (146.0, 230.0), 360.0,
+        Tube(kvp=90.0, filters=(Filter(material="Al", thickness=0.5),)),
+        Detector(kind="gos", thickness=0.1),
+    ),
+    # seated dental cone-beam unit, full turn
+    "dental": Machine(
+        430.0, 690.0, (250.0, 300.0), 360.0,
+        Tube(kvp=90.0, filters=(Filter(material="Al", thickness=2.5),)),
+        Detector(kind="csi", thickness=0.5),
+    ),
+    # interventional C-arm: 200 degree short scan, 30 x 40 cm panel
+    "c-arm": Machine(
+        785.0, 1200.0, (300.0, 400.0), 200.0,
+        Tube(kvp=100.0, filters=(Filter(material="Al", thickness=2.5), Filter(material="Cu", thickness=0.1))),
+        Detector(kind="csi", thickness=0.6),
+    ),
+}  # fmt: skip
+
+
+def shadow(dso: float, dsd: float, object_mm: float) -> Pair:
+    """Return the extent (v, u) in mm of the shadow of the largest object of a cube of `object_mm`."""
+    radius = REACH * object_mm / 2
+    if radius >= dso:
+        raise InputError(f"the source lies inside the object: dso = {dso} mm, the object's radius is {radius:.4g} mm")
+    return 2 * radius * dsd / (dso - radius), 2 * dsd * math.tan(math.asin(radius / dso))
+
+
+def preset(
+    name: str,
+    n_views: int,
+    n_detector: tuple[int, int],
+    n_voxel: tuple[int, int, int],
+    object_mm: float,
+) -> Scanner:
+    """Return a preset scanner whose square pixels and voxels cover a cube of `object_mm`.
+
+    Raises `InputError` for an unknown name and for an object that the panel cannot cover.
+    """
+    if name not in MACHINES:
+        raise InputError(f"unknown scanner preset {name!r}: expected one of {', '.join(MACHINES)}")
+    if not (math.isfinite(object_mm) and object_mm > 0):
+        raise InputError(f"object_mm must be positive (mm), got {object_mm}")
+    if min(*n_detector, *n_voxel, n_views) < 1:
+        raise InputError(f"n_views, n_detector and n_voxel must be at least 1, got {n_views}, {n_detector}, {n_voxel}")
+    machine = MACHINES[name]
+    need = [s * MARGIN for s in shadow(machine.dso, machine.dsd, object_mm)]
+    if need[0] > machine.panel[0] or need[1] > machine.panel[1]:
+        raise InputError(
+            f"preset {name!r}: an object of {object_mm} mm needs {need[0]:.0f} x {need[1]:.0f} mm of panel (v, u), "
+            f"the machine has {machine.panel[0]:.0f} x {machine.panel[1]:.0f}"
+        )
+    pixel = max(s / n for s, n in zip(need, n_detector, strict=True))
+    z, y, x = (object_mm / n for n in n_voxel)
+    geometry = Geometry(
+        dso=machine.dso,
+        dsd=machine.dsd,
+        n_voxel=n_voxel,
+        d_voxel=(z, y, x),
+        n_detector=n_detector,
+        d_detector=(pixel, pixel),
+        n_views=n_views,
+        arc_deg=machine.arc_deg,
+    )
+    return Scanner(geometry=geometry, tube=machine.tube, detector=machine.detector)
+
+
+class ScannerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The scanner table of a scene: a preset with overrides, or a full `geometry`.
+
+    With a `geometry`, the keys that shape one (n_views … off_origin) must be left out. `field_mm` is
+    the edge of the reconstructed cube, by default the object's. `tube`, `detector`, `noise`,
+    `scatter` and `i0` replace the preset's.
+    """
+
+    preset: Literal["skyscan1273", "dental", "c-arm"] = "skyscan1273"
+    n_views: Count | None = None
+    n_detector: tuple[Count, Count] | None = None
+    n_voxel: tuple[Count, Count, Count] | None = None
+    field_mm: Annotated[float, msgspec.Meta(gt=0)] | None = None
+    start_deg: float | None = None
+    arc_deg: float | None = None
+    angles_deg: tuple[float, ...] | None = None
+    off_detector: Pair | None = None
+    off_origin: Triple | None = None
+    geometry: Geometry | None = None
+    tube: Tube | None = None
+    detector: Detector | None = None
+    noise: Noise | None = None
+    scatter: Scatter | None = None
+    i0: Annotated[float, msgspec.Meta(gt=0, le=1e12)] | None = None
+
+    def __post_init__(self) -> None:
+        if self.field_mm is not None and not (math.isfinite(self.field_mm) and self.field_mm > 0):
+            raise InputError(f"field_mm must be positive (mm), got {self.field_mm}")
+        if self.geometry is not None and (given := [k for k in SHAPING if getattr(self, k) is not None]):
+            raise InputError(f"geometry is given in full, so {', '.join(given)} must be left out")
+
+    def resolve(self, object_mm: float) -> Scanner:
+        """Return the scanner for an object of a cube of `object_mm`."""
+        n_voxel = self.n_voxel or (64, 64, 64)
+        if self.geometry is None:
+            scanner = preset(self.preset, self.n_views or 60, self.n_detector or (96, 96), n_voxel, object_mm)
+            names = ("start_deg", "arc_deg", "angles_deg", "off_detector", "off_origin")
+            changes = {k: getattr(self, k) for k in names if getattr(self, k) is not None}
+            if self.field_mm is not None:
+                changes["d_voxel"] = tuple(self.field_mm / n for n in n_voxel)
+            if self.angles_deg is not None and self.n_views is None:
+                changes["n_views"] = len(self.angles_deg)
+            scanner = msgspec.structs.replace(scanner, geometry=msgspec.structs.replace(scanner.geometry, **changes))
+        else:
+            machine = MACHINES[self.preset]
+            scanner = Scanner(geometry=self.geometry, tube=machine.tube, detector=machine.detector)
+        parts = {k: getattr(self, k) for k in ("tube", "detector", "noise", "scatter", "i0")}
+        return msgspec.structs.replace(scanner, **{k: v for k, v in parts.items() if v is not None})
+
+
+SHAPING = (
+    "n_views", "n_detector", "n_voxel", "field_mm", "start_deg", "arc_deg", "angles_deg", "off_detector", "off_origin",
+)  # fmt: skip

@@ -1,0 +1,223 @@
+"""Scenes: pure recipes of a scan, read from TOML, hashed to an id, built into a phantom."""
+
+import hashlib
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+from ctsim.settings import Simulation
+from ctsim.types import Phantom, Scanner
+from phantoms.recipes import AnyRecipe, build_recipe
+from phantoms.scanners import REACH, ScannerSettings
+
+NULL = "null"  # how a scene file says None, which TOML lacks, where None is not the default
+
+
+class Truth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Which ground truths are written beside the counts; each costs time and disk.
+
+    `twin`: the metal-free scan with the same noise streams; `mono_kev`: energies (keV) of
+    monochromatic line integrals; `trace`: metal trace; `metal_path`: metal path length (mm);
+    `paths`: path length of every material (mm).
+    """
+
+    twin: bool = True
+    noise_free: bool = False
+    scatter_free: bool = False
+    mono_kev: tuple[float, ...] = ()
+    trace: bool = False
+    metal_path: bool = False
+    paths: bool = False
+
+    def __post_init__(self) -> None:
+        if not all(1.0 <= e <= 500.0 for e in self.mono_kev):
+            raise InputError(f"mono_kev must be within 1 to 500 keV, got {self.mono_kev}")
+
+
+class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A scene: what is scanned, by which scanner, and what is written.
+
+    `truncated = true` allows an object that reaches out of the field of view.
+    """
+
+    name: str
+    phantom: AnyRecipe
+    scanner: ScannerSettings = ScannerSettings()
+    seed: Annotated[int, msgspec.Meta(ge=0, lt=2**63)] = 0
+    truncated: bool = False
+    truth: Truth = Truth()
+    simulation: Simulation = Simulation()
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", self.name):
+            raise InputError(f"name must be letters, digits, '.', '_', '-' (it names a folder), got {self.name!r}")
+        if not 0 <= self.seed < 2**63:
+            raise InputError(f"seed must be within 0 to 2^63 - 1, got {self.seed}")
+        check_geometry(self.resolve().geometry, self.phantom.size, self.truncated)
+
+    def resolve(self) -> Scanner:
+        """Return the scanner with the preset and its overrides worked out."""
+        return self.scanner.resolve(self.phantom.size)
+
+
+def build(scene: Scene) -> Phantom:
+    """Build the scene's phantom, the same for the same recipe and seed."""
+    return build_recipe(scene.phantom, scene.seed)
+
+
+def scene_id(scene: Scene) -> str:
+    """Return 12 hexadecimal digits of the SHA-256 of everything the scene says."""
+    return _digest(msgspec.to_builtins(scene))
+
+
+def stream_id(scene: Scene) -> str:
+    """Return the key of the scene's noise streams: its id without `truth` and `simulation`.
+
+    Asking for more ground truth, or for another tolerance, must not change the noise.
+    """
+    plain = msgspec.to_builtins(scene)
+    return _digest({k: v for k, v in plain.items() if k not in ("truth", "simulation")})
+
+
+def _digest(plain: dict[str, Any]) -> str:
+    # decoding turns 60 into 60.0 where a float is meant, so equal scenes have equal text
+    if "truth" in plain:
+        plain = msgspec.to_builtins(msgspec.convert(plain, Scene))
+    return hashlib.sha256(msgspec.json.encode(plain, order="deterministic")).hexdigest()[:12]
+
+
+def scene_to_toml(scene: Scene) -> str:
+    """Return the scene as TOML that `load_suite` reads back to an equal scene."""
+    return tomli_w.dumps(_plain(scene))
+
+
+def load_suite(path: str | Path) -> tuple[Scene, ...]:
+    """Read a file of `[[scene]]` tables over an optional `[defaults]`, or of one scene at top level.
+
+    Defaults are merged under every scene, table by table. The string "null" stands for a value left
+    empty. Raises `InputError` with file, key and what was expected.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); expected a TOML file of scenes") from error
+    return parse_suite(text, str(path))
+
+
+def parse_suite(text: str, where: str = "scene") -> tuple[Scene, ...]:
+    """Read scenes from TOML text; `where` names the file in messages. See `load_suite`."""
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{where}: not TOML: {error}") from error
+    if "phantom" in data and "scene" not in data:
+        return (_decode(data, where, ""),)
+    if extra := sorted(set(data) - {"defaults", "scene"}):
+        raise InputError(f"{where}: unknown key {extra[0]!r}; expected [defaults] and [[scene]]")
+    tables, defaults = data.get("scene", []), data.get("defaults", {})
+    if not isinstance(defaults, dict):
+        raise InputError(f"{where}: defaults must be a table")
+    if not isinstance(tables, list) or not tables or not all(isinstance(t, dict) for t in tables):
+        raise InputError(f"{where}: no scenes; expected at least one [[scene]] table")
+    scenes = tuple(_decode(_merge(defaults, t), where, f"scene[{k}]") for k, t in enumerate(tables))
+    names = [s.name for s in scenes]
+    if twice := sorted({n for n in names if names.count(n) > 1}):
+        raise InputError(f"{where}: two scenes are named {twice[0]!r}; names must differ")
+    return scenes
+
+
+def _decode(data: dict[str, Any], where: str, prefix: str) -> Scene:
+    try:
+        return msgspec.convert(_nulls(data), Scene)
+    except msgspec.ValidationError as error:
+        message, _, key = str(error).partition(" - at `$")
+        key = (prefix + key.rstrip("`")).lstrip(".")
+        raise InputError(f"{where}: {key + ': ' if key else ''}{message}") from error
+
+
+def _merge(under: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(under)
+    for key, value in over.items():
+        old = merged.get(key)
+        merged[key] = _merge(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return merged
+
+
+def _nulls(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _nulls(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_nulls(v) for v in value]
+    return None if value == NULL else value
+
+
+def _plain(value: Any) -> Any:
+    """Turn structs into TOML values, leaving out what is None by default."""
+    if isinstance(value, msgspec.Struct):
+        config = value.__struct_config__
+        out = {config.tag_field: config.tag} if config.tag_field else {}
+        for item in msgspec.structs.fields(value):
+            held = getattr(value, item.name)
+            if held is not None or item.default is not None:
+                out[item.encode_name] = NULL if held is None else _plain(held)
+        return out
+    return [_plain(v) for v in value] if isinstance(value, tuple | list) else value
+
+
+def check_geometry(geometry: Geometry, size: float, truncated: bool) -> None:
+    """Refuse a geometry that cannot image an object of a cube of `size` mm.
+
+    Raises `InputError` when the source comes inside the object or the reconstructed volume, when no
+    view sees the object, and when a view cuts it off although `truncated` is false.
+    """
+    poses = geometry.pose_array()
+    _check_source(poses[:, :3], geometry, size)
+    u, v = _shadow(poses, size)
+    half_v, half_u = ((n / 2) for n in geometry.n_detector)
+    if geometry.off_detector[1] and abs(geometry.arc_deg) >= 360 - 1e-9 and geometry.angles_deg is None:
+        half_u += abs(geometry.off_detector[1]) / geometry.d_detector[1]  # the opposite view sees the other side
+        u = u + geometry.off_detector[1] / geometry.d_detector[1]
+    seen = (u.min(1) < half_u) & (u.max(1) > -half_u) & (v.min(1) < half_v) & (v.max(1) > -half_v)
+    if not seen.any():
+        raise InputError(f"the object ({size} mm) lies outside the cone of all views; expected it on the detector")
+    outside = (np.abs(u) > half_u).any() or (np.abs(v) > half_v).any()
+    if outside and not truncated:
+        raise InputError(
+            f"the object ({size} mm) reaches out of the cone: its shadow needs {2 * np.abs(v).max():.0f} x "
+            f"{2 * np.abs(u).max():.0f} pixels (v, u) of {geometry.n_detector}; say truncated = true if this is meant"
+        )
+
+
+def _check_source(source: NDArray[np.float64], geometry: Geometry, size: float) -> None:
+    radius = np.hypot(source[:, 0], source[:, 1])
+    if ((radius <= REACH * size / 2) & (np.abs(source[:, 2]) <= REACH * size / 2)).any():
+        raise InputError(f"the source lies inside the object ({size} mm); expected a larger dso or a smaller size")
+    box = np.array(geometry.s_voxel[::-1]) / 2
+    if (np.abs(source - np.array(geometry.off_origin[::-1])) <= box).all(1).any():
+        raise InputError(f"the source lies inside the reconstructed volume ({geometry.s_voxel} mm, z y x)")
+
+
+def _shadow(poses: NDArray[np.float64], size: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Detector coordinates (pixels from the centre) of the object's bounding cylinder: u, v [view, point]."""
+    angle = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    ring = REACH * size / 2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
+    points = np.concatenate([ring + [0, 0, h] for h in (-REACH * size / 2, REACH * size / 2)])
+    source, centre, du, dv = (poses[:, k : k + 3] for k in (0, 3, 6, 9))
+    normal = np.cross(du, dv)
+    ray = points[None] - source[:, None]
+    depth = (ray * normal[:, None]).sum(-1)
+    reach = ((centre - source) * normal).sum(-1)[:, None]
+    ahead = depth * np.sign(reach) > 0
+    hit = source[:, None] + ray * (reach / np.where(ahead, depth, 1.0))[..., None] - centre[:, None]
+    u = (hit * du[:, None]).sum(-1) / (du * du).sum(-1)[:, None]
+    v = (hit * dv[:, None]).sum(-1) / (dv * dv).sum(-1)[:, None]
+    return np.where(ahead, u, 1e9), np.where(ahead, v, 1e9)
