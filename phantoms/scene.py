@@ -75,7 +75,7 @@ def build(scene: Scene) -> Phantom:
 
 def scene_id(scene: Scene) -> str:
     """Return 12 hexadecimal digits of the SHA-256 of everything the scene says."""
-    return _digest(msgspec.to_builtins(scene))
+    return _digest(scene, ())
 
 
 def stream_id(scene: Scene) -> str:
@@ -83,15 +83,14 @@ def stream_id(scene: Scene) -> str:
 
     Asking for more ground truth, or for another tolerance, must not change the noise.
     """
-    plain = msgspec.to_builtins(scene)
-    return _digest({k: v for k, v in plain.items() if k not in ("truth", "simulation")})
+    return _digest(scene, ("truth", "simulation"))
 
 
-def _digest(plain: dict[str, Any]) -> str:
+def _digest(scene: Scene, without: tuple[str, ...]) -> str:
     # decoding turns 60 into 60.0 where a float is meant, so equal scenes have equal text
-    if "truth" in plain:
-        plain = msgspec.to_builtins(msgspec.convert(plain, Scene))
-    return hashlib.sha256(msgspec.json.encode(plain, order="deterministic")).hexdigest()[:12]
+    plain = msgspec.to_builtins(msgspec.convert(msgspec.to_builtins(scene), Scene))
+    kept = {k: v for k, v in plain.items() if k not in without}
+    return hashlib.sha256(msgspec.json.encode(kept, order="deterministic")).hexdigest()[:12]
 
 
 def scene_to_toml(scene: Scene) -> str:
@@ -183,7 +182,7 @@ def check_geometry(geometry: Geometry, size: float, truncated: bool) -> None:
     _check_source(poses[:, :3], geometry, size)
     u, v = _shadow(poses, size)
     half_v, half_u = ((n / 2) for n in geometry.n_detector)
-    if geometry.off_detector[1] and abs(geometry.arc_deg) >= 360 - 1e-9 and geometry.angles_deg is None:
+    if geometry.poses is None and geometry.off_detector[1] and abs(geometry.arc_deg) >= 360 - 1e-9 and geometry.angles_deg is None:
         half_u += abs(geometry.off_detector[1]) / geometry.d_detector[1]  # the opposite view sees the other side
         u = u + geometry.off_detector[1] / geometry.d_detector[1]
     seen = (u.min(1) < half_u) & (u.max(1) > -half_u) & (v.min(1) < half_v) & (v.max(1) > -half_v)

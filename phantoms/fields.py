@@ -1,0 +1,179 @@
+"""Drawing tools for voxel bodies: a canvas in relative units, smooth noise, branching trees.
+
+Everything random is drawn in the units of the box (half its shortest edge = 1) and with a number of
+draws that does not depend on the grid, so one seed is one object at every resolution.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctsim.geometry import Triple
+
+Field = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Inside = Callable[[Field, Field, Field], Mask]
+
+
+class Noise:
+    """Smooth random field on [−1, 1]³ with unit standard deviation: uniform cubic B-splines.
+
+    `cells` is the number of spline cells along an edge, so features are about 2/cells wide. Evaluates
+    on three coordinate axes (any shape that flattens to 1-D) to float32 [z, y, x].
+    """
+
+    def __init__(self, rng: np.random.Generator, cells: int) -> None:
+        self.cells = cells
+        # variance of a cubic B-spline sum with unit coefficients is about (151/315)^3 per volume
+        self.coefficients = (rng.standard_normal((cells + 3,) * 3) / (151 / 315) ** 1.5).astype(np.float32)
+
+    def __call__(self, x: Field, y: Field, z: Field) -> Field:
+        """Evaluate on the grid spanned by the axes x, y, z."""
+        out = self.coefficients
+        for axis, at in enumerate((z, y, x)):
+            out = np.moveaxis(np.tensordot(self._basis(at.ravel()), out, (1, axis)), 0, axis)
+        return out
+
+    def _basis(self, at: Field) -> Field:
+        t = np.clip((at.astype(np.float64) + 1) / 2, 0, 1) * self.cells
+        left = np.minimum(t.astype(int), self.cells - 1)
+        f = t - left
+        weights = np.stack([(1 - f) ** 3, 3 * f**3 - 6 * f**2 + 4, -3 * f**3 + 3 * f**2 + 3 * f + 1, f**3], 1) / 6
+        basis = np.zeros((len(t), self.cells + 3))
+        for k in range(4):
+            basis[np.arange(len(t)), left + k] = weights[:, k]
+        return basis.astype(np.float32)
+
+
+@dataclass(slots=True)
+class Canvas:
+    """A label volume that shapes are painted on; later paint covers earlier, unless `over` restricts it.
+
+    Coordinates are relative: x, y, z in units of half the shortest edge of the box. `over` lists the
+    labels that may be replaced (None: all).
+    """
+
+    n: tuple[int, int, int]
+    d_voxel: Triple
+    unit: float = field(init=False)
+    labels: NDArray[np.uint8] = field(init=False)
+    axes: tuple[Field, Field, Field] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.unit = min(k * d for k, d in zip(self.n, self.d_voxel, strict=True)) / 2
+        self.labels = np.zeros(self.n, np.uint8)
+        z, y, x = (
+            ((np.arange(k) + 0.5 - k / 2) * d / self.unit).astype(np.float32)
+            for k, d in zip(self.n, self.d_voxel, strict=True)
+        )
+        self.axes = (x, y, z)
+
+    def fill(
+        self,
+        label: int,
+        inside: Inside,
+        box: tuple[ArrayLike, ArrayLike] = ((-9, -9, -9), (9, 9, 9)),
+        over: Sequence[int] | None = None,
+    ) -> None:
+        """Paint where `inside(x, y, z)` holds within the box (low corner, high corner; x, y, z)."""
+        low, high = np.asarray(box[0]), np.asarray(box[1])
+        cut = [slice(*np.searchsorted(a, (lo, hi))) for a, lo, hi in zip(self.axes, low, high, strict=True)]
+        if any(c.start >= c.stop for c in cut):
+            return
+        x, y, z = self.axes[0][cut[0]], self.axes[1][cut[1]], self.axes[2][cut[2]]
+        mask = inside(x[None, None, :], y[None, :, None], z[:, None, None])
+        view = self.labels[cut[2], cut[1], cut[0]]
+        if over is not None:
+            mask = mask & np.isin(view, over)
+        view[np.broadcast_to(mask, view.shape)] = label
+
+    def ellipsoid(
+        self,
+        label: int,
+        centre: ArrayLike,
+        radii: ArrayLike,
+        frame: NDArray[np.float64] | None = None,
+        over: Sequence[int] | None = None,
+    ) -> None:
+        """Paint an ellipsoid; the rows of `frame` are its axes (default x, y, z)."""
+        c, r = np.asarray(centre, float), np.asarray(radii, float) * np.ones(3)
+        rows = np.eye(3) if frame is None else frame
+
+        def inside(x: Field, y: Field, z: Field) -> Mask:
+            p = [x - np.float32(c[0]), y - np.float32(c[1]), z - np.float32(c[2])]
+            return sum(((row[0] * p[0] + row[1] * p[1] + row[2] * p[2]) / k) ** 2 for row, k in zip(rows, r)) <= 1
+
+        reach = np.sqrt(((rows * r[:, None]) ** 2).sum(0))
+        self.fill(label, inside, (c - reach, c + reach), over)
+
+    def capsule(
+        self, label: int, a: ArrayLike, b: ArrayLike, radii: tuple[float, float], over: Sequence[int] | None = None
+    ) -> None:
+        """Paint a round-ended rod from a to b whose radius runs from radii[0] to radii[1]."""
+        p, q = np.asarray(a, np.float64), np.asarray(b, np.float64)
+        d = q - p
+        length2 = float(d @ d) or 1e-12
+        r0, r1 = radii
+
+        def inside(x: Field, y: Field, z: Field) -> Mask:
+            px, py, pz = (w - np.float32(o) for w, o in zip((x, y, z), p, strict=True))
+            t = np.clip((px * np.float32(d[0]) + py * np.float32(d[1]) + pz * np.float32(d[2])) / length2, 0, 1)
+            t = t.astype(np.float32)
+            gap = (px - t * np.float32(d[0])) ** 2 + (py - t * np.float32(d[1])) ** 2 + (pz - t * np.float32(d[2])) ** 2
+            return gap <= (r0 + t * np.float32(r1 - r0)) ** 2
+
+        r = max(radii)
+        self.fill(label, inside, (np.minimum(p, q) - r, np.maximum(p, q) + r), over)
+
+    def tube(self, label: int, points: ArrayLike, radii: ArrayLike, over: Sequence[int] | None = None) -> None:
+        """Paint a chain of capsules through the points [k, 3]; one radius, or one per point."""
+        at = np.asarray(points, np.float64)
+        r = np.broadcast_to(np.asarray(radii, np.float64), (len(at),))
+        for k in range(len(at) - 1):
+            self.capsule(label, at[k], at[k + 1], (float(r[k]), float(r[k + 1])), over)
+
+
+Branch = tuple[NDArray[np.float64], NDArray[np.float64], float, float]
+"""Start, end, radius at the start, radius at the end; relative units."""
+
+
+def supply_tree(
+    root: NDArray[np.float64], targets: NDArray[np.float64], radius: float, leaf: float = 0.0
+) -> list[Branch]:
+    """Grow a tree from `root` that supplies all `targets` [k, 3], as vessels and bronchi do.
+
+    Targets are halved along their longest extent until one is left; a branch to a group ends short
+    of its centroid. Radii obey Murray's law (r³ shared among the children), from `radius` at the root,
+    never below `leaf`.
+    """
+    branches: list[Branch] = []
+    total = len(targets)
+    stack: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = [(np.asarray(root, float), targets)]
+    while stack:
+        start, group = stack.pop()
+        share = max(radius * (len(group) / total) ** (1 / 3), leaf)
+        if len(group) == 1:
+            branches.append((start, group[0], share, share * 0.6))
+            continue
+        centre = group.mean(0)
+        end = start + 0.45 * (centre - start)
+        branches.append((start, end, share, share * 0.88))
+        _, _, axes = np.linalg.svd(group - centre, full_matrices=False)
+        side = (group - centre) @ axes[0]
+        half = side > np.median(side)
+        if not half.any():
+            half[: len(half) // 2] = True
+        stack += [(end, group[half]), (end, group[~half])]
+    return branches
+
+
+def frame_along(axis: ArrayLike, spin: float = 0.0) -> NDArray[np.float64]:
+    """Return a right-handed orthonormal frame (rows) whose third row points along `axis`."""
+    w = np.asarray(axis, np.float64)
+    w = w / np.linalg.norm(w)
+    u = np.cross(np.eye(3)[np.argmin(np.abs(w))], w)
+    u /= np.linalg.norm(u)
+    v = np.cross(w, u)
+    return np.stack([np.cos(spin) * u + np.sin(spin) * v, np.cos(spin) * v - np.sin(spin) * u, w])
