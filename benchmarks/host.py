@@ -1,0 +1,131 @@
+"""Where a measurement was taken: machine, threads, versions, commit; and what it took."""
+
+import contextlib
+import functools
+import os
+import platform
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+import msgspec
+
+VERSIONS_OF = ("ctsim", "numpy", "numba", "torch", "scipy", "scikit-image", "xraylib")
+
+
+class Host(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The machine and the software of a measurement. `ram` is bytes, `versions` maps package to version."""
+
+    cpu: str
+    cores: int
+    threads: int
+    ram: int
+    system: str
+    python: str
+    versions: dict[str, str]
+
+
+def _cpu_name() -> str:
+    """Return the processor's model name, or the architecture where the system does not tell."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _threads() -> int:
+    """Return the threads that the kernels use."""
+    numba = sys.modules.get("numba")
+    return int(numba.get_num_threads()) if numba else len(os.sched_getaffinity(0))
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def host() -> Host:
+    """Describe this machine."""
+    return Host(
+        cpu=_cpu_name(),
+        cores=len(os.sched_getaffinity(0)),
+        threads=_threads(),
+        ram=os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+        system=f"{platform.system()} {platform.release()}",
+        python=platform.python_version(),
+        versions=_versions(),
+    )
+
+
+@functools.cache
+def _versions() -> dict[str, str]:
+    return {package: _version(package) for package in VERSIONS_OF}
+
+
+@functools.cache
+def commit() -> str:
+    """Return the commit of this code, with "+changes" where files differ from it; "unknown" outside git."""
+    here = Path(__file__).resolve().parent
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(here), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+
+    try:
+        head = git("rev-parse", "HEAD")
+        return head + ("+changes" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+
+
+@dataclass(slots=True)
+class Usage:
+    """What a block of code took; filled when the block ends. Seconds and bytes."""
+
+    wall: float = 0.0
+    cpu: float = 0.0
+    peak_bytes: int = 0
+
+
+def _reset_peak() -> bool:
+    """Ask the kernel to forget this process's memory high-water mark (Linux); say whether it did."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return False
+    return True
+
+
+def peak_memory() -> int:
+    """Return the highest resident memory in bytes since the last reset, else since the process began."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+@contextlib.contextmanager
+def measured() -> Iterator[Usage]:
+    """Measure wall time, CPU time of all threads, and peak resident memory of this process.
+
+    The peak is the whole process's, with the interpreter, the libraries and the mapped files.
+    """
+    usage = Usage()
+    _reset_peak()
+    wall, cpu = time.perf_counter(), time.process_time()
+    try:
+        yield usage
+    finally:
+        usage.wall = time.perf_counter() - wall
+        usage.cpu = time.process_time() - cpu
+        usage.peak_bytes = peak_memory()

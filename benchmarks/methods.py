@@ -1,0 +1,187 @@
+"""The methods table: a name to a plain function `reconstruct(scan, *, device, ...) -> Volume`.
+
+`--method my_lab.net:reconstruct` names a function outside the table in the same way. The function's
+module may define `skip(scan) -> str | None` (a reason, or None to run) and `INPUTS`, a sentence
+fragment saying what the method needs beside the counts; methods are ranked within one such class.
+"""
+
+import ast
+import difflib
+import functools
+import hashlib
+import importlib.util
+import inspect
+import os
+import pkgutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from ctsim.errors import InputError
+
+if TYPE_CHECKING:
+    from ctsim.types import Scan, Volume
+
+OURS = ("ctsim", "reconstruct", "baselines")
+COUNTS_ONLY = "counts only"
+
+TABLE: dict[str, tuple[str, str]] = {
+    "fdk": ("reconstruct.fdk:reconstruct", COUNTS_ONLY),
+}
+"""name -> ("module:function", what it needs beside the counts)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Method:
+    """A method that was found, with its parameters.
+
+    `params` are all keyword parameters with their values, `overrides` those given by the user.
+    """
+
+    name: str
+    target: str
+    inputs: str
+    params: dict[str, Any]
+    overrides: dict[str, Any] = field(default_factory=dict)
+    code: str = ""
+
+    @property
+    def label(self) -> str:
+        """The name with the parameters that were given, as tables show it."""
+        given = ", ".join(f"{k}={v}" for k, v in sorted(self.overrides.items()))
+        return f"{self.name}[{given}]" if given else self.name
+
+    @property
+    def mask(self) -> str:
+        """Where the metal mask comes from, "none" for a method without."""
+        return str(self.params.get("mask", "none"))
+
+    def reconstruct(self, scan: "Scan", device: str) -> "Volume":
+        """Run the method."""
+        return resolve(self.target)(scan, device=device, **self.overrides)
+
+    def skip(self, scan: "Scan") -> str | None:
+        """Ask the method's module why it would rather not run on `scan`; None to run."""
+        asked = getattr(sys.modules[resolve(self.target).__module__], "skip", None)
+        return asked(scan) if asked else None
+
+
+def resolve(target: str) -> Callable[..., "Volume"]:
+    """Import "module:function"; modules in the working directory are found too.
+
+    Raises InputError where there is no such module or function, or it cannot be called.
+    """
+    if "" not in sys.path and os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+    try:
+        found = pkgutil.resolve_name(target)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError(f"method {target!r} cannot be imported: {error}") from None
+    if not callable(found):
+        raise InputError(f"method {target!r} is not a function")
+    return found
+
+
+def find(name: str, overrides: dict[str, Any] | None = None) -> Method:
+    """Look a method up by its table name or as "module:function" and bind its parameters.
+
+    Raises InputError naming near matches for an unknown method or parameter.
+    """
+    if name in TABLE:
+        target, inputs = TABLE[name]
+    elif ":" in name:
+        target, inputs = name, ""
+    else:
+        near = difflib.get_close_matches(name, TABLE, n=3)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"expected {', '.join(TABLE)} or module:function"
+        raise InputError(f"there is no method {name!r}: {hint}")
+    function = resolve(target)
+    module = sys.modules[function.__module__]
+    params = _parameters(name, function)
+    given = dict(overrides or {})
+    for key in given:
+        if key not in params:
+            raise InputError(f"method {name!r} has no parameter {key!r}: expected one of {', '.join(params) or 'none'}")
+    return Method(
+        name=name,
+        target=target,
+        inputs=inputs or getattr(module, "INPUTS", COUNTS_ONLY),
+        params={**params, **given},
+        overrides=given,
+        code=code_version(function.__module__),
+    )
+
+
+def _parameters(name: str, function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the keyword parameters with their defaults, as JSON values; scan and device are not among them."""
+    parameters = list(inspect.signature(function).parameters.values())
+    if not parameters or "device" not in {p.name for p in parameters}:
+        raise InputError(
+            f"method {name!r} must be reconstruct(scan, *, device, ...), got {inspect.signature(function)}"
+        )
+    found = {}
+    for parameter in parameters[1:]:
+        if parameter.name != "device" and parameter.kind is not inspect.Parameter.VAR_KEYWORD:
+            default = None if parameter.default is inspect.Parameter.empty else parameter.default
+            found[parameter.name] = msgspec.to_builtins(default, enc_hook=repr)
+    return found
+
+
+def parse_overrides(settings: tuple[str, ...], names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+    """Parse "method.parameter=value" settings; values are JSON, or text where they are not.
+
+    Raises InputError where a setting has another form or names a method that is not run.
+    """
+    found: dict[str, dict[str, Any]] = {name: {} for name in names}
+    for setting in settings:
+        path, equals, text = setting.partition("=")
+        method, dot, parameter = path.rpartition(".")
+        if not (equals and dot and parameter):
+            raise InputError(f"--set {setting!r}: expected method.parameter=value")
+        if method not in found:
+            raise InputError(f"--set {setting!r}: method {method!r} is not among those to run, {', '.join(names)}")
+        try:
+            found[method][parameter] = msgspec.json.decode(text)
+        except msgspec.DecodeError:
+            found[method][parameter] = text
+    return found
+
+
+@functools.cache
+def code_version(module: str) -> str:
+    """Hash the sources of `module` and of all it imports from its own package and from this project."""
+    roots = {*OURS, module.partition(".")[0]}
+    digest = hashlib.sha256()
+    for name, source in sorted(_sources(module, roots).items()):
+        digest.update(name.encode() + b"\0" + source + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def _sources(module: str, roots: set[str]) -> dict[str, bytes]:
+    """Collect the sources that are reachable from `module` through import statements within `roots`."""
+    found: dict[str, bytes] = {}
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        if name in found or name.partition(".")[0] not in roots:
+            continue
+        try:
+            spec = importlib.util.find_spec(name)
+        except (ImportError, AttributeError, ValueError):
+            continue  # `from package import value` names no module
+        if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
+            continue
+        with open(spec.origin, "rb") as file:
+            found[name] = file.read()
+        package = name if spec.submodule_search_locations else name.rpartition(".")[0]
+        for node in ast.walk(ast.parse(found[name])):
+            if isinstance(node, ast.Import):
+                waiting += [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                origin = package.rsplit(".", node.level - 1)[0] + "." if node.level else ""
+                base = (origin + (node.module or "")).strip(".")
+                waiting += [base, *(f"{base}.{alias.name}" for alias in node.names)]
+    return found

@@ -1,0 +1,181 @@
+"""Records: one JSON line per measurement, appended and flushed, so that a crash loses one line at most.
+
+A run is what a scene, its files, a method, its parameters and its code determine; its identity is a
+SHA-256 over them. Of a run that was recorded several times the last record counts.
+"""
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from benchmarks.host import Host
+from benchmarks.protocol import VERSION, Score
+from ctsim.errors import InputError
+
+NAME = "records.jsonl"
+OK = "ok"
+
+
+class Cost(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a run took: seconds, bytes, views used times passes; the warm-up stands apart."""
+
+    wall: float
+    cpu: float
+    peak_bytes: int
+    view_updates: int
+    device: str
+    warm_up: float = 0.0
+    isolated: bool = False
+
+
+class Run(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What determines a measurement; `identity` hashes it.
+
+    `variant` is "metal" for the scan itself and "metal_free" for its twin; `mask` names the source of
+    a metal mask ("none", "oracle", "auto"); `code` hashes the method's sources.
+    """
+
+    scene: str
+    scene_id: str
+    scan: str
+    seed: int
+    method: str
+    params: dict[str, Any]
+    mask: str = "none"
+    variant: str = "metal"
+    code: str = ""
+    protocol: int = VERSION
+
+    @property
+    def identity(self) -> str:
+        """SHA-256 over all fields, independent of their order."""
+        return hashlib.sha256(msgspec.json.encode(self, order="sorted")).hexdigest()
+
+
+class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One measurement: the run, how it ended, its scores under each protocol, cost and provenance.
+
+    `label` is the method with the parameters that differ from its defaults; `inputs` what the method
+    needs beside the counts; `volume` the path of the kept volume relative to the results folder.
+    """
+
+    identity: str
+    run: Run
+    label: str
+    inputs: str
+    status: str
+    reason: str = ""
+    scores: dict[str, Score] = {}
+    cost: Cost | None = None
+    volume: str | None = None
+    host: Host | None = None
+    commit: str = "unknown"
+    time: str = ""
+
+
+class Torn(msgspec.Struct, frozen=True, kw_only=True):
+    """The rest of a line whose writing was interrupted: its file, where it begins, and its length in bytes."""
+
+    path: Path
+    offset: int
+    length: int
+
+    def __str__(self) -> str:
+        return f"{self.path}: the last line was cut short ({self.length} bytes); that measurement is left out"
+
+
+def append(path: Path, record: Record) -> None:
+    """Append one record and force it to the disk.
+
+    Raises OSError where it cannot be written; the file is then as it was before.
+    """
+    line = msgspec.json.encode(record) + b"\n"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
+    size = os.fstat(descriptor).st_size
+    try:
+        written = 0
+        while written < len(line):
+            written += os.write(descriptor, line[written:])
+        os.fsync(descriptor)
+    except OSError:
+        os.ftruncate(descriptor, size)
+        raise
+    finally:
+        os.close(descriptor)
+
+
+def read(path: Path) -> tuple[list[Record], Torn | None]:
+    """Read a records file; a last line that was cut short is left out and returned as `Torn`.
+
+    Raises InputError where any other line is not a record. A file that is not there has no records.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return [], None
+    records: list[Record] = []
+    decoder = msgspec.json.Decoder(Record)
+    offset = 0
+    for number, line in enumerate(data.splitlines(keepends=True), 1):
+        if line.strip():
+            try:
+                records.append(decoder.decode(line))
+            except msgspec.MsgspecError as error:
+                if not line.endswith(b"\n"):
+                    return records, Torn(path=path, offset=offset, length=len(line))
+                raise InputError(f"{path}, line {number}: expected a record of run-benchmark: {error}") from None
+        offset += len(line)
+    return records, None
+
+
+def repair(path: Path) -> Torn | None:
+    """Set aside the rest of a torn last line beside the file, so that records can be appended again.
+
+    Returns what was torn, None where nothing was. A whole last line that only lacks its end gets it.
+    """
+    _, torn = read(path)
+    if torn is not None:
+        with path.open("r+b") as file:
+            file.seek(torn.offset)
+            path.with_suffix(".torn").write_bytes(file.read())
+            file.truncate(torn.offset)
+        return torn
+    if path.exists() and path.stat().st_size:
+        with path.open("r+b") as file:
+            file.seek(-1, os.SEEK_END)
+            if file.read(1) != b"\n":
+                file.write(b"\n")
+    return None
+
+
+def read_all(results: Path) -> tuple[list[Record], list[Torn]]:
+    """Read every `records*.jsonl` of a results folder: files copied from other machines merge so."""
+    records: list[Record] = []
+    torn = []
+    for path in sorted(results.glob("records*.jsonl")):
+        found, rest = read(path)
+        records += found
+        torn += [rest] if rest else []
+    return records, torn
+
+
+def latest(records: list[Record]) -> list[Record]:
+    """Keep the last record of each scene, scan, seed, variant and method label, in order of first sight.
+
+    Other code versions of the same run are superseded too: a table shows one row for a method.
+    """
+    kept: dict[tuple[Any, ...], Record] = {}
+    for record in records:
+        run = record.run
+        kept[(run.scene, run.scene_id, run.scan, run.seed, run.variant, record.label)] = record
+    return list(kept.values())
+
+
+def done(records: list[Record]) -> set[str]:
+    """Return the identities that need no rerun: those whose last record is ok. Failures are never among them."""
+    last = {record.identity: record.status for record in records}
+    return {identity for identity, status in last.items() if status == OK}

@@ -1,0 +1,242 @@
+import math
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from skimage.metrics import structural_similarity
+
+from benchmarks import metrics
+from benchmarks.protocol import Truth, evaluate, tissue_range
+from benchmarks.ssim import window
+from ctsim.errors import InputError
+
+
+def volumes(shape=(13, 17, 19), seed=0, noise=0.1):
+    rng = np.random.default_rng(seed)
+    reference = ndimage.gaussian_filter(rng.random(shape), 1.0)
+    return reference + noise * rng.standard_normal(shape), reference
+
+
+def slicewise(values, reference, data_range):
+    """The SSIM map of scikit-image, slice by slice along each axis."""
+    maps = []
+    for axis in range(3):
+        pairs = zip(np.moveaxis(values, axis, 0), np.moveaxis(reference, axis, 0), strict=True)
+        slices = [
+            structural_similarity(
+                a, b, data_range=data_range, full=True, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
+            )[1]
+            for a, b in pairs
+        ]
+        maps.append(np.moveaxis(np.stack(slices), 0, axis))
+    return np.mean(maps, 0)
+
+
+def test_ssim_equals_scikit_image_slice_by_slice():
+    values, reference = volumes()
+    expected = slicewise(values, reference, 0.7).mean()
+    # Same float64 sums in another order: some 1e3 terms of 1e-16, divided by c2 = 4e-4.
+    assert metrics.ssim3d(values, reference, data_range=0.7) == pytest.approx(expected, abs=1e-10)
+
+
+def test_ssim_in_a_region_equals_substitution_and_the_map():
+    values, reference = volumes((23, 25, 29), seed=1)
+    region = np.zeros(values.shape, bool)
+    region[7:14, 8:15, 9:20] = True
+    region[9:11, 10:12, 12:14] = False
+    expected = slicewise(np.where(region, values, reference), reference, 0.5)[region].mean()
+    assert metrics.ssim3d(values, reference, data_range=0.5, region=region) == pytest.approx(expected, abs=1e-10)
+
+
+def test_ssim_of_float32_is_that_of_float64():
+    values, reference = (v.astype(np.float32) for v in volumes(seed=2))
+    expected = metrics.ssim3d(values.astype(float), reference.astype(float), data_range=1.0)
+    assert metrics.ssim3d(values, reference, data_range=1.0) == pytest.approx(expected, abs=1e-12)
+
+
+def test_what_is_not_judged_cannot_leak_in():
+    values, reference = volumes()
+    region = np.zeros(values.shape, bool)
+    region[:, :9] = True
+    spoilt = np.where(region, values, 1e6)
+    for metric in (metrics.psnr3d, metrics.ssim3d):
+        clean = metric(values, reference, data_range=1.0, region=region)
+        assert metric(spoilt, reference, data_range=1.0, region=region) == clean
+        assert metric(spoilt, reference, data_range=1.0) != pytest.approx(clean)
+
+
+def test_window_is_the_gaussian_of_eleven_taps():
+    impulse = np.zeros(21)
+    impulse[10] = 1
+    expected = ndimage.gaussian_filter1d(impulse, 1.5, truncate=3.5)
+    np.testing.assert_allclose(window(), expected[5:16], atol=1e-15)
+    assert expected[4] == 0
+
+
+def test_psnr_closed_form_and_range():
+    reference = np.zeros((5, 7, 11))
+    values = np.full_like(reference, 0.1)
+    assert metrics.psnr3d(values, reference, data_range=1.0) == pytest.approx(20.0, abs=1e-12)
+    assert metrics.psnr3d(values, reference, data_range=10.0) == pytest.approx(40.0, abs=1e-12)
+    region = np.zeros(reference.shape, bool)
+    region[0] = True
+    values[1:] = 5.0
+    assert metrics.psnr3d(values, reference, data_range=1.0, region=region) == pytest.approx(20.0, abs=1e-12)
+
+
+def test_identical_volumes_have_no_psnr_and_ssim_one():
+    _, reference = volumes()
+    assert metrics.psnr3d(reference, reference, data_range=1.0) is None
+    assert metrics.ssim3d(reference, reference, data_range=1.0) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_small_volumes_have_a_ssim():
+    values, reference = volumes((5, 7, 11))
+    assert 0 < metrics.ssim3d(values, reference, data_range=1.0) < 1
+    assert metrics.ssim3d_naf(values, reference) is None
+
+
+def test_compatibility_columns():
+    values, reference = volumes()
+    reference[3] = 0  # a slice that R2-Gaussian's evaluation leaves out
+    naf = structural_similarity(values, reference, win_size=7, data_range=2.0)
+    assert metrics.ssim3d_naf(values, reference) == pytest.approx(naf, abs=1e-12)
+    means = []
+    for axis in range(3):
+        scores = []
+        for a, b in zip(np.moveaxis(values, axis, 0), np.moveaxis(reference, axis, 0), strict=True):
+            if b.max() > 0:
+
+                def g(f):
+                    return ndimage.gaussian_filter(f, 1.5, truncate=3.5, mode="constant")
+
+                mu, nu = g(a), g(b)
+                va, vb, cov = g(a * a) - mu**2, g(b * b) - nu**2, g(a * b) - mu * nu
+                top = (2 * mu * nu + 1e-4) * (2 * cov + 9e-4)
+                scores.append((top / ((mu**2 + nu**2 + 1e-4) * (va + vb + 9e-4))).mean())
+        means.append(np.mean(scores))
+    assert metrics.ssim3d_r2(values, reference) == pytest.approx(np.mean(means), abs=1e-10)
+    assert metrics.ssim3d_r2(values, np.zeros_like(reference)) is None
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
+def test_a_range_must_be_positive(bad):
+    values, reference = volumes((5, 7, 11))
+    for metric in (metrics.psnr3d, metrics.ssim3d):
+        with pytest.raises(InputError, match="data range must be positive"):
+            metric(values, reference, data_range=bad)
+
+
+def test_shapes_and_regions_are_checked():
+    values, reference = volumes((5, 7, 11))
+    with pytest.raises(InputError, match="one 3-D shape"):
+        metrics.psnr3d(values, reference[1:], data_range=1.0)
+    with pytest.raises(InputError, match="empty"):
+        metrics.psnr3d(values, reference, data_range=1.0, region=np.zeros(values.shape, bool))
+
+
+def test_gain_is_least_squares():
+    _, reference = volumes()
+    region = reference > 0.5
+    values = np.where(region, reference / 1.25, 99.0)
+    assert metrics.least_squares_gain(values, reference, region) == pytest.approx(1.25, rel=1e-12)
+    assert metrics.least_squares_gain(np.zeros_like(values), reference, region) is None
+
+
+def test_dilate_and_erode_count_steps():
+    mask = np.zeros((9, 9, 9), bool)
+    mask[4, 4, 4] = True
+    grown = metrics.dilate(mask, 2)
+    assert grown.sum() == 5**3 and grown[2:7, 2:7, 2:7].all()
+    np.testing.assert_array_equal(metrics.erode(grown, 2), mask)
+
+
+def ball(shape, centre, radius):
+    z, y, x = np.ogrid[tuple(slice(n) for n in shape)]
+    return (z - centre[0]) ** 2 + (y - centre[1]) ** 2 + (x - centre[2]) ** 2 <= radius**2
+
+
+def test_boundary_of_a_shifted_slab_is_its_shift():
+    truth = np.zeros((5, 7, 30), bool)
+    truth[:, :, 10:20] = True
+    found = np.roll(truth, 3, 2)
+    assert metrics.boundary_rms(found, truth, (1.0, 1.0, 0.5)) == pytest.approx(1.5, abs=1e-12)
+    assert metrics.boundary_rms(truth, truth, (1.0, 1.0, 0.5)) == 0
+    assert metrics.boundary_rms(np.zeros_like(truth), truth, (1.0, 1.0, 1.0)) is None
+
+
+def test_metal_metrics_of_a_scaled_metal():
+    metal = ball((21, 22, 23), (10, 11, 12), 5)
+    reference = np.where(metal, 0.4, 0.02)
+    found = metrics.metal_metrics(reference * 0.5, reference, metal, np.ones_like(metal), (1.0, 1.0, 1.0))
+    assert found == {"core_ratio": pytest.approx(0.5), "dice": 1.0, "boundary_rms": 0.0}
+    small = ball((21, 22, 23), (10, 11, 12), 4)
+    shrunk = metrics.metal_metrics(np.where(small, 0.4, 0.02), reference, metal, np.ones_like(metal), (1.0, 1.0, 1.0))
+    assert shrunk["dice"] == pytest.approx(2 * small.sum() / (small.sum() + metal.sum()))
+    # The balls' surfaces are one voxel apart, give or take the staircase of the voxels (< 0.5).
+    assert 0.6 < shrunk["boundary_rms"] < 1.5
+
+
+def test_metal_that_vanished_scores_zero():
+    metal = ball((11, 12, 13), (5, 6, 6), 3)
+    found = metrics.metal_metrics(np.zeros(metal.shape), np.where(metal, 1.0, 0), metal, metal, (1.0, 1.0, 1.0))
+    assert found == {"core_ratio": 0.0, "dice": 0.0, "boundary_rms": None}
+
+
+def truth(with_metal=True):
+    shape = (20, 24, 28)
+    body = ball(shape, (10, 12, 14), 7)
+    metal = ball(shape, (10, 12, 14), 2) if with_metal else np.zeros(shape, bool)
+    near = metrics.dilate(metal, 2)
+    judged = metrics.dilate(body, 4)
+    effective = np.where(metal, 0.5, np.where(body, 0.02, 0)).astype(np.float32)
+    return Truth(
+        references={"effective": effective, "50kev": effective * np.float32(1.1)},
+        metal=metal,
+        body=body,
+        tissue=judged & ~near,
+        judged=judged,
+        near_metal=near,
+        d_voxel=(1.0, 1.0, 1.0),
+        l0=14.0,
+    )
+
+
+def test_a_pure_energy_scale_is_what_alignment_removes():
+    t = truth()
+    scores = evaluate(t.references["effective"] * np.float32(0.8), t)
+    assert set(scores) == {"tissue", "aligned", "aligned_50kev", "paper", "metal"}
+    assert scores["aligned"].values["gain"] == pytest.approx(1.25, rel=1e-6)
+    assert scores["aligned_50kev"].values["gain"] == pytest.approx(1.375, rel=1e-6)
+    # A fifth of the range is missing where the body is: MSE = 0.2²·R²·share of body in the region.
+    share = (t.body & t.tissue).sum() / t.tissue.sum()
+    assert scores["tissue"].values["psnr3d"] == pytest.approx(-10 * math.log10(0.04 * share), abs=1e-4)
+    # What is left is float32 rounding: nothing at all, or beyond 100 dB.
+    assert scores["aligned"].identical or scores["aligned"].values["psnr3d"] > 100
+    assert scores["tissue"].data_range == pytest.approx(0.02)
+    assert scores["paper"].data_range == pytest.approx(0.55)
+    assert scores["metal"].values["core_ratio"] == pytest.approx(0.8, rel=1e-5)
+
+
+def test_a_perfect_volume_is_named_identical():
+    t = truth()
+    score = evaluate(t.references["effective"], t)["tissue"]
+    assert score.identical and score.values["psnr3d"] is None and score.values["rmse"] == 0
+
+
+def test_every_score_says_region_reference_and_range():
+    for name, score in evaluate(truth().references["effective"] + np.float32(0.001), truth()).items():
+        assert score.region and score.reference and score.alignment and score.n_voxels > 0, name
+        assert name == "metal" or score.data_range > 0
+
+
+def test_without_metal_there_is_no_metal_score():
+    t = truth(with_metal=False)
+    assert "metal" not in evaluate(t.references["effective"], t)
+    assert tissue_range(t, "effective") == pytest.approx(0.02)
+    assert set(evaluate(t.references["effective"], t, anchor=True)) == {"tissue", "aligned", "aligned_50kev"}
+
+
+def test_metal_does_not_set_the_tissue_range():
+    t = truth()
+    assert tissue_range(t, "effective") < 0.1 < t.references["effective"].max()
