@@ -17,7 +17,7 @@ from ctsim.solids import BOX, CAPSULE, ELLIPSOID, FRUSTUM
 _PARALLEL = 1e-30
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")  # always: saves two atomic reference counts
 def intersect(prim, ox, oy, oz, dx, dy, dz, out):
     """Intersect a ray with one primitive.
 
