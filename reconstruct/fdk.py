@@ -1,0 +1,119 @@
+"""Filtered backprojection for a cone beam on a circular orbit (Feldkamp, Davis, Kress).
+
+Feldkamp, Davis and Kress, J. Opt. Soc. Am. A 1, 1984, doi:10.1364/JOSAA.1.000612. Projections
+[view, v, u], volume [z, y, x] in 1/mm; voxels outside the scan's field of view are zero.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+from ctsim.kernels.backproject_cpu import backproject
+from ctsim.types import Scan, Status, Volume
+from reconstruct.filters import filter_rows, padded_length, ramp_response
+from reconstruct.log import count_floor, line_integrals
+from reconstruct.redundancy import RayWeights, ray_weights
+
+CHUNK_BYTES = 1 << 25
+
+
+def reconstruct(scan: Scan, *, device: str = "cpu", window: str = "ram-lak", cutoff: float = 1.0) -> Volume:
+    """Reconstruct `scan` by FDK without any correction.
+
+    `window` and `cutoff` are those of `reconstruct.filters.window_gain`. Details hold the clamped pixels
+    and how redundant rays were weighted. Raises InputError for another device than the CPU, for a
+    geometry given by poses, and for an unknown window.
+    """
+    if torch.device(device).type != "cpu":
+        raise InputError(f"fdk runs on device 'cpu' only, got {device!r}")
+    clamped = 0
+
+    def read(views: slice) -> NDArray[np.float32]:
+        nonlocal clamped
+        p, mask = line_integrals(scan, views)
+        clamped += int(mask.sum())
+        return p.numpy()
+
+    weights = _orbit_weights(scan.geometry)
+    values = _run(read, scan.geometry, weights, ramp=_response(scan.geometry, window, cutoff))
+    finite = bool(np.isfinite(values).all())
+    details = {
+        "window": window,
+        "cutoff": cutoff,
+        "clamped_pixels": clamped,
+        "count_floor": count_floor(scan),
+        "rays": weights.kind,
+        "field_of_view_mm": weights.radius,
+    }
+    if weights.note:
+        details["limitation"] = weights.note
+    return Volume(
+        values=torch.from_numpy(values),
+        status=Status.OK if finite else Status.NONFINITE,
+        reason="" if finite else "the reconstruction holds values that are not finite",
+        details=details,
+    )
+
+
+def fdk(projections: torch.Tensor, geometry: Geometry, *, window: str = "ram-lak", cutoff: float = 1.0) -> torch.Tensor:
+    """Reconstruct line integrals, float32 [view, v, u] → [z, y, x] in 1/mm.
+
+    Raises InputError when the shapes disagree, the orbit is not circular or the window is unknown.
+    """
+    if tuple(projections.shape) != geometry.shape:
+        raise InputError(f"projections have shape {tuple(projections.shape)}, the geometry says {geometry.shape}")
+    if projections.device.type != "cpu":
+        raise InputError(f"fdk runs on the CPU only, the projections are on {projections.device}")
+
+    def read(views: slice) -> NDArray[np.float32]:
+        return np.array(projections[views].detach().numpy(), np.float32)
+
+    weights = _orbit_weights(geometry)
+    return torch.from_numpy(_run(read, geometry, weights, ramp=_response(geometry, window, cutoff)))
+
+
+def _orbit_weights(geometry: Geometry) -> RayWeights:
+    if geometry.poses is not None:
+        raise InputError("FDK needs a circular orbit: give angles_deg or arc_deg instead of poses")
+    return ray_weights(geometry)
+
+
+def _response(geometry: Geometry, window: str, cutoff: float) -> NDArray[np.float32]:
+    # The filter works on the detector scaled to the isocentre.
+    spacing = geometry.d_detector[1] * geometry.dso / geometry.dsd
+    return ramp_response(padded_length(geometry.n_detector[1]), spacing, window, cutoff)
+
+
+def _run(
+    read: Callable[[slice], NDArray[np.float32]],
+    geometry: Geometry,
+    weights: RayWeights,
+    ramp: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """Weight, filter and backproject a few views at a time; `read` gives line integrals that may be overwritten."""
+    n_v, n_u = geometry.n_detector
+    n_fft = padded_length(n_u)
+    cosine = _cosine_weights(geometry)
+    orbit = np.array([geometry.dso, geometry.dsd, *geometry.d_detector, *geometry.off_detector])
+    grid = np.array([*geometry.d_voxel, *geometry.off_origin, weights.radius])
+    volume = np.zeros(geometry.n_voxel, np.float32)
+    chunk = max(1, min(64, CHUNK_BYTES // (4 * n_v * n_fft)))
+    for first in range(0, geometry.n_views, chunk):
+        views = slice(first, min(first + chunk, geometry.n_views))
+        p = read(views)
+        p *= cosine
+        p *= weights.values[views, None, :]
+        backproject(filter_rows(p, ramp, n_fft), geometry.angles[views], orbit, grid, volume)
+    return volume
+
+
+def _cosine_weights(geometry: Geometry) -> NDArray[np.float32]:
+    """Cosine of the angle between each ray and the central ray, [v, u]."""
+    (n_v, n_u), (d_v, d_u), (off_v, off_u) = geometry.n_detector, geometry.d_detector, geometry.off_detector
+    v = (np.arange(n_v) - (n_v - 1) / 2) * d_v + off_v
+    u = (np.arange(n_u) - (n_u - 1) / 2) * d_u + off_u
+    return (geometry.dsd / np.sqrt(geometry.dsd**2 + u[None, :] ** 2 + v[:, None] ** 2)).astype(np.float32)

@@ -1,0 +1,74 @@
+"""Line integrals from counts: the logarithm, its floor, and the mask of pixels that hit it."""
+
+import math
+
+import numpy as np
+import torch
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from ctsim.types import Scan
+
+
+def count_floor(scan: Scan) -> float:
+    """Return the smallest signal, in counts above the pedestal, whose logarithm is taken.
+
+    Half a photon's worth (mean open field / (2 i0)), and at least half a count where counts are integers:
+    below that a reading says no more than "nothing seen".
+    """
+    half_photon = 0.5 * float(scan.flat.double().mean()) / scan.i0
+    half_count = 0.0 if scan.counts.is_floating_point() else 0.5
+    floor = max(half_photon, half_count)
+    return floor if math.isfinite(floor) and floor > 0 else 0.5
+
+
+def line_integrals(scan: Scan, view: int | slice) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return p = −ln(max(counts − dark, floor) / flat), float32, and the mask of clamped pixels, bool.
+
+    Shapes are [v, u] for one view and [view, v, u] for a slice. `flat` is the open field above the
+    pedestal. Readings that are not finite, and pixels whose open field is below the floor, count as clamped.
+    """
+    counts = scan.counts[view].numpy()
+    stack = counts[None] if counts.ndim == 2 else counts
+    p = np.empty(stack.shape, np.float32)
+    clamped = np.empty(stack.shape, np.bool_)
+    floor = count_floor(scan)
+    log_open, dead = _log_open(scan.flat.numpy(), floor)
+    if stack.dtype == np.uint16:
+        # 65536 logarithms serve all pixels.
+        signal = np.arange(65536) - scan.dark
+        table = np.log(np.maximum(signal, floor)).astype(np.float32)
+        _look_up(stack, table, signal <= floor, log_open, dead, p, clamped)
+    else:
+        _take_log(np.asarray(stack, np.float32), np.float32(scan.dark), np.float32(floor), log_open, dead, p, clamped)
+    p, clamped = p.reshape(counts.shape), clamped.reshape(counts.shape)
+    return torch.from_numpy(p), torch.from_numpy(clamped)
+
+
+def _log_open(flat: NDArray[np.float32], floor: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    usable = np.isfinite(flat) & (flat > floor)
+    log_open = np.log(np.where(usable, flat, floor).astype(np.float64)).astype(np.float32)
+    return log_open, ~usable
+
+
+@njit(parallel=True, cache=True)
+def _look_up(counts, table, low, log_open, dead, p, clamped):  # noqa: ANN001, ANN202
+    n_view, n_v, n_u = counts.shape
+    for row in prange(n_view * n_v):
+        view, v = row // n_v, row % n_v
+        for u in range(n_u):
+            c = counts[view, v, u]
+            p[view, v, u] = log_open[v, u] - table[c]
+            clamped[view, v, u] = low[c] | dead[v, u]
+
+
+@njit(parallel=True, cache=True)
+def _take_log(counts, dark, floor, log_open, dead, p, clamped):  # noqa: ANN001, ANN202
+    n_view, n_v, n_u = counts.shape
+    for row in prange(n_view * n_v):
+        view, v = row // n_v, row % n_v
+        for u in range(n_u):
+            signal = counts[view, v, u] - dark
+            seen = floor < signal < np.float32(np.inf)
+            p[view, v, u] = log_open[v, u] - math.log(signal if seen else floor)
+            clamped[view, v, u] = (not seen) | dead[v, u]
