@@ -1,10 +1,17 @@
 """What the detector writes: photon noise, electronic noise, fixed pattern, ADC, flat field."""
 
-from typing import Annotated, Literal
+import math
+from typing import Annotated, Any, Literal
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
+from ctsim import rng
 from ctsim.errors import InputError
+from ctsim.kernels import noise_cpu
+
+_NO_PATTERN = np.empty((0, 0), np.float32)
 
 
 class Noise(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -43,3 +50,117 @@ class Noise(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise InputError(f"noise.fixed_pattern must be within [0, 0.3], got {self.fixed_pattern}")
         if not 0 <= self.dead_fraction < 1:
             raise InputError(f"noise.dead_fraction must be within [0, 1), got {self.dead_fraction}")
+
+    @property
+    def has_adc(self) -> bool:
+        """Whether counts are whole numbers of an ADC."""
+        return self.model == "compound" and self.adc_bits is not None
+
+    @property
+    def dtype(self) -> type[np.uint16] | type[np.float32]:
+        """Type of the counts."""
+        return np.uint16 if self.has_adc else np.float32
+
+    @property
+    def full_scale(self) -> int:
+        """Highest count, 0 without an ADC."""
+        return 2**self.adc_bits - 1 if self.has_adc and self.adc_bits is not None else 0
+
+    @property
+    def dark(self) -> float:
+        """Counts at no signal: the pedestal, a whole number."""
+        return float(round(self.pedestal * self.full_scale))
+
+    def gain(self, i0: float) -> float:
+        """Return the counts of the open field above `dark`: counts = dark + gain(i0)·relative signal."""
+        return self.adc_fill * self.full_scale - self.dark if self.has_adc else float(i0)
+
+
+def pixel_pattern(shape: tuple[int, int], *, noise: Noise, scene_id: str) -> NDArray[np.float32] | None:
+    """Return each pixel's gain around 1, float32 [v, u], 0 where the pixel is dead; None if all are 1.
+
+    Gains are Gaussian with standard deviation `fixed_pattern`, not below 0.05.
+    """
+    if noise.fixed_pattern == 0 and noise.dead_fraction == 0:
+        return None
+    n = shape[0] * shape[1]
+    gains = 1.0 + noise.fixed_pattern * rng.normal(rng.stream_key(scene_id, "pixel gain", 0), n)[:, 0]
+    dead = rng.uniform(rng.stream_key(scene_id, "dead pixels", 0), n)[:, 0] < noise.dead_fraction
+    return np.where(dead, 0.0, np.maximum(gains, 0.05)).reshape(shape).astype(np.float32)
+
+
+def detect(
+    m1: NDArray[Any],
+    m2: NDArray[Any],
+    *,
+    noise: Noise,
+    i0: float,
+    key: np.uint64,
+    pattern: NDArray[np.float32] | None = None,
+    out: NDArray[Any] | None = None,
+) -> NDArray[Any]:
+    """Draw what the detector writes in one view, [v, u] of type `noise.dtype`, into `out` if given.
+
+    `m1` is the mean signal relative to the open field, scatter included, and `m2` the second moment Σ w2·e^(−τ):
+    without electronics the relative signal has variance m2/i0. One draw has that mean, that variance and nearly
+    the compound Poisson's skewness: g·Poisson(i0·m1²/m2), g = m2/(m1·i0). `key` names the view's stream
+    (`rng.stream_key`); `pattern` comes from `pixel_pattern`. Model "none" draws nothing. Model "tigre" takes p
+    relative to the view's largest p before the draw (TIGRE: the largest of the whole scan), ignoring m2 and pattern.
+
+    Raises InputError on moments that are negative, not finite, or m2 = 0 where m1 > 0.
+    """
+    if m1.ndim != 2 or m1.shape != m2.shape:
+        raise InputError(f"expected m1 and m2 of one shape [v, u], got {m1.shape} and {m2.shape}")
+    if not 0 < i0 <= 1e12:
+        raise InputError(f"i0 must be within (0, 1e12] photons, got {i0}")
+    if pattern is not None and pattern.shape != m1.shape:
+        raise InputError(f"pattern has shape {pattern.shape}, the view {m1.shape}")
+    if out is None:
+        out = np.empty(m1.shape, noise.dtype)
+    elif out.shape != m1.shape or out.dtype != noise.dtype:
+        raise InputError(f"out must be {np.dtype(noise.dtype)} {m1.shape}, got {out.dtype} {out.shape}")
+    if m1.dtype != np.float32 or m2.dtype != np.float32:
+        m1, m2 = m1.astype(np.float64, copy=False), m2.astype(np.float64, copy=False)
+    if noise.model == "compound":
+        bad = np.zeros(m1.shape[0], np.uint8)
+        gains = _NO_PATTERN if pattern is None else pattern.astype(np.float32, copy=False)
+        scale = (float(i0), noise.electronic, noise.gain(i0), noise.dark, float(noise.full_scale))
+        noise_cpu.detect(m1, m2, gains, *scale, np.uint64(key), out, bad)
+        if bad.any():
+            raise InputError(f"detector row {int(bad.argmax())}: m1 and m2 must be finite and m2 > 0 where m1 > 0")
+        return out
+    if not (np.isfinite(m1).all() and (m1 >= 0).all()):
+        raise InputError("m1 must be finite and not negative")
+    if noise.model == "none":
+        out[...] = m1 * i0 if pattern is None else m1 * i0 * pattern
+        return out
+    lowest = float(m1[m1 > 0].min(initial=1.0))
+    top = -math.log(lowest)
+    # An open view has nothing to normalise by; 1 leaves p as it is.
+    noise_cpu.detect_tigre(m1, top if top > 0 else 1.0, float(i0), noise.electronic, np.uint64(key), out)
+    return out
+
+
+def flat_field(
+    shape: tuple[int, int],
+    *,
+    noise: Noise,
+    i0: float,
+    scene_id: str,
+    pattern: NDArray[np.float32] | None = None,
+    m2_open: float = 1.0,
+) -> NDArray[np.float32]:
+    """Return the open-field image in counts, pedestal included, float32 [v, u].
+
+    It is the mean of `noise.n_flats` views without an object through the same detector, or exact when that is 0
+    and for the models "tigre" and "none". `m2_open` is Σ w2. A dead pixel reads exactly `noise.dark`.
+    """
+    if noise.n_flats == 0 or noise.model != "compound":
+        ones = np.ones(shape) if pattern is None else pattern
+        return (noise.dark + noise.gain(i0) * ones).astype(np.float32)
+    m1, m2 = np.ones(shape, np.float32), np.full(shape, m2_open, np.float32)
+    total, counts = np.zeros(shape), np.empty(shape, noise.dtype)
+    for k in range(noise.n_flats):
+        key = rng.stream_key(scene_id, "flat", k)
+        total += detect(m1, m2, noise=noise, i0=i0, key=key, pattern=pattern, out=counts)
+    return (total / noise.n_flats).astype(np.float32)

@@ -19,7 +19,12 @@ _TWO_M53, _TWO_M32 = 2.0**-53, 2.0**-32
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 # Below this mean inversion is used; the transformed rejection needs at least 10.
 _SMALL = 10.0
-_LOG_FACTORIAL = np.array([math.lgamma(k + 1.0) for k in range(16)])
+# Up to here k·log(mean) − mean − log k! loses less than 1e-12, and a table is faster than Stirling's series.
+_TABLE = 1024
+# A mean above this is a mistake (m2 far below m1², say), not a signal.
+_MOST = 1e30
+_FLOAT32_MAX = float(np.finfo(np.float32).max)
+_LOG_FACTORIAL = np.array([math.lgamma(k + 1.0) for k in range(_TABLE)])
 _RECIPROCAL = np.array([0.0] + [1.0 / k for k in range(1, 128)])
 
 
@@ -68,11 +73,11 @@ def normal(word):
 
 @njit(cache=True)
 def log_poisson(k, mean):
-    """Return log(mean^k·e^(−mean)/k!) without cancellation, to about 1e-15 relative even at means of 1e12.
+    """Return log(mean^k·e^(−mean)/k!) to about 1e-12 even at means of 1e12, where the plain formula loses 1e-2.
 
     Stirling's series for k!, and k·log(k/mean) + mean − k by the series of log((1+v)/(1−v)) near k = mean.
     """
-    if k < 16.0:
+    if k < _TABLE:
         return k * math.log(mean) - mean - _LOG_FACTORIAL[int(k)]
     v = (k - mean) / (k + mean)
     if abs(v) < 0.1:
@@ -80,7 +85,7 @@ def log_poisson(k, mean):
         term = 2.0 * k * v
         for j in range(1, 20):
             term *= v * v
-            step = term / (2 * j + 1)
+            step = term * _RECIPROCAL[2 * j + 1]
             deviance += step
             if abs(step) <= 1e-17 * deviance:
                 break
@@ -102,16 +107,13 @@ def _poisson_small(mean, u):
 
 
 @njit(cache=True)
-def _poisson_retry(mean, b, a, w0, w1, w2, index, key):
-    """Finish Hörmann's rejection from a first block that missed the quick test."""
+def _poisson_retry(mean, b, a, v_quick, u, v, index, key):
+    """Finish Hörmann's rejection from a first pair (u, v) that missed the quick test."""
     inverse_alpha = 1.1239 + 1.1328 / (b - 3.4)
-    v_quick = 0.9277 - 3.6224 / (b - 2.0)
     draw = 0
     while True:
-        u = float(((w0 << _32) | w1) >> _11) * _TWO_M53 - 0.5 + 0.5 * _TWO_M53
-        v = (float(w2) + 0.5) * _TWO_M32
         us = 0.5 - abs(u)
-        k = math.floor((2.0 * a / us + b) * u + mean + 0.43)
+        k = np.floor((2.0 * a / us + b) * u + mean + 0.43)
         if us >= 0.07 and v <= v_quick:
             return k
         if (
@@ -122,6 +124,8 @@ def _poisson_retry(mean, b, a, w0, w1, w2, index, key):
             return k
         draw += 1
         w0, w1, w2, _ = philox(index & _LOW, index >> _32, np.uint64(draw), np.uint64(0), key & _LOW, key >> _32)
+        u = float(((w0 << _32) | w1) >> _11) * _TWO_M53 - (0.5 - 0.5 * _TWO_M53)
+        v = (float(w2) + 0.5) * _TWO_M32
 
 
 @njit(cache=True, inline="always")
@@ -136,10 +140,12 @@ def _poisson(mean, w0, w1, w2, index, key):
     b = 0.931 + 2.53 * math.sqrt(mean)
     a = -0.059 + 0.02483 * b
     u -= 0.5 - 0.5 * _TWO_M53
+    v = (float(w2) + 0.5) * _TWO_M32
     us = 0.5 - abs(u)
-    if us >= 0.07 and (float(w2) + 0.5) * _TWO_M32 <= 0.9277 - 3.6224 / (b - 2.0):
-        return math.floor((2.0 * a / us + b) * u + mean + 0.43)
-    return _poisson_retry(mean, b, a, w0, w1, w2, index, key)
+    v_quick = 0.9277 - 3.6224 / (b - 2.0)
+    if us >= 0.07 and v <= v_quick:
+        return np.floor((2.0 * a / us + b) * u + mean + 0.43)
+    return _poisson_retry(mean, b, a, v_quick, u, v, index, key)
 
 
 @njit(cache=True)
@@ -182,12 +188,14 @@ def detect(m1, m2, pattern, i0, electronic, gain, dark, full, key, out, bad):
             mean = float(m1[v, u])
             second = float(m2[v, u])
             signal = 0.0
-            if mean > 0.0 and second > 0.0 and mean < np.inf and second < np.inf:
+            photons = 0.0
+            if mean > 0.0 and second > 0.0:
                 photons = i0 * mean * (mean / second)
+            if 0.0 < photons <= _MOST:
                 hi, lo = words[0, u], words[1, u]
                 k = _poisson(photons, hi >> _32, hi & _LOW, lo >> _32, first + np.uint64(u), key)
                 signal = k * (second / (mean * i0))
-            elif not (mean == 0.0 and second >= 0.0 and second < np.inf):
+            elif not (mean == 0.0 and 0.0 <= second < np.inf):
                 wrong = True
             value = dark
             factor = 1.0 if pattern.size == 0 else float(pattern[v, u])
@@ -197,7 +205,7 @@ def detect(m1, m2, pattern, i0, electronic, gain, dark, full, key, out, bad):
                 else:
                     value += gain * signal * factor
             if full > 0.0:
-                value = min(max(math.floor(value + 0.5), 0.0), full)
+                value = min(max(np.floor(value + 0.5), 0.0), full)
             out[v, u] = value
         bad[v] = wrong
 
@@ -206,7 +214,7 @@ def detect(m1, m2, pattern, i0, electronic, gain, dark, full, key, out, bad):
 def detect_tigre(m1, top, i0, electronic, key, out):
     """Draw one view's photons as TIGRE's CTnoise does, with p = −log m1 normalised by `top` before the draw.
 
-    counts = Poisson(i0·exp(−p/top)) + electronic·Gaussian, not below 1e-6; out = i0·(counts/i0)^top.
+    counts = Poisson(i0·exp(−p/top)) + electronic·Gaussian, not below 1e-6; out = i0·(counts/i0)^top, finite.
     """
     n_v, n_u = m1.shape
     key = np.uint64(key)
@@ -219,4 +227,4 @@ def detect_tigre(m1, top, i0, electronic, key, out):
             hi, lo = words[0, u], words[1, u]
             k = _poisson(mean, hi >> _32, hi & _LOW, lo >> _32, first + np.uint64(u), key)
             k = max(k + electronic * normal(lo & _LOW), 1e-6)
-            out[v, u] = i0 * (k / i0) ** top
+            out[v, u] = min(i0 * (k / i0) ** top, _FLOAT32_MAX)
