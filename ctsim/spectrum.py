@@ -1,0 +1,264 @@
+"""X-ray tubes: which photons reach the object.
+
+Energies are keV, thicknesses mm. A spectrum is the photon share per energy bin, after the tube's filters
+and without air; the bow-tie is not in it, because it is one more chord per ray.
+"""
+
+import functools
+import importlib.util
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctsim.errors import InputError
+from ctsim.materials import E_MIN, attenuation, mass_energy_transfer, material
+
+TABLE_KVP = (20.0, 300.0)
+_TABLE_ANGLE_DEG = (1.0, 40.0)
+_NEGLIGIBLE = 1e-12  # bins with less than this share of the largest are cut off at the soft end
+
+
+class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A sheet in front of the tube: material and thickness (mm)."""
+
+    material: str
+    thickness: float
+
+    def __post_init__(self) -> None:
+        material(self.material)
+        if not (math.isfinite(self.thickness) and self.thickness >= 0):
+            raise InputError(f"filter {self.material!r}: thickness must be at least 0 mm, got {self.thickness}")
+
+
+class Bowtie(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A filter that thickens from `center` to `edge` (mm) at the fan angle ±`half_angle_deg`, as its square."""
+
+    material: str = "Al"
+    center: float
+    edge: float
+    half_angle_deg: float
+
+    def __post_init__(self) -> None:
+        material(self.material)
+        for name in ("center", "edge"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise InputError(f"bowtie: {name} must be at least 0 mm, got {value}")
+        if not 0 < self.half_angle_deg < 90:
+            raise InputError(f"bowtie: half_angle_deg must be within (0, 90), got {self.half_angle_deg}")
+
+
+class Tube(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An X-ray tube with a tungsten anode.
+
+    `model`: "table" interpolates bundled SpekPy spectra, 20–300 kVp; "finkelshtein-pavlova" is a closed form
+    for 10–500 kVp; "spekpy" asks the installed SpekPy; "mono" is one energy, `kvp` keV, that no filter changes.
+    """
+
+    kvp: float = 90.0
+    anode_deg: float = 11.0
+    filters: tuple[Filter, ...] = (Filter(material="Al", thickness=0.5),)
+    model: Literal["table", "finkelshtein-pavlova", "spekpy", "mono"] = "table"
+    heel: bool = False
+    bowtie: Bowtie | None = None
+
+    def __post_init__(self) -> None:
+        if self.model not in ("table", "finkelshtein-pavlova", "spekpy", "mono"):
+            raise InputError(
+                f"tube: model must be 'table', 'finkelshtein-pavlova', 'spekpy' or 'mono', got {self.model!r}"
+            )
+        low, high = (2.0, 500.0) if self.model == "mono" else (10.0, 500.0)
+        if not (math.isfinite(self.kvp) and low <= self.kvp <= high):
+            raise InputError(f"tube: kvp must be within [{low:g}, {high:g}] for model {self.model!r}, got {self.kvp}")
+        if self.model == "table" and not TABLE_KVP[0] <= self.kvp <= TABLE_KVP[1]:
+            raise InputError(
+                f"tube: the bundled table covers {TABLE_KVP[0]:g} to {TABLE_KVP[1]:g} kVp, got {self.kvp:g}; "
+                "model = 'finkelshtein-pavlova' covers 10 to 500"
+            )
+        low, high = _TABLE_ANGLE_DEG
+        if not (math.isfinite(self.anode_deg) and low <= self.anode_deg <= high):
+            raise InputError(f"tube: anode_deg must be within [{low:g}, {high:g}], got {self.anode_deg}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spectrum:
+    """Photon shares `weights` [n] (sum 1) in bins around `energies` [n] (keV, ascending).
+
+    `fluence` is photons per cm2 at 1 m and mAs behind the filters, nan where the model does not know it.
+    """
+
+    energies: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    fluence: float = math.nan
+
+    def __post_init__(self) -> None:
+        e, w = self.energies, self.weights
+        if e.ndim != 1 or e.shape != w.shape or e.size == 0:
+            raise InputError(f"a spectrum needs as many weights as energies, got {w.shape} and {e.shape}")
+        if not (np.all(np.isfinite(e)) and np.all(np.diff(e) > 0) and e[0] > 0):
+            raise InputError("a spectrum's energies must be positive, finite and ascending")
+        if not (np.all(np.isfinite(w)) and w.min() >= 0 and abs(w.sum() - 1) < 1e-9):
+            raise InputError("a spectrum's weights must be non-negative and sum to 1")
+
+    @property
+    def mean(self) -> float:
+        """Mean photon energy (keV)."""
+        return float(self.energies @ self.weights)
+
+    @property
+    def e_max(self) -> float:
+        """Highest photon energy (keV)."""
+        return float(self.energies[-1])
+
+    def hvl(self, which: str = "Al", order: int = 1) -> float:
+        """Return the `order`-th half-value layer (mm) of a material, in air kerma."""
+        mu = attenuation(which, self.energies)
+        kerma = self.weights * self.energies * mass_energy_transfer("air", self.energies)
+        start = _thickness_to(kerma, mu, 0.5 ** (order - 1))
+        return _thickness_to(kerma, mu, 0.5**order) - start
+
+
+def _thickness_to(kerma: NDArray[np.float64], mu: NDArray[np.float64], share: float) -> float:
+    """Thickness behind which `share` of the kerma is left, by Newton on the log, which is convex."""
+    total, thickness = kerma.sum(), 0.0
+    for _ in range(60):
+        left = kerma * np.exp(-mu * thickness)
+        step = math.log(left.sum() / total / share) * left.sum() / float(left @ mu)
+        thickness += step
+        if abs(step) <= 1e-12 * max(thickness, 1e-12):
+            break
+    return thickness
+
+
+@functools.lru_cache(maxsize=64)
+def spectrum(tube: Tube) -> Spectrum:
+    """Return the tube's spectrum on its central ray, behind its filters; bins of at most 0.25 keV to 100 kVp.
+
+    Raises InputError where model "spekpy" is asked for and not installed, or where filters leave nothing.
+    """
+    if tube.model == "mono":
+        return _frozen(np.array([tube.kvp]), np.ones(1))
+    e, photons = _behind_filters(tube, math.radians(tube.anode_deg))
+    total = float(photons.sum())
+    if not total > 0 or not math.isfinite(total):
+        raise InputError(f"tube: the filters {tube.filters} leave no photons at {tube.kvp:g} kVp")
+    first = int(np.argmax(photons > _NEGLIGIBLE * photons.max()))
+    return _frozen(e[first:], photons[first:] / photons[first:].sum(), total)
+
+
+def _frozen(e: NDArray[np.float64], w: NDArray[np.float64], fluence: float = math.nan) -> Spectrum:
+    e.flags.writeable = w.flags.writeable = False
+    return Spectrum(energies=e, weights=w, fluence=fluence)
+
+
+def _behind_filters(tube: Tube, takeoff: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Bin centres (keV) and photons per bin, cm2 at 1 m and mAs at a take-off angle (radians)."""
+    n = math.ceil((tube.kvp - E_MIN) / max(0.25, tube.kvp / 400))
+    edges = np.linspace(E_MIN, tube.kvp, n + 1)
+    e = 0.5 * (edges[1:] + edges[:-1])
+    width = edges[1] - edges[0]
+    density, line_e, line_photons = _anode(tube, takeoff, e)
+    transmitted = density * width * _transmission(tube.filters, e)
+    if line_e.size:
+        line_photons = line_photons * _transmission(tube.filters, line_e)
+        # Shared between the two nearest bins: keeps number and mean energy.
+        at = np.clip((line_e - e[0]) / width, 0, n - 1)
+        low = np.minimum(at.astype(int), n - 2)
+        np.add.at(transmitted, low, line_photons * (1 - (at - low)))
+        np.add.at(transmitted, low + 1, line_photons * (at - low))
+    return e, transmitted
+
+
+def _transmission(filters: tuple[Filter, ...], e: NDArray[np.float64]) -> NDArray[np.float64]:
+    depth = np.zeros(e.size)
+    for f in filters:
+        depth += attenuation(f.material, e) * f.thickness
+    return np.exp(-depth)
+
+
+def _anode(
+    tube: Tube, takeoff: float, e: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Unfiltered continuum per keV at `e`, and the lines' energies and photons."""
+    from ctsim import anode
+
+    if tube.model == "finkelshtein-pavlova":
+        return anode.continuum(tube.kvp, takeoff, e), *anode.lines(tube.kvp, takeoff)
+    if tube.model == "spekpy":
+        return _from_spekpy(tube.kvp, takeoff, e), np.zeros(0), np.zeros(0)
+    t = _table()
+    weights = _node_weights(t, tube.kvp, math.degrees(takeoff))
+    log_g = sum(w * t["log_continuum"][i, j] for i, j, w in weights)
+    log_line = sum(w * t["log_line"][i, j] for i, j, w in weights)
+    continuum = np.exp(np.interp(e / tube.kvp, t["u"], log_g)) * (tube.kvp / e - 1)
+    continuum *= anode.self_absorption(tube.kvp, takeoff, e)
+    on = tube.kvp > t["line_edge"]
+    photons = np.exp(log_line[on]) * (tube.kvp / t["line_edge"][on] - 1) ** 1.65
+    return continuum, t["line_energy"][on], photons
+
+
+@functools.lru_cache(maxsize=1)
+def _table() -> dict[str, NDArray[np.float64]]:
+    with np.load(Path(__file__).with_name("data") / "tungsten_spectra.npz", allow_pickle=False) as file:
+        return {name: file[name].astype(np.float64) for name in file.files}
+
+
+def _node_weights(t: dict[str, NDArray[np.float64]], kvp: float, angle_deg: float) -> list[tuple[int, int, float]]:
+    """Bilinear weights in log kVp and log angle: (kVp index, angle index, weight)."""
+    out = [(0, 0, 1.0)]
+    for axis, value in enumerate((kvp, angle_deg)):
+        grid = np.log(t["kvp"] if axis == 0 else t["angle_deg"])
+        at = float(np.clip(np.interp(math.log(value), grid, np.arange(grid.size)), 0, grid.size - 1))
+        low = min(int(at), grid.size - 2)
+        parts = ((low, 1 - (at - low)), (low + 1, at - low))
+        out = [((i, j) if axis == 0 else (o[0], i)) + (o[2] * w,) for o in out for i, w in parts for j in (0,)]
+    return [o for o in out if o[2] > 0]
+
+
+def _from_spekpy(kvp: float, takeoff: float, e: NDArray[np.float64]) -> NDArray[np.float64]:
+    if importlib.util.find_spec("spekpy") is None:
+        raise InputError("tube: model 'spekpy' needs SpekPy; install the extra: pip install 'ctsim[spekpy]'")
+    import spekpy  # pyright: ignore[reportMissingImports]
+
+    tube = spekpy.Spek(
+        kvp=kvp, th=math.degrees(takeoff), physics="casim", mu_data_source="nist", dk=e[1] - e[0], mas=1, z=100
+    )
+    k, flux = tube.get_spectrum()
+    return np.interp(e, k, flux)
+
+
+def heel_factor(tube: Tube, angles_rad: ArrayLike) -> NDArray[np.float64]:
+    """Return the energy fluence at emission angles (radians) relative to the central ray; 0 behind the anode.
+
+    The angle lies in the plane of the electron beam and the central ray; negative leans towards the anode,
+    so that the take-off angle is anode_deg + angle. Beyond −anode_deg nothing gets out. Hardening along
+    the heel is in the intensity, not in the spectrum that the simulator uses.
+    """
+    angles = np.asarray(angles_rad, dtype=np.float64)
+    takeoff = math.radians(tube.anode_deg) + angles
+    if tube.model == "mono":
+        return np.where(takeoff > 0, 1.0, 0.0)
+    nodes, values = _heel_curve(tube)
+    inside = np.interp(takeoff, nodes, values)
+    return np.where(takeoff > 0, inside, 0.0)
+
+
+@functools.lru_cache(maxsize=16)
+def _heel_curve(tube: Tube) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    low, high = (math.radians(a) for a in _TABLE_ANGLE_DEG)
+    nodes = np.geomspace(low, high, 48)
+    energy = np.array([float(np.dot(*_behind_filters(tube, a))) for a in nodes])
+    center = float(np.dot(*_behind_filters(tube, math.radians(tube.anode_deg))))
+    # Below the first node intensity falls to zero with the sine of the take-off angle.
+    return np.concatenate([[0.0], nodes]), np.concatenate([[0.0], energy]) / center
+
+
+def bowtie_thickness(bowtie: Bowtie, fan_angle: ArrayLike) -> NDArray[np.float64]:
+    """Return the chord (mm) through the bow-tie at fan angles (radians); constant beyond its half angle."""
+    share = np.minimum(np.abs(np.asarray(fan_angle, dtype=np.float64)) / math.radians(bowtie.half_angle_deg), 1.0)
+    return bowtie.center + (bowtie.edge - bowtie.center) * share**2
