@@ -1,0 +1,120 @@
+"""Files that survive: locks between processes, flushing, and putting a finished folder in its place."""
+
+import ctypes
+import errno
+import fcntl
+import os
+import shutil
+import sys
+from pathlib import Path
+
+from ctsim.errors import InputError
+
+_AT_FDCWD = -100
+_RENAME_EXCHANGE = 2
+
+
+def lock(path: Path) -> int:
+    """Take the lock file `path` and return its handle; `unlock` gives it back.
+
+    Raises
+    ------
+    InputError
+        When another process has it.
+    """
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            mine = os.fstat(handle)
+            if path.exists() and path.stat().st_ino == mine.st_ino:
+                return handle
+        except BlockingIOError:
+            os.close(handle)
+            scene = path.name.removeprefix(".").removesuffix(".lock")
+            raise InputError(f"{path.parent}: another process is writing the scene {scene!r}") from None
+        except BaseException:
+            os.close(handle)
+            raise
+        os.close(handle)  # its owner removed the file between our open and our lock
+
+
+def unlock(path: Path, handle: int) -> None:
+    """Remove the lock file while it is still held, then let go."""
+    path.unlink(missing_ok=True)
+    os.close(handle)
+
+
+def sync(path: Path) -> None:
+    """Flush one file or folder to the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def sync_tree(folder: Path) -> None:
+    """Flush every file and folder below `folder`, and itself, to the disk."""
+    for path in folder.rglob("*"):
+        sync(path)
+    sync(folder)
+
+
+def write_synced(path: Path, data: bytes) -> None:
+    """Replace a small file whole: after a crash it holds the old or the new bytes."""
+    aside = path.with_name(path.name + ".new")
+    with aside.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    aside.replace(path)
+
+
+def put_in_place(new: Path, final: Path) -> None:
+    """Rename folder `new` to `final`; a folder that is there is swapped out in one step and removed.
+
+    Where the system cannot swap, the old folder is moved aside first; `recover` mends a crash between.
+    """
+    old = _aside(final)
+    if not final.exists():
+        new.rename(final)
+    else:
+        shutil.rmtree(old, ignore_errors=True)
+        if _exchange(new, final):
+            new.rename(old)
+        else:
+            final.rename(old)
+            new.rename(final)
+        shutil.rmtree(old)
+    sync(final.parent)
+
+
+def recover(final: Path) -> None:
+    """Finish or undo a `put_in_place` that was cut off."""
+    old = _aside(final)
+    if old.exists() and not final.exists():
+        old.rename(final)
+    elif old.exists():
+        shutil.rmtree(old)
+
+
+def _aside(final: Path) -> Path:
+    return final.with_name(f".{final.name}.old")
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Swap two paths atomically; False where the system or file system cannot."""
+    if not sys.platform.startswith("linux"):
+        return False
+    try:
+        rename = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError):
+        return False
+    done = rename(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE)
+    if done == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.EPERM):
+        return False
+    raise OSError(code, os.strerror(code), str(other))

@@ -1,0 +1,212 @@
+"""What a data folder holds and whether it is still what was written: manifests, the index, verification.
+
+Every scene folder has a `manifest.json` with the size and SHA-256 of each of its files; the data folder
+has an `index.jsonl` with one line per finished scene (the last line of a name counts).
+"""
+
+import fcntl
+import hashlib
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import msgspec
+
+from ctsim.errors import InputError
+
+MANIFEST = "manifest.json"
+INDEX = "index.jsonl"
+PROGRESS = ".progress.json"
+OWN = (MANIFEST, PROGRESS, f"{PROGRESS}.new")  # our own notes, in no manifest
+FORMAT = 1
+_NOT_CONTENT = ("plan.json",)  # estimates of time and disk are no part of what a method sees
+
+
+class FileEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One file: its size and SHA-256, and for arrays the shape, dtype and byte offset of the data."""
+
+    bytes: int
+    sha256: str
+    shape: tuple[int, ...] | None = None
+    dtype: str | None = None
+    offset: int | None = None
+
+
+class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """All files of one finished scene by their path inside its folder."""
+
+    format: int
+    name: str
+    scene_id: str
+    plan_hash: str
+    content_hash: str
+    files: dict[str, FileEntry]
+
+
+class IndexLine(msgspec.Struct, frozen=True, kw_only=True):
+    """One finished scene in the index."""
+
+    name: str
+    scene_id: str
+    content_hash: str
+
+
+def file_sha256(path: Path) -> str:
+    """Return the SHA-256 of a file in hex, reading it in blocks."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def content_hash(files: dict[str, FileEntry]) -> str:
+    """Hash what the files hold, independent of their order and of the plan's estimates."""
+    lines = (f"{path} {entry.sha256}\n" for path, entry in sorted(files.items()) if path not in _NOT_CONTENT)
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Read a finished scene's manifest.
+
+    Raises
+    ------
+    InputError
+        When the folder is no finished scene, or its manifest is damaged or of another format.
+    """
+    path = folder / MANIFEST
+    try:
+        manifest = msgspec.json.decode(path.read_bytes(), type=Manifest)
+    except (FileNotFoundError, NotADirectoryError):
+        if not folder.is_dir():
+            raise InputError(f"{folder}: no such scene folder") from None
+        raise InputError(f"{folder}: not a finished scene, {MANIFEST} is missing (was it interrupted?)") from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: damaged manifest ({error})") from None
+    if manifest.format != FORMAT:
+        raise InputError(f"{path}: format {manifest.format}, this version reads format {FORMAT}")
+    return manifest
+
+
+def read_index(data_dir: Path) -> dict[str, IndexLine]:
+    """Read the index: the last line of each name, in the order in which names first appeared.
+
+    Raises
+    ------
+    InputError
+        When there is no index or a line other than an unfinished last one cannot be read.
+    """
+    path = data_dir / INDEX
+    try:
+        lines = path.read_bytes().split(b"\n")
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(f"{data_dir}: not a dataset folder, {INDEX} is missing") from None
+    found: dict[str, IndexLine] = {}
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        try:
+            entry = msgspec.json.decode(line, type=IndexLine)
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+            if number == len(lines):
+                continue  # no newline: an append that was cut off, repeated by the next run
+            raise InputError(f"{path}: line {number} is damaged ({error})") from None
+        found[entry.name] = entry
+    return found
+
+
+def append_index(data_dir: Path, entry: IndexLine) -> None:
+    """Append a line to the index unless it is already the last word on that name."""
+    line = msgspec.json.encode(entry) + b"\n"
+    handle = os.open(data_dir / INDEX, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        size = os.fstat(handle).st_size
+        if size:
+            if os.pread(handle, 1, size - 1) != b"\n":
+                whole = os.pread(handle, size, 0)
+                os.ftruncate(handle, whole.rfind(b"\n") + 1)
+            if read_index(data_dir).get(entry.name) == entry:
+                return
+        os.write(handle, line)
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def list_scans(data_dir: str | Path) -> tuple[Path, ...]:
+    """Return the folders of all finished scenes in the order in which they were made.
+
+    Raises
+    ------
+    InputError
+        When there is no index, or a scene that it names is gone.
+    """
+    data_dir = Path(data_dir)
+    folders = tuple(data_dir / name for name in read_index(data_dir))
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(f"{data_dir / INDEX} names the scene {folder.name!r} but its folder is missing")
+    return folders
+
+
+def check_sizes(folder: Path, manifest: Manifest) -> list[str]:
+    """List files that are missing or have another size than was written (quick: nothing is read)."""
+    problems = []
+    for name, entry in manifest.files.items():
+        path = folder / name
+        if not path.is_file():
+            problems.append(f"{path}: missing")
+        elif (size := path.stat().st_size) != entry.bytes:
+            how = "truncated" if size < entry.bytes else "too long"
+            problems.append(f"{path}: {how}, {size} bytes instead of {entry.bytes}")
+    return problems
+
+
+def verify_scene(folder: str | Path) -> list[str]:
+    """List everything that differs from what was written: missing, truncated, changed and extra files."""
+    folder = Path(folder)
+    try:
+        manifest = read_manifest(folder)
+    except InputError as error:
+        return [str(error)]
+    problems = check_sizes(folder, manifest)
+    for name, entry in manifest.files.items():
+        path = folder / name
+        if path.is_file() and path.stat().st_size == entry.bytes and file_sha256(path) != entry.sha256:
+            problems.append(f"{path}: changed, its SHA-256 is not the one written")
+    if content_hash(manifest.files) != manifest.content_hash:
+        problems.append(f"{folder / MANIFEST}: changed, its content hash does not fit its files")
+    present = {str(p.relative_to(folder)) for p in folder.rglob("*") if not p.is_dir()}
+    problems += [f"{folder / extra}: extra file" for extra in sorted(present - set(manifest.files) - set(OWN))]
+    return problems
+
+
+def verify(data_dir: str | Path) -> list[str]:
+    """List every problem of a data folder; an empty list means that all is as it was written.
+
+    Raises
+    ------
+    InputError
+        When the folder does not exist or has no index.
+    """
+    data_dir = Path(data_dir)
+    if not data_dir.is_dir():
+        raise InputError(f"{data_dir}: no such folder")
+    index = read_index(data_dir)
+    problems: list[str] = []
+    for name in sorted({*index, *_scene_names(data_dir.iterdir())}):
+        folder = data_dir / name
+        if not folder.is_dir():
+            problems.append(f"{folder}: missing, though {INDEX} names it")
+            continue
+        found = verify_scene(folder)
+        if name not in index:
+            found.append(f"{folder}: not in {INDEX}")
+        elif not found and read_manifest(folder).content_hash != index[name].content_hash:
+            found.append(f"{folder}: its content is not the one that {INDEX} names")
+        problems += found
+    unfinished = sorted(data_dir.glob(".*.partial"))
+    problems += [f"{p}: unfinished, make the scene again to go on from there" for p in unfinished]
+    return problems
+
+
+def _scene_names(paths: Iterable[Path]) -> set[str]:
+    return {p.name for p in paths if p.is_dir() and not p.name.startswith(".")}
