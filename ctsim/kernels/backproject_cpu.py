@@ -86,9 +86,7 @@ def _add_tiles(columns, cos, sin, orbit, grid, tiles, volume):  # noqa: ANN001, 
                     for view in range(first, last):
                         along = x_mm * cos[view] + y_mm * sin[view]
                         across = y_mm * cos[view] - x_mm * sin[view]
-                        _add_column(
-                            columns[view], along, across, orbit, grid, row, index, part, total[y - y0, x - x0]
-                        )
+                        _add_column(columns[view], along, across, orbit, grid, row, index, part, total[y - y0, x - x0])
         for z in range(n_z):
             for y in range(y0, y1):
                 for x in range(x0, x1):
@@ -116,18 +114,19 @@ def _add_column(columns, along, across, orbit, grid, row, index, part, total):  
     weight = (orbit[0] / distance) ** 2
     w_right = np.float32(weight * (u + 1 - left))
     w_left = np.float32(weight - weight * (u + 1 - left))
-    first = max(int(start + step * low + 1), 0)
-    last = min(int(start + step * (high - 1) + 1) + 2, n_v + 2)
-    a, b = columns[left], columns[left + np.uint32(1)]
-    for v in range(first, last):
-        row[v] = w_left * a[v] + w_right * b[v]
-    slope, origin = np.float32(step), np.float32(start + 1)
-    for z in range(low, high):
+    # One spare row on either side: the places below are rounded to float32.
+    first = max(int(start + step * low), 0)
+    last = min(int(start + step * (high - 1)) + 4, n_v + 2)
+    # Slices counted from zero spare the compiler negative indices, and so become vector code.
+    a, b, blend = columns[left, first:last], columns[left + np.uint32(1), first:last], row[: last - first]
+    for v in range(blend.size):
+        blend[v] = w_left * a[v] + w_right * b[v]
+    slope, origin = np.float32(step), np.float32(start + step * low + 1 - first)
+    index, part, total = index[: high - low], part[: high - low], total[low:high]
+    for z in range(index.size):
         place = origin + slope * np.float32(z)
-        # Rounding may step past the last interval; its neighbour holds the same border value.
-        cell = min(max(np.int32(place), np.int32(first)), np.int32(last - 2))
-        index[z] = cell
-        part[z] = place - np.float32(cell)
-    for z in range(low, high):
+        index[z] = np.int32(place)
+        part[z] = place - np.float32(np.int32(place))
+    for z in range(index.size):
         i = np.uint32(index[z])
-        total[z] += row[i] + part[z] * (row[i + np.uint32(1)] - row[i])
+        total[z] += blend[i] + part[z] * (blend[i + np.uint32(1)] - blend[i])
