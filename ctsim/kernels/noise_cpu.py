@@ -45,7 +45,7 @@ def philox(c0, c1, c2, c3, k0, k1):
 
 @njit(cache=True)
 def blocks(key, first, draw, out):
-    """Fill `out` uint32 [n, 4] with draw number `draw` of the pixels first, first + 1, …"""
+    """Fill `out` uint32 [n, 4] with draw number `draw` of the pixels first, first + 1 and on."""
     key = np.uint64(key)
     for i in range(out.shape[0]):
         index = np.uint64(first + i)

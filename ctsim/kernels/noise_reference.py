@@ -26,7 +26,7 @@ def _block(key, index, draw):
 
 
 def blocks(key, first, draw, out):
-    """Fill `out` uint32 [n, 4] with draw number `draw` of the pixels first, first + 1, …"""
+    """Fill `out` uint32 [n, 4] with draw number `draw` of the pixels first, first + 1 and on."""
     for i in range(len(out)):
         out[i] = _block(key, first + i, draw)
 
