@@ -47,6 +47,11 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
             material(self.metal)
 
+    def within(self, key: str, low: float, high: float) -> None:
+        """Raise `InputError` unless the setting `key` lies within [low, high]."""
+        if not low <= getattr(self, key) <= high:
+            raise InputError(f"{key} must be within {low} to {high}, got {getattr(self, key)}")
+
     @property
     def recipe(self) -> str:
         """The recipe's name in scene files."""

@@ -13,33 +13,12 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.settings import Simulation
+from ctsim.settings import Simulation, Truth
 from ctsim.types import Phantom, Scanner
 from phantoms.recipes import AnyRecipe, build_recipe
 from phantoms.scanners import REACH, ScannerSettings
 
 NULL = "null"  # how a scene file says None, which TOML lacks, where None is not the default
-
-
-class Truth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Which ground truths are written beside the counts; each costs time and disk.
-
-    `twin`: the metal-free scan with the same noise streams; `mono_kev`: energies (keV) of
-    monochromatic line integrals; `trace`: metal trace; `metal_path`: metal path length (mm);
-    `paths`: path length of every material (mm).
-    """
-
-    twin: bool = True
-    noise_free: bool = False
-    scatter_free: bool = False
-    mono_kev: tuple[float, ...] = ()
-    trace: bool = False
-    metal_path: bool = False
-    paths: bool = False
-
-    def __post_init__(self) -> None:
-        if not all(1.0 <= e <= 500.0 for e in self.mono_kev):
-            raise InputError(f"mono_kev must be within 1 to 500 keV, got {self.mono_kev}")
 
 
 class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
