@@ -236,7 +236,10 @@ def _k_share(z: int, energies: bytes) -> NDArray[np.float64]:
     out = np.zeros(e.size)
     if shell is not None:
         for i in np.flatnonzero(e > shell.edge):
-            out[i] = xrl.CS_Photo_Partial(z, xrl.K_SHELL, float(e[i])) / xrl.CS_Photo_Total(z, float(e[i]))
+            try:
+                out[i] = xrl.CS_Photo_Partial(z, xrl.K_SHELL, float(e[i])) / xrl.CS_Photo_Total(z, float(e[i]))
+            except ValueError:  # far above the edge of a light element: the jump at the edge
+                out[i] = 1 - 1 / xrl.JumpFactor(z, xrl.K_SHELL)
     return out
 
 
