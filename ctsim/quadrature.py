@@ -1,0 +1,195 @@
+"""Few energies that stand for all: Gauss quadrature with the detected spectrum as weight.
+
+The signal behind path lengths L is m1·Σ w1_k exp(−Σ_m μ_m(E_k) L_m), and its variance per incident photon,
+over m1², Σ w2_k exp(−τ_k). Nodes come from Lanczos with full reorthogonalisation on the fine spectrum, in
+intervals split at the K-edges of the object (Golub and Welsch 1969, doi:10.1090/S0025-5718-69-99647-1).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.detector import Detector, response
+from ctsim.errors import InputError
+from ctsim.materials import Material, attenuation, k_edges
+from ctsim.spectrum import Spectrum
+
+P_MAX = 14.6  # −log of the faintest signal that a rule answers for
+_N_MAX = 40
+_STEPS = (0.0, 0.03, 0.15, 0.5, 1.0)  # shares of each material's greatest length in the combinations tried
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EnergyRule:
+    """Energies and weights of a scan.
+
+    `w1` [N] sums to 1; `w2` [N] sums to m2/m1², so that a pixel that i0 photons would reach has the variance
+    Σ w2 exp(−τ)/i0 of its signal over the open one. `mean_signal` is m1, keV per incident photon (1 for a
+    counter: the share counted); `error` bounds |ΔP| over the path lengths tried.
+    """
+
+    energies: NDArray[np.float64]
+    w1: NDArray[np.float64]
+    w2: NDArray[np.float64]
+    mean_signal: float
+    error: float
+
+
+def full_rule(spectrum: Spectrum, detector: Detector) -> EnergyRule:
+    """Return the fine spectrum itself as a rule; its error is 0 by definition."""
+    a1, a2 = response(detector, spectrum.energies)
+    signal = spectrum.weights * a1
+    m1 = float(signal.sum())
+    if not m1 > 0:
+        raise InputError(f"the detector {detector.kind!r} sees nothing of a spectrum up to {spectrum.e_max:g} keV")
+    kept = signal > 0
+    return EnergyRule(
+        energies=spectrum.energies[kept],
+        w1=signal[kept] / m1,
+        w2=(spectrum.weights * a2)[kept] / m1**2,
+        mean_signal=m1,
+        error=0.0,
+    )
+
+
+def energy_rule(
+    spectrum: Spectrum,
+    detector: Detector,
+    materials: Sequence[str | Material],
+    max_lengths: Sequence[float],
+    tolerance: float = 1e-4,
+) -> EnergyRule:
+    """Return the smallest Gauss rule whose |ΔP| stays within `tolerance`.
+
+    `max_lengths` (mm) are the longest path per material; every combination of five shares of them is tried
+    up to P = 14.6. Raises InputError where 40 energies an interval do not reach the tolerance.
+    """
+    if len(materials) != len(max_lengths):
+        raise InputError(f"max_lengths must have one entry per material ({len(materials)}), got {len(max_lengths)}")
+    if not all(math.isfinite(v) and v >= 0 for v in max_lengths):
+        raise InputError(f"max_lengths must be at least 0 mm, got {tuple(max_lengths)}")
+    if not tolerance > 0:
+        raise InputError(f"tolerance must be positive, got {tolerance}")
+    fine = full_rule(spectrum, detector)
+    if fine.energies.size == 1:
+        return fine
+    used = [(m, length) for m, length in zip(materials, max_lengths, strict=True) if length > 0]
+    lengths = _combinations(np.array([length for _, length in used]))
+    mu_fine = np.array([attenuation(m, fine.energies) for m, _ in used]).reshape(len(used), fine.energies.size)
+    p_fine = _log_signal(fine.w1, lengths, mu_fine)
+    reached = p_fine <= P_MAX
+    lengths, p_fine = lengths[reached], p_fine[reached]
+    intervals = _intervals(fine, k_edges([m for m, _ in used], fine.energies[0], fine.energies[-1]))
+    error = math.inf
+    for n in range(1, _N_MAX + 1):
+        rule = _gauss(fine, intervals, n)
+        mu = np.array([attenuation(m, rule.energies) for m, _ in used]).reshape(len(used), rule.energies.size)
+        error = float(np.max(np.abs(_log_signal(rule.w1, lengths, mu) - p_fine)))
+        if error <= tolerance:
+            return EnergyRule(energies=rule.energies, w1=rule.w1, w2=rule.w2, mean_signal=rule.mean_signal, error=error)
+    raise InputError(f"{_N_MAX} energies leave |ΔP| = {error:.1e}, more than the tolerance {tolerance:.1e}")
+
+
+def gauss_rule(spectrum: Spectrum, detector: Detector, n: int, edges: Sequence[float] = ()) -> EnergyRule:
+    """Return the Gauss rule with `n` energies in every interval between `edges` (keV); its error is not measured."""
+    fine = full_rule(spectrum, detector)
+    return _gauss(fine, _intervals(fine, edges), n)
+
+
+def effective_weights(
+    spectrum: Spectrum, detector: Detector, water_length: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return energies [n] and ω [n] ∝ S·a1·exp(−μ_water·`water_length` mm), sum 1: the effective spectrum."""
+    if not (math.isfinite(water_length) and water_length >= 0):
+        raise InputError(f"water_length must be at least 0 mm, got {water_length}")
+    fine = full_rule(spectrum, detector)
+    depth = attenuation("water", fine.energies) * water_length
+    weights = fine.w1 * np.exp(depth.min() - depth)
+    return fine.energies, weights / weights.sum()
+
+
+def _combinations(max_lengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """All combinations [c, m] of shares of each length; beyond four materials, one to three at a time."""
+    m = max_lengths.size
+    if m <= 5:
+        grids = np.meshgrid(*([np.array(_STEPS)] * m), indexing="ij")
+        shares = np.stack([g.ravel() for g in grids], axis=1) if m else np.zeros((1, 0))
+        return shares * max_lengths
+    rng = np.random.Generator(np.random.Philox(key=m))
+    shares = rng.choice(_STEPS, size=(4000, m))
+    shares[:m] = np.eye(m)
+    shares[m] = 1.0
+    return shares * max_lengths
+
+
+def _log_signal(w1: NDArray[np.float64], lengths: NDArray[np.float64], mu: NDArray[np.float64]) -> NDArray[np.float64]:
+    depth = lengths @ mu
+    low = depth.min(axis=1)
+    return low - np.log(np.exp(low[:, None] - depth) @ w1)
+
+
+def _intervals(fine: EnergyRule, edges: Sequence[float]) -> list[slice]:
+    cuts = np.unique(np.concatenate([[0], np.searchsorted(fine.energies, edges), [fine.energies.size]])).astype(int)
+    return [slice(a, b) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
+
+
+def _gauss(fine: EnergyRule, intervals: list[slice], n: int) -> EnergyRule:
+    energies, w1, w2 = [], [], []
+    for part in intervals:
+        e, w = fine.energies[part], fine.w1[part]
+        nodes, weights = _lanczos(e, w, min(n, e.size))
+        # a2/a1 at the nodes, least squares with the weight w1 and orthogonal polynomials, keeps the moments of m2.
+        energies.append(nodes)
+        w1.append(weights)
+        w2.append(weights * _project(e, w, fine.w2[part] / w, nodes, weights))
+    return EnergyRule(
+        energies=np.concatenate(energies),
+        w1=np.concatenate(w1),
+        w2=np.concatenate(w2),
+        mean_signal=fine.mean_signal,
+        error=math.nan,
+    )
+
+
+def _lanczos(x: NDArray[np.float64], w: NDArray[np.float64], n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Nodes and weights [n] of the Gauss rule of the discrete measure w at x."""
+    total = w.sum()
+    q = np.zeros((n, x.size))
+    q[0] = np.sqrt(w / total)
+    alpha, beta = np.zeros(n), np.zeros(max(n - 1, 0))
+    for k in range(n):
+        v = x * q[k]
+        alpha[k] = q[k] @ v
+        if k + 1 == n:
+            break
+        for _ in range(2):  # twice is enough (Parlett): orthogonal to all before, to rounding
+            v = v - q[: k + 1].T @ (q[: k + 1] @ v)
+        beta[k] = np.linalg.norm(v)
+        q[k + 1] = v / beta[k]
+    jacobi = np.diag(alpha) + np.diag(beta, 1) + np.diag(beta, -1)
+    nodes, vectors = np.linalg.eigh(jacobi)
+    return nodes, total * vectors[0] ** 2
+
+
+def _project(
+    x: NDArray[np.float64],
+    w: NDArray[np.float64],
+    f: NDArray[np.float64],
+    nodes: NDArray[np.float64],
+    weights: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Values [n] at the nodes of f's w-orthogonal projection on polynomials of degree < n.
+
+    With them Σ w_k f_k p(x_k) equals the fine sum of w·f·p for every polynomial p of degree < n.
+    """
+    # Lagrange polynomials of the nodes are orthogonal under w: (ℓ_k, ℓ_k) = w_k.
+    difference = x[:, None] - nodes
+    basis = np.ones((x.size, nodes.size))
+    for k in range(nodes.size):
+        for j in range(nodes.size):
+            if j != k:
+                basis[:, k] *= difference[:, j] / (nodes[k] - nodes[j])
+    return (w * f) @ basis / weights
