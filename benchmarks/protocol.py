@@ -27,7 +27,6 @@ METAL_MARGIN = 2
 BODY_MARGIN = 4
 RANGE_PERCENTILE = 99.9
 ReferenceKind = Literal["effective", "50kev"]
-REFERENCES = {"effective": "effective spectrum", "50kev": "50 keV"}
 TISSUE = "inside the body dilated by 4 voxels, outside the metal dilated by 2"
 
 
@@ -65,13 +64,18 @@ class Stored(Protocol):
         ...
 
     @property
-    def metal(self) -> NDArray[np.uint8]:
-        """1 in the metal, [z, y, x]."""
+    def info(self) -> dict[str, Any]:
+        """What scan.json says; `seed` is the repetition's."""
         ...
 
     @property
-    def body(self) -> NDArray[np.bool_]:
-        """True in the object, [z, y, x]."""
+    def labels(self) -> NDArray[np.uint8]:
+        """Material labels, 0 is air: [z, y, x]."""
+        ...
+
+    @property
+    def metal(self) -> NDArray[np.uint8]:
+        """1 in the metal, [z, y, x]."""
         ...
 
     @property
@@ -84,8 +88,8 @@ class Stored(Protocol):
         """The same scan without its metal."""
         ...
 
-    def reference(self, kind: ReferenceKind) -> NDArray[np.float32]:
-        """Return the reference volume [z, y, x] in 1/mm."""
+    def reference(self, which: str) -> NDArray[np.float32]:
+        """Return the reference volume "effective" or "50kev", [z, y, x] in 1/mm."""
         ...
 
 
@@ -124,7 +128,7 @@ class Truth:
 
 def truth_of(stored: Stored) -> Truth:
     """Load the references of a stored scan and derive the regions from its masks."""
-    metal, body = np.asarray(stored.metal) > 0, np.asarray(stored.body) > 0
+    metal, body = np.asarray(stored.metal) > 0, np.asarray(stored.labels) > 0
     near_metal = metrics.dilate(metal, METAL_MARGIN) if metal.any() else metal
     judged = metrics.dilate(body | metal, BODY_MARGIN)
     tissue = judged & ~near_metal

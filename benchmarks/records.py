@@ -164,14 +164,17 @@ def read_all(results: Path) -> tuple[list[Record], list[Torn]]:
 
 
 def latest(records: list[Record]) -> list[Record]:
-    """Keep the last record of each scene, scan, seed, variant and method label, in order of first sight.
+    """Keep what a table shows: the last record of each scene, seed, variant and method label.
 
-    Other code versions of the same run are superseded too: a table shows one row for a method.
+    Only the newest data of a scene and seed count: a scan that was made anew supersedes all that was
+    measured on the old one, and a method's new code supersedes its old.
     """
+    newest = {(r.run.scene, r.run.seed): (r.run.scene_id, r.run.scan) for r in records}
     kept: dict[tuple[Any, ...], Record] = {}
     for record in records:
         run = record.run
-        kept[(run.scene, run.scene_id, run.scan, run.seed, run.variant, record.label)] = record
+        if newest[run.scene, run.seed] == (run.scene_id, run.scan):
+            kept[(run.scene, run.seed, run.variant, record.label)] = record
     return list(kept.values())
 
 

@@ -103,6 +103,11 @@ def test_latest_supersedes_other_code_versions():
     assert records.latest([old, new, record(seed=1)]) == [new, record(seed=1)]
 
 
+def test_a_scan_made_anew_supersedes_what_was_measured_on_the_old():
+    given = [record(), record(label="nmar"), record(scan="new"), record(seed=1)]
+    assert records.latest(given) == [record(scan="new"), record(seed=1)]
+
+
 def test_files_of_several_machines_merge(tmp_path):
     records.append(tmp_path / "records.jsonl", record())
     records.append(tmp_path / "records-other.jsonl", record(seed=1))
@@ -127,7 +132,8 @@ def test_measured_sees_time_and_memory():
 
 def test_methods_are_found_by_name_and_by_path(tmp_path, monkeypatch):
     (tmp_path / "my_lab_net.py").write_text(
-        "INPUTS = 'training'\n\ndef reconstruct(scan, *, device, steps=3, window='hann'):\n    return (scan, device, steps)\n"
+        "INPUTS = 'training'\n\n"
+        "def reconstruct(scan, *, device, steps=3, window='hann'):\n    return (scan, device, steps)\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     method = methods.find("my_lab_net:reconstruct", {"steps": 5})

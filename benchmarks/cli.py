@@ -1,0 +1,55 @@
+"""The commands `make-dataset` and `run-benchmark`: dispatch, and what the user's errors look like.
+
+Everything heavy is imported after the command line is understood, so that --help answers at once.
+"""
+
+import importlib
+import os
+import sys
+from collections.abc import Callable
+
+EXIT_USER, EXIT_INTERRUPTED = 2, 130
+
+
+def make_dataset() -> int:
+    """Run `make-dataset`; return the exit code."""
+    return guarded("make-dataset", "benchmarks.make_dataset", sys.argv[1:])
+
+
+def run_benchmark() -> int:
+    """Run `run-benchmark`, or `run-benchmark peers`; return the exit code."""
+    arguments = sys.argv[1:]
+    if arguments[:1] == ["peers"]:
+        return guarded("run-benchmark peers", "benchmarks.peers", arguments[1:])
+    return guarded("run-benchmark", "benchmarks.cli_run", arguments)
+
+
+def guarded(name: str, module: str, arguments: list[str]) -> int:
+    """Call `main(arguments) -> int` of a module; say the user's errors in one sentence, exit code 2.
+
+    Ctrl-C ends with 130; what was recorded until then stays. Other exceptions are ours and keep
+    their traceback.
+    """
+    import msgspec
+
+    from ctsim.errors import InputError
+
+    try:
+        main: Callable[[list[str]], int] = importlib.import_module(module).main
+        return main(arguments)
+    except BrokenPipeError:  # the reader of a pipe, such as head, went away
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (InputError, msgspec.ValidationError, msgspec.DecodeError) as error:
+        return _complain(name, " ".join(str(error).split()))
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _complain(name, f"{where}{error.strerror or error}")
+    except KeyboardInterrupt:
+        print(f"\n{name}: interrupted; what was finished is kept, run the same command to go on", file=sys.stderr)
+        return EXIT_INTERRUPTED
+
+
+def _complain(name: str, sentence: str) -> int:
+    print(f"{name}: {sentence}", file=sys.stderr)
+    return EXIT_USER

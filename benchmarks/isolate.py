@@ -1,0 +1,88 @@
+"""Run one method in a process of its own, with its own memory count and an optional time limit."""
+
+import multiprocessing
+import pkgutil
+import signal
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.records import Cost
+
+if TYPE_CHECKING:
+    from benchmarks.methods import Method
+
+_RESULT, _VALUES = "outcome.json", "values.npy"
+
+
+@dataclass(slots=True, kw_only=True)
+class Outcome:
+    """How a run ended: its status and reason, the volume [z, y, x] float32 in 1/mm if any, and its cost."""
+
+    status: str
+    reason: str = ""
+    values: NDArray[np.float32] | None = None
+    cost: Cost | None = None
+
+
+class _Ended(msgspec.Struct, frozen=True, kw_only=True):
+    """What the process leaves behind beside the volume."""
+
+    status: str
+    reason: str
+    cost: Cost | None
+
+
+def _work(store: str, folder: str, variant: str, method: "Method", device: str, out: str) -> None:
+    """Be the process: open the scan, warm up, run, leave the outcome in `out`."""
+    from benchmarks.run import attempt, variant_of, warm_up
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C means
+    scan = variant_of(pkgutil.resolve_name(store)(folder), variant).scan
+    outcome = attempt(method, scan, device, warm_up(method, scan, device))
+    if outcome.values is not None:
+        np.save(Path(out) / _VALUES, outcome.values)
+    cost = None if outcome.cost is None else msgspec.structs.replace(outcome.cost, isolated=True)
+    ended = _Ended(status=outcome.status, reason=outcome.reason, cost=cost)
+    (Path(out) / _RESULT).write_bytes(msgspec.json.encode(ended))
+
+
+def run_apart(store: str, folder: Path, variant: str, method: "Method", device: str, seconds: float | None) -> Outcome:
+    """Run `method` on the scan in `folder` in a new process and wait at most `seconds` for it.
+
+    The limit counts the whole process, with its start and compilation. `store` is the "module:function"
+    that opens the folder.
+    """
+    with tempfile.TemporaryDirectory(prefix="run-benchmark-") as out:
+        context = multiprocessing.get_context("spawn")
+        process: Any = context.Process(target=_work, args=(store, str(folder), variant, method, device, out))
+        process.start()
+        try:
+            process.join(seconds)
+            if process.is_alive():
+                return Outcome(status="timeout", reason=f"did not end within {seconds:g} s")
+        finally:
+            if process.is_alive():
+                process.kill()
+                process.join()
+        return _collect(Path(out), process.exitcode)
+
+
+def _collect(out: Path, exit_code: int) -> Outcome:
+    """Read what the process left, or say how it died."""
+    if not (out / _RESULT).exists():
+        if exit_code == -signal.SIGKILL and sys.platform != "win32":
+            return Outcome(
+                status="out_of_memory", reason="the process was killed, as the system does when memory is short"
+            )
+        how = f"signal {signal.Signals(-exit_code).name}" if exit_code < 0 else f"exit code {exit_code}"
+        return Outcome(status="error", reason=f"the process died with {how}")
+    ended = msgspec.json.decode((out / _RESULT).read_bytes(), type=_Ended)
+    values = np.load(out / _VALUES) if (out / _VALUES).exists() else None
+    return Outcome(status=ended.status, reason=ended.reason, values=values, cost=ended.cost)

@@ -1,0 +1,261 @@
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import cli, cli_run, methods, records, run
+from benchmarks.panels import cut, write_panels
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+from ctsim.types import Scan, Volume
+
+GEOMETRY = Geometry(
+    dso=100.0, dsd=150.0, n_voxel=(12, 14, 16), d_voxel=(1.0, 1.0, 1.0), n_detector=(18, 20), d_detector=(1.5, 1.5),
+    n_views=6,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Double:
+    """A stored scan held in memory."""
+
+    folder: Path
+    name: str
+    metal_free: "Double | None" = None
+    scene_id: str = "scene"
+    content_hash: str = "hash"
+    l0: float = 10.0
+
+    @property
+    def info(self):
+        return {"seed": 3}
+
+    @property
+    def geometry(self):
+        return GEOMETRY
+
+    @property
+    def scan(self):
+        counts = torch.full(GEOMETRY.shape, 1000, dtype=torch.uint16)
+        return Scan(geometry=GEOMETRY, counts=counts, flat=torch.full(GEOMETRY.n_detector, 2000.0))
+
+    @property
+    def labels(self):
+        labels = np.zeros(GEOMETRY.n_voxel, np.uint8)
+        labels[3:9, 3:11, 3:13] = 1
+        return labels
+
+    @property
+    def metal(self):
+        metal = np.zeros(GEOMETRY.n_voxel, np.uint8)
+        metal[5:7, 6:8, 7:9] = 1
+        return metal
+
+    def reference(self, which):
+        return np.where(self.metal, 0.3, 0.02 * self.labels).astype(np.float32)
+
+
+def open_double(folder):
+    return double(Path(folder))
+
+
+def double(folder, twin=True):
+    return Double(folder=folder, name="box", metal_free=Double(folder=folder, name="box") if twin else None)
+
+
+def good(scan, *, device, level=0.018):
+    shape = scan.geometry.n_voxel
+    values = torch.zeros(shape)
+    values[tuple(slice(n // 4, -n // 4) for n in shape)] = level
+    return Volume(values=values, details={"view_updates": 12})
+
+
+def nonfinite(scan, *, device):
+    values = torch.zeros(scan.geometry.n_voxel)
+    values[0, 0, :2] = float("nan")
+    return Volume(values=values)
+
+
+def misshapen(scan, *, device):
+    return Volume(values=torch.zeros((2, 3, 4)))
+
+
+def hungry(scan, *, device):
+    raise MemoryError("no room for 1 TB")
+
+
+def broken(scan, *, device):
+    raise RuntimeError("this is\nbroken")
+
+
+def slow(scan, *, device):
+    import time
+
+    time.sleep(60)
+
+
+def crash(scan, *, device):
+    os._exit(7)
+
+
+def once(name, results, stored=None, **options):
+    method = methods.find(f"test_run:{name}")
+    chosen = run.Options(store="test_run:open_double", **options)
+    return next(run.run_all(run.tasks([stored or double(results)], [method], chosen), results, chosen))
+
+
+def test_a_run_is_scored_timed_kept_and_recorded(tmp_path):
+    record = once("good", tmp_path)
+    assert record.status == "ok" and record.run.seed == 3 and record.run.params == {"level": 0.018}
+    assert set(record.scores) == {"tissue", "aligned", "aligned_50kev", "paper", "metal"}
+    assert record.cost.view_updates == 12 and record.cost.peak_bytes > 0 and not record.cost.isolated
+    assert record.host.ram > 0 and record.time.endswith("+00:00")
+    assert records.read(tmp_path / records.NAME) == ([record], None)
+    import tifffile
+
+    assert tifffile.imread(tmp_path / record.volume).shape == GEOMETRY.n_voxel
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "reason"),
+    [
+        ("nonfinite", "nonfinite", "2 of 2688 voxels"),
+        ("misshapen", "error", "shape (2, 3, 4)"),
+        ("hungry", "out_of_memory", "no room"),
+        ("broken", "error", "RuntimeError: this is broken"),
+    ],
+)
+def test_failures_have_a_status_and_a_reason(tmp_path, name, status, reason):
+    record = once(name, tmp_path)
+    assert (record.status, record.scores) == (status, {}) and reason in record.reason
+    assert records.read(tmp_path / records.NAME)[0] == [record]
+
+
+def test_isolated_runs_end_as_they_do_here(tmp_path):
+    record = once("good", tmp_path, isolate=True)
+    assert record.status == "ok" and record.cost.isolated and record.scores == once("good", tmp_path).scores
+    record = once("crash", tmp_path, isolate=True)
+    assert record.status == "error" and "exit code 7" in record.reason
+
+
+def test_a_time_limit_is_a_status(tmp_path):
+    record = once("slow", tmp_path, seconds=0.5)
+    assert record.status == "timeout" and "0.5 s" in record.reason
+    with pytest.raises(InputError, match="seconds"):
+        run.Options(seconds=-1)
+
+
+def test_a_rerun_does_only_what_is_missing(tmp_path):
+    options = run.Options(anchor=False)
+    found = [methods.find(f"test_run:{n}") for n in ("good", "broken")]
+    listed = run.tasks([double(tmp_path)], found, options)
+    assert [r.status for r in run.run_all(listed, tmp_path, options)] == ["ok", "error"]
+    assert [t.method.name for t in run.pending(listed, tmp_path, force=False)] == ["test_run:broken"]
+    assert run.pending(listed, tmp_path, force=True) == listed
+    other = run.tasks([double(tmp_path)], [methods.find("test_run:good", {"level": 0.02})], options)
+    assert run.pending(other, tmp_path, force=False) == other
+
+
+def test_the_anchor_is_judged_in_the_region_of_the_metal_scan(tmp_path, monkeypatch):
+    monkeypatch.setitem(methods.TABLE, "fdk", ("test_run:good", "counts only"))
+    options = run.Options()
+    listed = run.tasks([double(tmp_path)], [methods.find("fdk")], options)
+    with_metal, without = run.run_all(listed, tmp_path, options)
+    assert without.run.variant == "metal_free" and without.identity != with_metal.identity
+    assert without.scores["tissue"] == with_metal.scores["tissue"]
+    assert set(without.scores) == {"tissue", "aligned", "aligned_50kev"}
+    assert len(run.tasks([double(tmp_path, twin=False)], [methods.find("fdk")], options)) == 1
+
+
+def test_a_method_can_skip_with_a_reason(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "skip", lambda scan: "no spectrum given", raising=False)
+    record = once("good", tmp_path)
+    assert (record.status, record.reason) == ("skipped", "no spectrum given")
+
+
+def test_the_tiny_scan_keeps_extent_and_kind():
+    scan = double(Path()).scan
+    small = run.tiny(scan)
+    assert small.geometry.s_voxel == pytest.approx(scan.geometry.s_voxel)
+    assert small.geometry.s_detector == pytest.approx(scan.geometry.s_detector)
+    assert small.counts.dtype == scan.counts.dtype and small.counts.is_contiguous()
+
+
+def test_panels_show_every_kept_volume(tmp_path):
+    record = once("good", tmp_path)
+    (path,) = write_panels([record], [double(tmp_path)], tmp_path)
+    assert path.name == "box.png" and path.stat().st_size > 10_000
+    assert cut(np.asarray(double(tmp_path).metal) > 0, np.ones(GEOMETRY.n_voxel, bool)) == (5, 6, 7)
+
+
+def command(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["run-benchmark", *map(str, arguments)])
+    code = cli.run_benchmark()
+    return code, capsys.readouterr()
+
+
+def use_double(monkeypatch):
+    monkeypatch.setattr(cli_run, "_scans", lambda given: [double(given.data)])
+
+
+def test_the_command_writes_tables_and_a_picture(tmp_path, monkeypatch, capsys):
+    use_double(monkeypatch)
+    code, said = command(monkeypatch, capsys, tmp_path, tmp_path / "r", "--method", "test_run:good")
+    assert code == 0 and "Protocol tissue" in said.out
+    names = {p.relative_to(tmp_path / "r").as_posix() for p in (tmp_path / "r").rglob("*") if p.is_file()}
+    assert {"records.jsonl", "table.md", "table.csv", "table.tex", "panels/box.png"} <= names
+    code, said = command(monkeypatch, capsys, tmp_path, tmp_path / "r", "--table")
+    assert code == 0 and "Protocol tissue" in said.out
+    code, _ = command(monkeypatch, capsys, tmp_path, tmp_path / "r", "--method", "test_run:broken")
+    assert code == 1
+
+
+def test_ctrl_c_keeps_the_records(tmp_path, monkeypatch, capsys):
+    use_double(monkeypatch)
+
+    def interrupted(scan, *, device):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys.modules[__name__], "stop", interrupted, raising=False)
+    code, said = command(
+        monkeypatch, capsys, tmp_path, tmp_path, "--method", "test_run:good", "--method", "test_run:stop"
+    )
+    assert code == 130 and "interrupted" in said.err
+    assert [r.status for r in records.read(tmp_path / records.NAME)[0]] == ["ok"]
+    assert (tmp_path / "table.md").exists()
+
+
+def test_bad_input_is_one_sentence_and_code_2(tmp_path, monkeypatch, capsys):
+    for arguments in [
+        (tmp_path / "nothing", tmp_path / "r"),
+        (tmp_path, tmp_path / "r", "--method", "fkd"),
+        (tmp_path, tmp_path / "r", "--method", "fdk", "--set", "x"),
+        (tmp_path, tmp_path / "r", "--table"),
+    ]:
+        code, said = command(monkeypatch, capsys, *arguments)
+        assert code == 2 and said.err.startswith("run-benchmark: ") and said.err.count("\n") == 1, said.err
+
+
+def test_a_disk_that_cannot_be_written_is_one_sentence(tmp_path, monkeypatch, capsys):
+    use_double(monkeypatch)
+    blocker = tmp_path / "file"
+    blocker.write_text("")
+    code, said = command(monkeypatch, capsys, tmp_path, blocker / "r", "--method", "test_run:good")
+    assert code == 2 and said.err.count("\n") == 1 and str(blocker) in said.err
+
+
+def test_help_loads_nothing_heavy():
+    script = (
+        "import sys\nfrom benchmarks.cli import run_benchmark\nsys.argv = ['run-benchmark', '--help']\n"
+        "try:\n    run_benchmark()\nexcept SystemExit:\n    pass\n"
+        "heavy = {'torch', 'numba', 'pandas', 'matplotlib', 'scipy', 'skimage'} & set(sys.modules)\n"
+        "sys.exit(f'loaded {heavy}' if heavy else 0)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "--method" in done.stdout
