@@ -39,7 +39,7 @@ def reconstruct(scan: Scan, *, device: str = "cpu", window: str = "ram-lak", cut
         return p.numpy()
 
     weights = _orbit_weights(scan.geometry)
-    values = _run(read, scan.geometry, weights, ramp=_response(scan.geometry, window, cutoff))
+    values = _run(read, scan.geometry, weights, window, cutoff)
     finite = bool(np.isfinite(values).all())
     details = {
         "window": window,
@@ -73,7 +73,7 @@ def fdk(projections: torch.Tensor, geometry: Geometry, *, window: str = "ram-lak
         return np.array(projections[views].detach().numpy(), np.float32)
 
     weights = _orbit_weights(geometry)
-    return torch.from_numpy(_run(read, geometry, weights, ramp=_response(geometry, window, cutoff)))
+    return torch.from_numpy(_run(read, geometry, weights, window, cutoff))
 
 
 def _orbit_weights(geometry: Geometry) -> RayWeights:
@@ -82,24 +82,25 @@ def _orbit_weights(geometry: Geometry) -> RayWeights:
     return ray_weights(geometry)
 
 
-def _response(geometry: Geometry, window: str, cutoff: float) -> NDArray[np.float32]:
-    # The filter works on the detector scaled to the isocentre.
-    spacing = geometry.d_detector[1] * geometry.dso / geometry.dsd
-    return ramp_response(padded_length(geometry.n_detector[1]), spacing, window, cutoff)
-
-
 def _run(
     read: Callable[[slice], NDArray[np.float32]],
     geometry: Geometry,
     weights: RayWeights,
-    ramp: NDArray[np.float32],
+    window: str,
+    cutoff: float,
 ) -> NDArray[np.float32]:
-    """Weight, filter and backproject a few views at a time; `read` gives line integrals that may be overwritten."""
-    n_v, n_u = geometry.n_detector
+    """Weight, filter and backproject a few views at a time; `read` gives line integrals that may be overwritten.
+
+    The filter works on the detector scaled to the isocentre.
+    """
+    before, after = weights.margin
+    n_v, n_u = geometry.n_detector[0], geometry.n_detector[1] + before + after
     n_fft = padded_length(n_u)
     cosine = _cosine_weights(geometry)
-    orbit = np.array([geometry.dso, geometry.dsd, *geometry.d_detector, *geometry.off_detector])
+    off_u = geometry.off_detector[1] + (after - before) / 2 * geometry.d_detector[1]
+    orbit = np.array([geometry.dso, geometry.dsd, *geometry.d_detector, geometry.off_detector[0], off_u])
     grid = np.array([*geometry.d_voxel, *geometry.off_origin, weights.radius])
+    ramp = ramp_response(n_fft, geometry.d_detector[1] * geometry.dso / geometry.dsd, window, cutoff)
     volume = np.zeros(geometry.n_voxel, np.float32)
     chunk = max(1, min(64, CHUNK_BYTES // (4 * n_v * n_fft)))
     for first in range(0, geometry.n_views, chunk):
@@ -107,6 +108,8 @@ def _run(
         p = read(views)
         p *= cosine
         p *= weights.values[views, None, :]
+        if before or after:
+            p = np.pad(p, ((0, 0), (0, 0), (before, after)))
         backproject(filter_rows(p, ramp, n_fft), geometry.angles[views], orbit, grid, volume)
     return volume
 

@@ -64,4 +64,6 @@ def filter_rows(rows: NDArray[np.float32], response: NDArray[np.float32], n_fft:
     """Convolve the last axis of `rows` with the filter of the given `response`; same shape and type."""
     spectrum = scipy.fft.rfft(rows, n_fft, axis=-1, workers=numba.get_num_threads())
     spectrum *= response
-    return scipy.fft.irfft(spectrum, n_fft, axis=-1, workers=numba.get_num_threads(), overwrite_x=True)[..., : rows.shape[-1]]
+    return scipy.fft.irfft(spectrum, n_fft, axis=-1, workers=numba.get_num_threads(), overwrite_x=True)[
+        ..., : rows.shape[-1]
+    ]

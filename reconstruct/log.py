@@ -52,7 +52,7 @@ def _log_open(flat: NDArray[np.float32], floor: float) -> tuple[NDArray[np.float
 
 
 @njit(parallel=True, cache=True)
-def _look_up(counts, table, low, log_open, dead, p, clamped):  # noqa: ANN001, ANN202
+def _look_up(counts, table, low, log_open, dead, p, clamped):
     n_view, n_v, n_u = counts.shape
     for row in prange(n_view * n_v):
         view, v = row // n_v, row % n_v
@@ -63,7 +63,7 @@ def _look_up(counts, table, low, log_open, dead, p, clamped):  # noqa: ANN001, A
 
 
 @njit(parallel=True, cache=True)
-def _take_log(counts, dark, floor, log_open, dead, p, clamped):  # noqa: ANN001, ANN202
+def _take_log(counts, dark, floor, log_open, dead, p, clamped):
     n_view, n_v, n_u = counts.shape
     for row in prange(n_view * n_v):
         view, v = row // n_v, row % n_v

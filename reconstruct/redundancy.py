@@ -11,11 +11,16 @@ from ctsim.geometry import Geometry
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RayWeights:
-    """Weights [view, u] in radians, float32; the field of view's radius in mm; and what falls short, if anything."""
+    """What `ray_weights` found out about a scan.
+
+    `values` [view, u] in radians; `radius` of the field of view in mm; `margin`, the columns to add before
+    and after each row for the filtered rays that a shifted detector misses; `note`, what falls short.
+    """
 
     values: NDArray[np.float32]
     radius: float
     kind: str
+    margin: tuple[int, int] = (0, 0)
     note: str = ""
 
 
@@ -32,11 +37,14 @@ def ray_weights(geometry: Geometry) -> RayWeights:
     u = (np.arange(n_u) - (n_u - 1) / 2) * d_u + off
     fan = np.arctan(u / geometry.dsd)
     long, short = n_u * d_u / 2 + abs(off), n_u * d_u / 2 - abs(off)
-    notes = []
+    notes, margin = [], (0, 0)
     if full:
         kind = "full turn" if abs(off) <= d_u / 2 else "full turn, shifted detector"
         share = np.broadcast_to(_overlap_share(fan, off, short, geometry), (len(step), n_u))
         edge = long
+        # Filtered rays are not zero where the detector ends, though the weighted rays are.
+        missing = math.ceil((long - short) / d_u - 1e-9) if abs(off) > d_u / 2 else 0
+        margin = (missing, 0) if off > 0 else (0, missing)
         if short <= 0:
             notes.append("the detector does not reach the rotation axis, so the centre is not measured")
     else:
@@ -50,7 +58,7 @@ def ray_weights(geometry: Geometry) -> RayWeights:
             notes.append("a short scan does not complete the rays that the shifted detector misses")
     radius = geometry.dso * math.sin(math.atan(edge / geometry.dsd))
     values = (step[:, None] * share).astype(np.float32)
-    return RayWeights(values=values, radius=radius, kind=kind, note="; ".join(notes))
+    return RayWeights(values=values, radius=radius, kind=kind, margin=margin, note="; ".join(notes))
 
 
 def parker_share(place: NDArray[np.float64], fan: NDArray[np.float64], arc: float) -> NDArray[np.float64]:

@@ -52,7 +52,7 @@ def _tiles(shape: tuple[int, ...], grid: NDArray[np.float64]) -> NDArray[np.int6
 
 
 @njit(parallel=True, cache=True)
-def _pad_transposed(filtered, columns):  # noqa: ANN001, ANN202
+def _pad_transposed(filtered, columns):
     """Copy views to [view, u, v] with the border pixels repeated once on every side."""
     n_view, n_v, n_u = filtered.shape
     for view in prange(n_view):
@@ -64,7 +64,7 @@ def _pad_transposed(filtered, columns):  # noqa: ANN001, ANN202
 
 
 @njit(parallel=True, cache=True)
-def _add_tiles(columns, cos, sin, orbit, grid, tiles, volume):  # noqa: ANN001, ANN202
+def _add_tiles(columns, cos, sin, orbit, grid, tiles, volume):
     n_z, n_y, n_x = volume.shape
     n_view = columns.shape[0]
     for tile in prange(tiles.shape[0]):
@@ -94,7 +94,7 @@ def _add_tiles(columns, cos, sin, orbit, grid, tiles, volume):  # noqa: ANN001, 
 
 
 @njit(cache=True, fastmath=FAST)
-def _add_column(columns, along, across, orbit, grid, row, index, part, total):  # noqa: ANN001, ANN202
+def _add_column(columns, along, across, orbit, grid, row, index, part, total):
     """Add one view's samples to one volume column; `along` and `across` are its place in the view's frame."""
     n_z = total.size
     n_u, n_v = columns.shape[0] - 2, columns.shape[1] - 2
