@@ -142,24 +142,24 @@ def detect(
 
 
 def flat_field(
-    shape: tuple[int, int],
+    open_field: tuple[NDArray[np.float32], NDArray[np.float32]],
     *,
     noise: Noise,
     i0: float,
     scene_id: str,
     pattern: NDArray[np.float32] | None = None,
-    m2_open: float = 1.0,
 ) -> NDArray[np.float32]:
     """Return the open-field image in counts, pedestal included, float32 [v, u].
 
-    It is the mean of `noise.n_flats` views without an object through the same detector, or exact when that is 0
-    and for the models "tigre" and "none". `m2_open` is Σ w2. A dead pixel reads exactly `noise.dark`.
+    `open_field` is the signal and second moment (m1, m2) [v, u] without an object. The image is the mean of
+    `noise.n_flats` views of it through the same detector, or exact when that is 0 and for the models
+    "tigre" and "none". A dead pixel reads exactly `noise.dark`.
     """
+    m1, m2 = open_field
     if noise.n_flats == 0 or noise.model != "compound":
-        ones = np.ones(shape) if pattern is None else pattern
-        return (noise.dark + noise.gain(i0) * ones).astype(np.float32)
-    m1, m2 = np.ones(shape, np.float32), np.full(shape, m2_open, np.float32)
-    total, counts = np.zeros(shape), np.empty(shape, noise.dtype)
+        gains = m1 if pattern is None else m1 * pattern
+        return (noise.dark + noise.gain(i0) * gains).astype(np.float32)
+    total, counts = np.zeros(m1.shape), np.empty(m1.shape, noise.dtype)
     for k in range(noise.n_flats):
         key = rng.stream_key(scene_id, "flat", k)
         total += detect(m1, m2, noise=noise, i0=i0, key=key, pattern=pattern, out=counts)

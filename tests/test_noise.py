@@ -244,7 +244,7 @@ def test_fixed_pattern_scales_the_signal_and_dead_pixels_read_the_pedestal():
     assert pattern[~dead].std() == pytest.approx(0.05, rel=5 / math.sqrt(2 * n))
     assert pattern[~dead].mean() == pytest.approx(1.0, abs=5 * 0.05 / math.sqrt(n))
     counts = detect(constant(0.5, shape), constant(0.5, shape), noise=noise, i0=1e8, key=KEY, pattern=pattern)
-    flat = flat_field(shape, noise=noise, i0=1e8, scene_id="scene", pattern=pattern)
+    flat = flat_field(open_field(shape), noise=noise, i0=1e8, scene_id="scene", pattern=pattern)
     assert (counts[dead] == noise.dark).all() and (flat[dead] == noise.dark).all()
     relative = (counts[~dead] - noise.dark) / (flat[~dead] - noise.dark)
     # Noise of 1.4e-4 relative and rounding of half a count in 2e4, six standard deviations of the first.
@@ -252,17 +252,21 @@ def test_fixed_pattern_scales_the_signal_and_dead_pixels_read_the_pedestal():
     assert pixel_pattern(shape, noise=Noise(), scene_id="scene") is None
 
 
+def open_field(shape, m2=1.0):
+    return np.ones(shape, np.float32), np.full(shape, m2, np.float32)
+
+
 def test_a_flat_field_is_the_mean_of_its_flats():
     i0, shape, m2_open = 1e4, (200, 300), 1.4
     noise = Noise(n_flats=16, electronic=10.0)
-    flat = flat_field(shape, noise=noise, i0=i0, scene_id="scene", m2_open=m2_open).astype(np.float64)
+    flat = flat_field(open_field(shape, m2_open), noise=noise, i0=i0, scene_id="scene").astype(np.float64)
     gain, n = noise.gain(i0), flat.size
     variance = (gain**2 * (m2_open / i0 + (10 / i0) ** 2) + 1 / 12) / 16
     assert flat.var() == pytest.approx(variance, rel=5 * math.sqrt(2 / n))
     assert flat.mean() == pytest.approx(noise.dark + gain, abs=5 * math.sqrt(variance / n))
-    perfect = flat_field(shape, noise=Noise(n_flats=0), i0=i0, scene_id="scene")
+    perfect = flat_field(open_field(shape), noise=Noise(n_flats=0), i0=i0, scene_id="scene")
     assert (perfect == np.float32(noise.dark + gain)).all()
-    photons = flat_field(shape, noise=Noise(n_flats=0, adc_bits=None), i0=i0, scene_id="scene")
+    photons = flat_field(open_field(shape), noise=Noise(n_flats=0, adc_bits=None), i0=i0, scene_id="scene")
     assert (photons == i0).all()
 
 

@@ -1,0 +1,219 @@
+"""Carry out a plan: counts and the ground truth asked for, view by view.
+
+Nothing here grows with the number of views. A view depends on its own index only, so a run that was
+interrupted goes on where it stopped and gives the same bytes.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.detector import response
+from ctsim.errors import InputError
+from ctsim.materials import attenuation
+from ctsim.noise import detect, flat_field, pixel_pattern
+from ctsim.plan import Plan
+from ctsim.project import Response, Tracer, path_lengths, row_spans, transmit
+from ctsim.quadrature import effective_weights
+from ctsim.rng import stream_key
+from ctsim.spectrum import bowtie_thickness, heel_factor
+from ctsim.types import Phantom, Scanner
+from ctsim.voxelise import attenuation_volume, label_volume, metal_mask
+
+Image = NDArray[np.float32]
+REFERENCE_KEV = 50.0  # centre of 10–90 keV
+
+
+def compact(phantom: Phantom, materials: tuple[str, ...]) -> Phantom:
+    """Return the phantom with its labels renumbered to `materials`, which must hold all that occur."""
+    if materials == phantom.materials:
+        return phantom
+    table = np.array([materials.index(m) if m in materials else 0 for m in phantom.materials], np.uint8)
+    return Phantom(
+        labels=table[phantom.labels],
+        materials=materials,
+        d_voxel=phantom.d_voxel,
+        off_origin=phantom.off_origin,
+        density=phantom.density,
+        solids=phantom.solids,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Beam:
+    """What reaches the detector without the object: intensity and layer per pixel, [v, u]."""
+
+    gain: Image | None
+    layer: Image | None
+    layer_material: str | None
+    open1: Image
+    open2: Image
+
+
+def _beam(plan: Plan, scanner: Scanner) -> _Beam:
+    tube, geometry = scanner.tube, scanner.geometry
+    if (tube.heel or tube.bowtie) and geometry.poses is not None:
+        raise InputError("tube.heel and tube.bowtie need a circular orbit, but geometry.poses is given")
+    n_v, n_u = geometry.n_detector
+    v = (np.arange(n_v) - (n_v - 1) / 2) * geometry.d_detector[0] + geometry.off_detector[0]
+    u = (np.arange(n_u) - (n_u - 1) / 2) * geometry.d_detector[1] + geometry.off_detector[1]
+    gain = layer = name = None
+    if tube.heel:
+        # the anode–cathode axis is the rotation axis, so the heel runs along v
+        gain = np.repeat(heel_factor(tube, np.arctan2(v, geometry.dsd))[:, None], n_u, 1).astype(np.float32)
+    shape, w1, w2 = (n_v, n_u), float(plan.rule.w1.sum()), float(plan.rule.w2.sum())
+    open1, open2 = np.full(shape, w1, np.float32), np.full(shape, w2, np.float32)
+    if tube.bowtie is not None:
+        name = tube.bowtie.material
+        slant = np.hypot(1.0, v / geometry.dsd)[:, None]
+        layer = (bowtie_thickness(tube.bowtie, np.arctan2(u, geometry.dsd))[None, :] * slant).astype(np.float32)
+        passed = np.exp(-attenuation(name, plan.rule.energies)[:, None, None] * layer)
+        open1 = np.tensordot(plan.rule.w1, passed, 1).astype(np.float32)
+        open2 = np.tensordot(plan.rule.w2, passed, 1).astype(np.float32)
+    return _Beam(gain=gain, layer=layer, layer_material=name, open1=open1, open2=open2)
+
+
+class _Simulator:
+    """One scan being simulated; holds what the views share."""
+
+    def __init__(self, plan: Plan, phantom: Phantom, scanner: Scanner) -> None:
+        self.plan, self.scanner, self.geometry = plan, scanner, scanner.geometry
+        self.beam = _beam(plan, scanner)
+        body = compact(phantom, plan.materials)
+        self.tracer = Tracer.of(body, skip=plan.settings.skip, extra=self.beam.layer_material)
+        self.bare = self.tracer.without_metal()
+        self.response = Response.of(plan.rule, self.tracer.materials)
+        self.pattern = pixel_pattern(self.geometry.n_detector, noise=scanner.noise, scene_id=plan.stream_id)
+        self.metal = np.array([any(s.metal and s.material == m for s in body.solids) for m in self.tracer.materials])
+        self.names = {o.name for o in plan.outputs}
+
+    def view(self, k: int) -> dict[str, NDArray]:
+        """Everything the plan wants of view k."""
+        subrays = self.plan.settings.subrays
+        m1, m2 = transmit(self.tracer, self.geometry, k, self.response, subrays=subrays, extra=self.beam.layer)
+        out = self._measured(m1, m2, k, "")
+        if "metal_free/counts" in self.names:
+            pose, shape = self.geometry.pose_array()[k], self.geometry.n_detector
+            # only pixels in the metal's shadow can differ
+            spans = row_spans(self.tracer.shadows(pose, shape)[self.tracer.metal], shape)
+            if not self.plan.settings.skip:
+                spans = np.tile(np.array([0, shape[1]]), (shape[0], 1))
+            twin = (m1.copy(), m2.copy(), spans)
+            transmit(self.bare, self.geometry, k, self.response, subrays=subrays, extra=self.beam.layer, out=twin)
+            out |= self._measured(twin[0], twin[1], k, "metal_free/")
+        return out | self._paths(k)
+
+    def _measured(self, m1: Image, m2: Image, k: int, prefix: str) -> dict[str, NDArray]:
+        """Add scatter, then draw the counts; with the noise-free images that were asked for."""
+        out: dict[str, NDArray] = {}
+        if prefix + "scatter_free" in self.names:
+            out[prefix + "scatter_free"] = -np.log(m1 / self.beam.open1)
+        s = self.plan.scatter_fraction
+        if s:
+            # scattered photons carry the open field's spectrum
+            m1, m2 = m1 + np.float32(s), m2 + np.float32(s * self.plan.rule.w2.sum())
+        if prefix + "noise_free" in self.names:
+            out[prefix + "noise_free"] = -np.log(m1 / self.beam.open1)
+        if self.beam.gain is not None:
+            m1, m2 = m1 * self.beam.gain, m2 * self.beam.gain
+        key = stream_key(self.plan.stream_id, "view", k)
+        noise, i0 = self.scanner.noise, self.scanner.i0
+        out[prefix + "counts"] = detect(m1, m2, noise=noise, i0=i0, key=key, pattern=self.pattern)
+        return out
+
+    def _paths(self, k: int) -> dict[str, NDArray]:
+        """Images made from path lengths along the central rays."""
+        wanted = {"trace", "metal_path", "paths"} & self.names
+        energies = self.plan.truth.mono_kev
+        if not wanted and not energies:
+            return {}
+        lengths = path_lengths(self.tracer, self.geometry, k)[: len(self.plan.materials)]
+        metal = lengths[self.metal[: len(lengths)]].sum(0)
+        all_paths = {"trace": (metal > 0).astype(np.uint8), "metal_path": metal, "paths": lengths[1:]}
+        out: dict[str, NDArray] = {name: all_paths[name] for name in wanted}
+        twin = path_lengths(self.bare, self.geometry, k) if "metal_free/counts" in self.names and energies else None
+        for energy in energies:
+            mu = np.array([0.0, *(attenuation(m, np.array([energy]))[0] for m in self.plan.materials[1:])])
+            out[f"mono_{energy:g}kev"] = np.tensordot(mu, lengths, 1).astype(np.float32)
+            if twin is not None:
+                mono = np.tensordot(mu, twin[: len(mu)], 1).astype(np.float32)
+                out[f"metal_free/mono_{energy:g}kev"] = mono
+        return out
+
+
+def simulate_views(
+    plan: Plan, phantom: Phantom, scanner: Scanner, first_view: int = 0
+) -> Iterator[tuple[int, dict[str, NDArray]]]:
+    """Yield (view, images by output name) from `first_view` on.
+
+    Line-integral images (noise_free, scatter_free, mono_…) are P = −ln(signal/open), float32 [v, u];
+    metal_path and paths are mm; trace is 1 where the central ray meets metal.
+    """
+    simulator = _Simulator(plan, phantom, scanner)
+    for k in range(first_view, scanner.geometry.n_views):
+        yield k, simulator.view(k)
+
+
+def flat_image(plan: Plan, scanner: Scanner) -> Image:
+    """Open-field image in counts, pedestal included: float32 [v, u]."""
+    beam = _beam(plan, scanner)
+    gain = 1.0 if beam.gain is None else beam.gain
+    pattern = pixel_pattern(scanner.geometry.n_detector, noise=scanner.noise, scene_id=plan.stream_id)
+    return flat_field(
+        (beam.open1 * np.float32(gain), beam.open2 * np.float32(gain)),
+        noise=scanner.noise,
+        i0=scanner.i0,
+        scene_id=plan.stream_id,
+        pattern=pattern,
+    )
+
+
+def truth_volumes(plan: Plan, phantom: Phantom, scanner: Scanner) -> dict[str, NDArray]:
+    """Return labels, metal mask and reference volumes on the reconstruction grid, and the twin's references.
+
+    `reference_50kev` is μ at 50 keV, `reference_effective` Σ ω(E) μ(E) behind the scene's median
+    water-equivalent path, both float32 [z, y, x] in 1/mm.
+    """
+    geometry = scanner.geometry
+    energies, omega = effective_weights(plan.spectrum, scanner.detector, plan.l0)
+    effective = _reference_mu(plan.materials, energies, omega)
+    at_50 = _reference_mu(plan.materials, np.array([REFERENCE_KEV]), np.ones(1))
+    body = compact(phantom, plan.materials)
+    out: dict[str, NDArray] = {
+        "labels": label_volume(body, geometry),
+        "metal": metal_mask(body, geometry),
+        "reference_effective": attenuation_volume(body, geometry, effective),
+        "reference_50kev": attenuation_volume(body, geometry, at_50),
+    }
+    if plan.runs("metal-free twin"):
+        bare = body.without_metal()
+        out["metal_free/labels"] = label_volume(bare, geometry)
+        out["metal_free/reference_effective"] = attenuation_volume(bare, geometry, effective)
+        out["metal_free/reference_50kev"] = attenuation_volume(bare, geometry, at_50)
+    return out
+
+
+def _reference_mu(materials: tuple[str, ...], energies: NDArray, omega: NDArray) -> Mapping[str, float]:
+    return {m: 0.0 if m == "air" else float(attenuation(m, energies) @ omega) for m in materials}
+
+
+def scan_info(plan: Plan, phantom: Phantom, scanner: Scanner) -> dict:
+    """Return what a reader needs to use the counts; lengths mm, energies keV; "flat" is the open-field image."""
+    noise = scanner.noise
+    a1, _ = response(scanner.detector, plan.spectrum.energies)
+    return {
+        "geometry": msgspec.to_builtins(scanner.geometry),
+        "flat": flat_image(plan, scanner),
+        "dark": noise.dark,
+        "gain": noise.gain(scanner.i0),
+        "i0": scanner.i0,
+        "e_max": float(plan.spectrum.e_max),
+        "l0": plan.l0,
+        "mean_detected_kev": float(np.average(plan.spectrum.energies, weights=plan.spectrum.weights * a1)),
+        "scatter_fraction": plan.scatter_fraction,
+        "materials": list(plan.materials),
+        "metal": sorted({s.material for s in phantom.solids if s.metal}),
+    }
