@@ -1,0 +1,288 @@
+"""make-dataset: from scene recipes to scans on disk, resumable at any moment."""
+
+import dataclasses
+import difflib
+import shutil
+import sys
+import tomllib
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from ctsim.errors import InputError
+
+if TYPE_CHECKING:
+    from ctsim.plan import Plan
+
+    from ctsim.types import Phantom, Scanner
+    from phantoms.scene import Scene
+
+HEAD = ("scene", "rays", "does", "skips (reason)", "error", "time", "disk")
+_SPARE = 64 * 2**20  # bytes left free for the file system's own needs
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options:
+    """Simulate the scans of a suite, with their ground truth, into a data folder.
+
+    An interrupted run goes on where it stopped when it is started again; finished scenes are skipped.
+    """
+
+    suite: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SUITE")]
+    """Name of a bundled suite (quick, core, paper …) or path of a TOML file; with --verify alone, the data folder."""
+    out: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")] = None
+    """Data folder."""
+    dry_run: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print what would be done, what is skipped and why, error, time and disk; write nothing."""
+    verify: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Only check the data folder against its checksums."""
+    force: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Make scenes again that are there, also where another scene has their name."""
+    only: tuple[str, ...] = ()
+    """Only these scenes of the suite."""
+    seeds: tuple[int, ...] = ()
+    """Make every scene once for each of these seeds, as NAME-sSEED."""
+
+
+def main(argv: list[str]) -> int:
+    """Run the command; return 0, 2 for an error of the user's or damaged data, 130 when interrupted."""
+    options = tyro.cli(Options, prog="make-dataset", args=argv)
+    try:
+        if options.verify:
+            return _verify(options.out or Path(options.suite))
+        if options.out is None:
+            raise InputError("the data folder is missing: expected make-dataset SUITE OUT")
+        scenes = select(load(options.suite), options.only, options.seeds)
+        return _dry_run(scenes, options) if options.dry_run else _make(scenes, options.out, options.force)
+    except (InputError, OSError, tomllib.TOMLDecodeError) as error:
+        _say(f"make-dataset: {_sentence(error)}")
+        return 2
+    except KeyboardInterrupt:
+        _say("make-dataset: interrupted; the same command goes on from here")
+        return 130
+
+
+def load(suite: str) -> "tuple[Scene, ...]":
+    """Return the scenes of a bundled suite by its name, or of a TOML file by its path.
+
+    Raises
+    ------
+    InputError
+        When there is no such suite or file, or the file is wrong (naming file, key and what was expected).
+    """
+    from phantoms.scene import load_suite
+
+    folder = resources.files("benchmarks") / "suites"
+    bundled = {entry.name.removesuffix(".toml"): entry for entry in folder.iterdir() if entry.name.endswith(".toml")}
+    if suite in bundled:
+        with resources.as_file(bundled[suite]) as path:
+            return load_suite(path)
+    if not Path(suite).is_file():
+        raise InputError(f"{suite}: neither a TOML file nor a bundled suite ({', '.join(sorted(bundled))})")
+    return load_suite(Path(suite))
+
+
+def select(scenes: "tuple[Scene, ...]", only: tuple[str, ...], seeds: tuple[int, ...]) -> "tuple[Scene, ...]":
+    """Return the named scenes (all when none is named), once for each seed when seeds are given."""
+    import msgspec
+
+    names = [scene.name for scene in scenes]
+    for name in only:
+        if name not in names:
+            near = difflib.get_close_matches(name, names) or names
+            raise InputError(f"--only {name}: no such scene, expected one of {', '.join(near)}")
+    chosen = tuple(scene for scene in scenes if not only or scene.name in only)
+    if not seeds:
+        return chosen
+    return tuple(
+        msgspec.structs.replace(scene, name=f"{scene.name}-s{seed}", seed=seed) for scene in chosen for seed in seeds
+    )
+
+
+def _verify(data_dir: Path) -> int:
+    from ctsim.manifest import read_index, verify
+
+    problems = verify(data_dir)
+    for problem in problems:
+        _say(problem)
+    if not problems:
+        sys.stdout.write(f"{data_dir}: {len(read_index(data_dir))} scenes, every file is as it was written\n")
+    return 2 if problems else 0
+
+
+def _plan(scene: "Scene") -> "tuple[Plan, Phantom, Scanner]":
+    from ctsim.plan import make_plan
+
+    from phantoms.scene import build, stream_id
+
+    phantom, scanner = build(scene), scene.resolve()
+    return make_plan(phantom, scanner, scene.simulation, scene.truth, stream_id(scene)), phantom, scanner
+
+
+def _dry_run(scenes: "tuple[Scene, ...]", options: Options) -> int:
+    from ctsim.writer import is_complete
+    from phantoms.scene import scene_id
+
+    rows, seconds, size = [], 0.0, 0
+    for scene in scenes:
+        if options.out and not options.force and is_complete(options.out, scene.name, scene_id(scene)):
+            rows.append((scene.name, "", "nothing", "all (already complete)", "", "0 s", ""))
+            continue
+        plan, *_ = _plan(scene)
+        rows.append((scene.name, *plan.table_row()))
+        seconds, size = seconds + plan.seconds, size + plan.disk_bytes
+    rows.append(("total", "", "", "", "", human_time(seconds), human_bytes(size)))
+    sys.stdout.write(table(HEAD, rows))
+    return 0
+
+
+def _make(scenes: "tuple[Scene, ...]", out: Path, force: bool) -> int:
+    from ctsim.writer import is_complete
+    from phantoms.scene import scene_id
+
+    # what is in the way shows before the first hour is spent, not after it
+    todo = [s for s in scenes if force or not is_complete(out, s.name, scene_id(s))]
+    for scene in scenes:
+        if scene not in todo:
+            _say(f"{scene.name}: already complete")
+    planned = {scene.name: _plan(scene) for scene in todo[:1]}
+    need = planned[todo[0].name][0].disk_bytes if todo else 0
+    for scene in todo[1:]:
+        need += _plan(scene)[0].disk_bytes
+    _check_space(out, need)
+    for number, scene in enumerate(todo, 1):
+        plan, phantom, scanner = planned.pop(scene.name, None) or _plan(scene)
+        make_scene(scene, plan, (phantom, scanner), out, force=force, title=f"{number}/{len(todo)} {scene.name}")
+    return 0
+
+
+def make_scene(
+    scene: "Scene", plan: "Plan", parts: "tuple[Phantom, Scanner]", out: Path, *, force: bool = False, title: str = ""
+) -> Path:
+    """Simulate one scene into `out`, going on from where an earlier run stopped; return its folder.
+
+    Raises
+    ------
+    InputError
+        When another scene is in the way or the disk is full.
+    """
+    from ctsim.simulate import scan_info, simulate_views, truth_volumes
+
+    from ctsim.writer import SceneWriter, Stack
+    from phantoms.scene import scene_id, scene_to_toml
+
+    phantom, scanner = parts
+    geometry = scanner.geometry
+    stacks = tuple(
+        Stack(name=o.name, shape=(geometry.n_views, *o.shape), dtype=o.dtype, pixel=geometry.d_detector)
+        for o in plan.outputs
+    )
+    with SceneWriter(
+        out, scene.name, scene_id=scene_id(scene), plan_hash=plan_hash(plan), stacks=stacks, force=force
+    ) as writer:
+        if writer.first_view:
+            _say(f"{scene.name}: goes on from view {writer.first_view} of {geometry.n_views}")
+        views = simulate_views(plan, phantom, scanner, first_view=writer.first_view)
+        for view, arrays in _progress(views, writer.first_view, geometry.n_views, title or scene.name):
+            writer.put(view, arrays)
+        info = dict(scan_info(plan, phantom, scanner))
+        writer.write_image("flat", info.pop("flat"), geometry.d_detector)
+        for name, volume in truth_volumes(plan, phantom, scanner).items():
+            own_grid = name.endswith("labels") and volume.shape != geometry.n_voxel
+            writer.write_image(name, volume, phantom.d_voxel if own_grid else geometry.d_voxel)
+        writer.write_text("scene.toml", scene_to_toml(scene))
+        writer.write_text("scan.json", _json(info))
+        writer.write_text("plan.json", _json(plan.to_dict()))
+        writer.write_text("spectrum.csv", spectrum_csv(scanner))
+        return writer.finish()
+
+
+def plan_hash(plan: "Plan") -> str:
+    """Hash what a plan does, leaving out its estimates of time, which change with the machine."""
+    import hashlib
+
+    kept = {k: v for k, v in plan.to_dict().items() if k != "seconds"}
+    return hashlib.sha256(_json(kept)).hexdigest()
+
+
+def spectrum_csv(scanner: "Scanner") -> str:
+    """Return the tube's spectrum and what the detector makes of it as CSV."""
+    from ctsim.detector import response
+    from ctsim.spectrum import spectrum
+
+    tube = spectrum(scanner.tube)
+    signal = tube.weights * response(scanner.detector, tube.energies)[0]
+    signal = signal / signal.sum()
+    rows = zip(tube.energies, tube.weights, signal, strict=True)
+    return "energy_kev,photon_fraction,signal_fraction\n" + "".join(f"{e:.4f},{w:.8g},{s:.8g}\n" for e, w, s in rows)
+
+
+def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    """Lay out a table in columns, the first three and the skips to the left, numbers to the right."""
+    cells = [head, *rows]
+    widths = [max(len(str(row[k])) for row in cells) for k in range(len(head))]
+    left = {"scene", "does", "skips (reason)"}
+    lines = (
+        "  ".join(
+            str(c).ljust(w) if h in left else str(c).rjust(w) for c, w, h in zip(row, widths, head, strict=True)
+        ).rstrip()
+        for row in cells
+    )
+    return "\n".join(lines) + "\n"
+
+
+def human_bytes(size: float) -> str:
+    """Return a size with a decimal unit, such as 113 MB."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if size < 999.5:
+            return f"{size:.3g} {unit}"
+        size /= 1000
+    return f"{size:.3g} TB"
+
+
+def human_time(seconds: float) -> str:
+    """Return a duration in the unit that reads best, such as 41 s or 3.5 h."""
+    if seconds < 99.5:
+        return f"{seconds:.2g} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5970 else f"{seconds / 3600:.1f} h"
+
+
+def _check_space(out: Path, need: int) -> None:
+    folder = out.absolute()
+    while not folder.exists():
+        folder = folder.parent
+    unfinished = sum(p.stat().st_blocks * 512 for p in out.glob(".*.partial/**/*.tif")) if out.is_dir() else 0
+    free = shutil.disk_usage(folder).free + unfinished
+    if need + _SPARE > free:
+        raise InputError(f"{out}: the dataset needs {human_bytes(need)} but only {human_bytes(free)} are free")
+
+
+def _progress(views: Iterator[Any], first: int, n_views: int, title: str) -> Iterator[Any]:
+    from tqdm import tqdm
+
+    return iter(tqdm(views, title, n_views, initial=first, unit="view", disable=None, file=sys.stderr))
+
+
+def _json(value: Any) -> bytes:
+    import msgspec
+    import numpy as np
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray | np.generic):
+            return value.tolist()
+        raise TypeError(f"{type(value).__name__} cannot be written as JSON")
+
+    return msgspec.json.format(msgspec.json.encode(value, enc_hook=plain), indent=1) + b"\n"
+
+
+def _sentence(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'file system'}: {error.strerror}"
+    return " ".join(str(error).split())
+
+
+def _say(text: str) -> None:
+    sys.stderr.write(text + "\n")
