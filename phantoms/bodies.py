@@ -115,3 +115,29 @@ def validation(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Vali
             centre = (0.5 * unit * math.cos(angle), 0.5 * unit * math.sin(angle), 0.0)
             solids.append(upright(f"rod{k}", params.metal, centre, (diameter / 2, 0.85 * unit), metal=True))
     return assemble(np.zeros(n, np.uint8), d_voxel, ("air",), solids)
+
+
+class MetalRods(Recipe, frozen=True, kw_only=True, tag="metal_rods"):
+    """Alloy rods in a water-filled PLA cylinder (Al6061 by default)."""
+
+    metal: str = "Al6061"
+
+
+def metal_rods(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: MetalRods) -> Phantom:
+    """Draw a printed PLA cup with lid, water up to a level, and rods of unequal width standing in it."""
+    unit = half_box(n, d_voxel)
+    level = rng.uniform(0.60, 0.76)
+    solids = [
+        upright("cup", "PLA", (0.0, 0.0, 0.0), (0.86 * unit, 0.9 * unit)),
+        upright("air space", "air", (0.0, 0.0, 0.02 * unit), (0.78 * unit, 0.80 * unit)),
+        upright("water", "water", (0.0, 0.0, (level - 0.78) / 2 * unit), (0.78 * unit, (level + 0.78) / 2 * unit)),
+    ]
+    if params.metal != "none":
+        total, turn = 4 if params.n_inserts is None else params.n_inserts, rng.uniform(0, 2 * math.pi)
+        for k in range(total):
+            angle = turn + 2 * math.pi * k / total
+            r = (0.46 + 0.06 * rng.uniform(-1, 1)) * unit
+            width = params.insert_mm or (4.0, 6.0, 8.0, 5.0)[k % 4] * unit / 30
+            centre = (r * math.cos(angle), r * math.sin(angle), -0.03 * unit)
+            solids.append(upright(f"rod{k}", params.metal, centre, (width / 2, 0.72 * unit), metal=True))
+    return assemble(np.zeros(n, np.uint8), d_voxel, ("air",), solids)

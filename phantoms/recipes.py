@@ -5,16 +5,36 @@ grid: shapes are drawn in units of the box, so 64³ and 256³ show the same obje
 """
 
 import hashlib
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from ctsim.errors import InputError
+from ctsim.geometry import Triple
 from ctsim.types import Phantom
-from phantoms.bodies import Recipe, Validation, validation
+from phantoms.bodies import MetalRods, Recipe, Shape, Validation, metal_rods, validation
+from phantoms.body_broccoli import Broccoli, broccoli
+from phantoms.body_lung import Lung, lung
+from phantoms.body_organic import BellPepper, Chicken, Walnut, bell_pepper, chicken, walnut
+from phantoms.body_random import Random, random
+from phantoms.body_teeth import Teeth, teeth
 
-AnyRecipe = Validation
+AnyRecipe = Validation | MetalRods | Lung | Teeth | Broccoli | Walnut | Chicken | BellPepper | Random
 
-BUILDERS = {Validation: validation}
+Builder = Callable[[Shape, Triple, np.random.Generator, Any], Phantom]
+
+BUILDERS: dict[type[Recipe], Builder] = {
+    Validation: validation,
+    MetalRods: metal_rods,
+    Lung: lung,
+    Teeth: teeth,
+    Broccoli: broccoli,
+    Walnut: walnut,
+    Chicken: chicken,
+    BellPepper: bell_pepper,
+    Random: random,
+}
 
 NAMES = tuple(str(kind.__struct_config__.tag) for kind in BUILDERS)
 

@@ -1,0 +1,126 @@
+"""A head of broccoli: a stem that forks again and again, tipped with florets of tiny buds.
+
+A small head that fits the 60 mm cube. The tissue is nine tenths water; its fibres are cellulose.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.geometry import Triple
+from ctsim.solids import Solid
+from ctsim.types import Phantom
+from phantoms.bodies import Recipe, Shape, assemble
+from phantoms.fields import Canvas, Field, Mask, Noise, frame_along
+from phantoms.inserts import count, diameter, inserts
+
+MATERIALS = ("air", "water", "cellulose")
+AIR, WATER, FIBRE = range(3)
+ROOT = np.array([0.0, 0.0, -0.86])
+FORK = np.array([0.0, 0.0, -0.30])
+
+
+class Broccoli(Recipe, frozen=True, kw_only=True, tag="broccoli"):
+    """Broccoli with rivets in its stem and florets (Al by default).
+
+    `levels` is the number of forkings, `forks` the branches at each.
+    """
+
+    metal: str = "Al"
+    levels: int = 4
+    forks: int = 5
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        Recipe.__post_init__(self)
+        self.within("levels", 1, 5)
+        self.within("forks", 2, 6)
+
+
+def broccoli(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Broccoli) -> Phantom:
+    """Draw the head; metal: rivets through the stem, then in the crown."""
+    body, metal = rng.spawn(2)
+    canvas = Canvas(n, d_voxel)
+    buds = _branches(canvas, body, params)
+    grains = body.standard_normal((32, 6, 3))
+    grains /= np.linalg.norm(grains, axis=2, keepdims=True)
+    for k, (at, r) in enumerate(buds):
+        canvas.ellipsoid(WATER, at, r)
+        if k % 3 == 0:
+            canvas.ellipsoid(FIBRE, at, 0.45 * r)
+        for way in grains[k % len(grains)]:
+            canvas.ellipsoid(WATER, at + 0.95 * r * way, 0.36 * r)
+    _stem(canvas, body)
+    return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit))
+
+
+def _stem(canvas: Canvas, rng: np.random.Generator) -> None:
+    """Thick stalk with a fibrous rind, a ring of bundles and a soft pith."""
+    ridges = Noise(rng, 7)
+    low, high = ROOT[2], FORK[2] + 0.05
+
+    def inside(scale: float) -> Callable[[Field, Field, Field], Mask]:
+        return lambda x, y, z: (np.hypot(x, y) <= scale * (0.235 - 0.05 * (z + 0.5) + 0.014 * ridges(x, y, z))) & (
+            (z > low + (1 - scale) * 0.1) & (z < high)
+        )
+
+    box = ((-0.4, -0.4, low), (0.4, 0.4, high))
+    canvas.fill(FIBRE, inside(1.0), box)
+    canvas.fill(WATER, inside(0.93), box)
+    for angle in np.linspace(0, 2 * np.pi, 17)[:-1] + rng.uniform(0, 1):
+        c = np.array([np.cos(angle), np.sin(angle), 0])
+        canvas.tube(FIBRE, [ROOT + 0.17 * c + [0, 0, 0.02], FORK + 0.14 * c], 0.016, over=(WATER,))
+
+
+def _branches(
+    canvas: Canvas, rng: np.random.Generator, params: Broccoli
+) -> list[tuple[NDArray[np.float64], float]]:
+    """Grow the branches, painting them; returns the buds (centre, radius)."""
+    buds: list[tuple[NDArray[np.float64], float]] = []
+    shells: list[tuple[NDArray[np.float64], NDArray[np.float64], float]] = []
+    dome = np.array([0.0, 0.0, -0.02])
+
+    def grow(start: NDArray[np.float64], along: NDArray[np.float64], length: float, r: float, level: int) -> None:
+        end = start + along * length
+        canvas.capsule(WATER, start, end, (r, 0.78 * r))
+        shells.append((start, end, r))
+        forks = params.forks + (2 if level == 0 else 0)
+        spin, frame = rng.uniform(0, 2 * np.pi), frame_along(along)
+        for k in range(forks + 1):
+            jitter = rng.uniform(-0.12, 0.12, 2)
+            tilt = (0.0 if k == forks else (1.02 if level == 0 else 0.74)) + jitter[0]
+            a = spin + 2 * np.pi * k / forks + jitter[1]
+            way = np.cos(tilt) * frame[2] + np.sin(tilt) * (np.cos(a) * frame[0] + np.sin(a) * frame[1])
+            if level + 1 < params.levels:
+                grow(end, way, length * (0.70 + 0.2 * jitter[0]), r * (0.62 if k < forks else 0.7), level + 1)
+            else:
+                buds.append((end + way * length * 0.55, 0.30 * length + 0.012))
+
+    grow(FORK - [0, 0, 0.22], np.array([0.0, 0.0, 1.0]), 0.5, 0.2, 0)
+    for start, end, r in shells:  # a bundle in the middle of each branch
+        canvas.capsule(FIBRE, start, end, (0.22 * r, 0.18 * r), over=(WATER,))
+    kept = []
+    for at, r in buds:
+        out = (at - dome) / np.array([0.88, 0.88, 0.88])
+        far = float(np.linalg.norm(out))
+        limit = (0.88 - r) / 0.88
+        kept.append((dome + (at - dome) * min(1.0, limit / max(far, 1e-9)), r))
+    return kept
+
+
+def _metal(rng: np.random.Generator, params: Broccoli, unit: float) -> list[Solid]:
+    make, d = inserts(params, unit), diameter(params, 4.0, unit)
+    solids: list[Solid] = []
+    for k in range(count(params, 4)):
+        turn = rng.uniform(0, 2 * np.pi)
+        out = np.array([np.cos(turn), np.sin(turn), 0.0])
+        if k < 2:
+            at = ROOT + [0, 0, 0.2 + 0.26 * k] + 0.2 * out
+            solids.append(make.rivet(f"rivet{k}", at, -out, d, 0.34 * unit))
+        else:
+            turn += 2 * np.pi * k / 3
+            way = np.array([np.cos(turn), np.sin(turn), 0.55])
+            way /= np.linalg.norm(way)
+            solids.append(make.rivet(f"rivet{k}", [0, 0, 0.05] + 0.6 * way, -way, d, 0.3 * unit))
+    return solids

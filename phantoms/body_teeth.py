@@ -1,0 +1,253 @@
+"""Both jaws of a dental specimen: arches of bone, 28 teeth with roots, cheeks, lips and tongue.
+
+The arch is of natural size in the 60 mm cube. Front is +y, up is +z; the teeth meet at z = 0.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ctsim.geometry import Triple
+from ctsim.solids import Solid
+from ctsim.types import Phantom
+from phantoms.bodies import Recipe, Shape, assemble
+from phantoms.fields import Canvas, Field, Mask, Noise
+from phantoms.inserts import count, diameter, inserts
+
+MATERIALS = ("air", "soft_tissue", "cortical_bone", "dentin", "enamel")
+AIR, SOFT, BONE, DENTIN, ENAMEL = range(5)
+
+
+class Teeth(Recipe, frozen=True, kw_only=True, tag="teeth"):
+    """Jaws with implant screws and crowns (Ti by default).
+
+    `crowns` of the inserts are metal crowns, the others implant screws; `missing` teeth leave gaps.
+    """
+
+    metal: str = "Ti"
+    crowns: int = 2
+    missing: int = 1
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        Recipe.__post_init__(self)
+        self.within("crowns", 0, 16)
+        self.within("missing", 0, 14)
+
+
+class Kind(NamedTuple):
+    """A tooth's half widths along and across the arch, crown height, root length (relative), roots."""
+
+    along: float
+    across: float
+    crown: float
+    root: float
+    roots: int
+
+
+KINDS = (  # from the midline backwards: two incisors, canine, two premolars, two molars
+    Kind(0.095, 0.085, 0.250, 0.36, 1),
+    Kind(0.092, 0.088, 0.240, 0.36, 1),
+    Kind(0.105, 0.110, 0.255, 0.44, 1),
+    Kind(0.108, 0.125, 0.215, 0.38, 1),
+    Kind(0.110, 0.130, 0.205, 0.38, 1),
+    Kind(0.150, 0.150, 0.195, 0.36, 2),
+    Kind(0.145, 0.148, 0.185, 0.33, 2),
+)
+
+
+class Tooth(NamedTuple):
+    """Where a tooth stands: kind, neck (x, y, z), frame rows (along, across, up to the crown), slot."""
+
+    kind: Kind
+    neck: NDArray[np.float64]
+    frame: NDArray[np.float64]
+    slot: int
+
+
+def teeth(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Teeth) -> Phantom:
+    """Draw the jaws; metal: implants under crowns of their own, and crowns over whole teeth."""
+    body, metal = rng.spawn(2)
+    canvas = Canvas(n, d_voxel)
+    _soft(canvas, body)
+    spongy = Noise(body, 56)
+    rows = [_row(body, jaw) for jaw in (-1, 1)]
+    for jaw, row in zip((-1, 1), rows, strict=True):
+        _bone(canvas, jaw, spongy)
+        gone = body.permutation(14)[: params.missing]
+        implants, _ = _sites(metal, params) if jaw < 0 else ([], [])
+        for tooth in row:
+            if tooth.slot not in gone or (jaw < 0 and tooth.slot in SITES):
+                _tooth(canvas, tooth, body, rootless=tooth.slot in implants)
+    return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit, rows[0]))
+
+
+def _arch(t: Field | float) -> tuple[Field, Field]:
+    """Point of the arch's midline (x, y) at t in [−1, 1]: half an ellipse with straightened ends."""
+    angle = np.asarray(t) * 1.42
+    return 0.56 * np.sin(angle) * (1 + 0.10 * np.abs(np.sin(angle)) ** 3), -0.48 + 0.98 * np.cos(angle)
+
+
+def _arch_gap(x: Field, y: Field) -> Field:
+    """Distance to the arch's midline, signed: positive on the cheek side."""
+    px, py = _arch(np.linspace(-1.12, 1.12, 240))
+    shape = np.broadcast_shapes(x.shape, y.shape)
+    at = np.stack([np.broadcast_to(x, shape).ravel(), np.broadcast_to(y, shape).ravel()], 1)
+    gap, nearest = cKDTree(np.stack([px, py], 1)).query(at)
+    inner = np.hypot(at[:, 0], at[:, 1] + 0.48) < np.hypot(px[nearest], py[nearest] + 0.48)
+    return np.where(inner, -gap, gap).reshape(shape).astype(np.float32)
+
+
+def _soft(canvas: Canvas, rng: np.random.Generator) -> None:
+    """Face with lips and cheeks, the mouth's air, gums and tongue."""
+    wobble = Noise(rng, 4)
+
+    def face(x: Field, y: Field, z: Field) -> Mask:
+        section = (np.abs(x / 0.87) ** 2.6 + np.abs((y + 0.04) / 0.84) ** 2.4) ** np.float32(1 / 2.5)
+        return (section**8 + np.abs(z / 0.9) ** 8) ** np.float32(1 / 8) + 0.012 * wobble(x, y, z) < 0.98
+
+    canvas.fill(SOFT, face)
+    canvas.fill(  # the open mouth: between the arches and just before the teeth
+        AIR,
+        lambda x, y, z: (_arch_gap(x, y) < 0.19) & (np.abs(z) < 0.30) & (y > -0.62),
+        ((-0.9, -0.62, -0.3), (0.9, 0.9, 0.3)),
+    )
+    canvas.fill(
+        SOFT,
+        lambda x, y, z: ((x / 0.40) ** 2 + ((y + 0.22) / 0.52) ** 2 + ((z + 0.18 - 0.1 * wobble(x, y, z)) / 0.27) ** 2 <= 1),
+    )
+    canvas.ellipsoid(AIR, (0.0, -0.3, 0.82), (0.2, 0.5, 0.05))  # floor of the nose
+
+
+def _bone(canvas: Canvas, jaw: int, spongy: Noise) -> None:
+    """Alveolar bone under the gum: a compact shell round a spongy core."""
+
+    def level(x: Field, y: Field, z: Field) -> Field:
+        h = jaw * z  # height above the occlusal plane into this jaw
+        width = np.float32(0.165) + 0.03 * np.clip((h - 0.3) / 0.4, 0, 1)
+        across = _arch_gap(x, y) / width
+        return (np.abs(across) ** 4 + np.abs((h - 0.555) / 0.32) ** 4) ** np.float32(0.25)
+
+    box = ((-0.92, -0.92, -0.92 if jaw < 0 else 0.2), (0.92, 0.8, -0.2 if jaw < 0 else 0.92))
+    canvas.fill(SOFT, lambda x, y, z: (level(x, y, z) <= 1.12) & (y > -0.66), box, over=(AIR,))  # gum
+    canvas.fill(BONE, lambda x, y, z: (level(x, y, z) <= 1) & (y > -0.70), box)
+    canvas.fill(
+        SOFT,
+        lambda x, y, z: (level(x, y, z) <= 0.80) & (y > -0.66) & (spongy(x, y, z) > -0.45),
+        box,
+        over=(BONE,),
+    )
+
+
+def _row(rng: np.random.Generator, jaw: int) -> list[Tooth]:
+    """Stand 14 teeth side by side along the arch, with a little disorder."""
+    fine = np.linspace(-1.12, 1.12, 2001)
+    length = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(np.stack(_arch(fine)), axis=1)))])
+    middle = np.interp(0.0, fine, length)
+    scale = 0.92 if jaw < 0 else 1.0  # lower teeth are narrower
+    teeth = []
+    for side in (-1, 1):
+        at = 0.0
+        for k, kind in enumerate(KINDS):
+            kind = kind._replace(along=kind.along * scale)
+            t = np.interp(middle + side * (at + kind.along), length, fine)
+            at += 2 * kind.along * 1.015
+            x, y = _arch(t)
+            ahead = np.subtract(_arch(t + 1e-3), _arch(t - 1e-3))
+            along = np.array([*(ahead / np.linalg.norm(ahead)), 0.0])
+            lean, turn = rng.uniform(-0.05, 0.05, 2)
+            up = np.array([0.0, 0.0, -float(jaw)]) + lean * along
+            up /= np.linalg.norm(up)
+            across = np.cross(up, along)
+            across /= np.linalg.norm(across)
+            along = np.cross(across, up)
+            frame = np.stack([along + turn * across, across - turn * along, up])
+            frame[:2] /= np.linalg.norm(frame[:2], axis=1, keepdims=True)
+            neck = np.array([float(x), float(y), jaw * (kind.crown + 0.012)])
+            teeth.append(Tooth(kind, neck, frame, k if side > 0 else 7 + k))
+    return teeth
+
+
+def _tooth(canvas: Canvas, tooth: Tooth, rng: np.random.Generator, *, rootless: bool) -> None:
+    """Paint roots of dentin with canals, a dentin crown with pulp, and the enamel cap with cusps."""
+    kind, neck, frame = tooth.kind, tooth.neck, tooth.frame
+    bend = rng.uniform(-0.04, 0.04, 3)
+    if not rootless:
+        _roots(canvas, tooth, bend)
+
+    def crown(shrink: float) -> Callable[[Field, Field, Field], Mask]:
+        a, b = kind.along - shrink, kind.across - shrink
+        top = kind.crown - 1.4 * shrink
+
+        def inside(x: Field, y: Field, z: Field) -> Mask:
+            px, py, pz = x - np.float32(neck[0]), y - np.float32(neck[1]), z - np.float32(neck[2])
+            p, q, h = (row[0] * px + row[1] * py + row[2] * pz for row in frame.astype(np.float32))
+            up = np.clip(h / kind.crown, 0, 1)
+            if kind.roots == 1 and kind.across < 0.12:  # a blade: wide in front, thin at its edge
+                wide, deep = 0.72 + 0.28 * up, 0.95 - 0.62 * up
+                lid = top
+            else:  # a table with cusps and a fissure between them
+                wide, deep = 0.80 + 0.20 * np.sin(2.2 * up), 0.86 + 0.14 * np.sin(2.4 * up)
+                cusps = np.cos(np.pi * p / a * (1 if kind.roots > 1 else 0.6)) * np.cos(np.pi * q / b)
+                lid = top - 0.022 + 0.03 * np.abs(cusps - 0.3)
+            round_ = np.abs(p / (a * wide)) ** 2.8 + np.abs(q / (b * deep)) ** 2.8
+            return (round_ <= 1) & (h <= lid) & (h > -0.03 if shrink else h > 0)
+
+        return inside
+
+    box = (neck - 0.34, neck + 0.34)
+    canvas.fill(ENAMEL, crown(0.0), box)
+    canvas.fill(DENTIN, crown(0.024), box)
+    if not rootless:
+        chamber = neck + 0.25 * kind.crown * frame[2]
+        canvas.ellipsoid(SOFT, chamber, (0.34 * kind.along, 0.30 * kind.across, 0.30 * kind.crown), frame)
+
+
+def _roots(canvas: Canvas, tooth: Tooth, bend: NDArray[np.float64]) -> None:
+    kind, neck, frame = tooth.kind, tooth.neck, tooth.frame
+    steps = np.linspace(0, 1, 9)
+    for k in range(kind.roots):
+        spread = 0.0 if kind.roots == 1 else (2 * k - 1) * 0.55 * kind.along
+        foot = neck + spread * frame[0] + 0.3 * spread * frame[0] + bend * [1, 1, 0] - kind.root * frame[2]
+        start = neck + 0.6 * spread * frame[0] + 0.04 * frame[2]
+        path = start + steps[:, None] * (foot - start) + (steps * (1 - steps))[:, None] * 0.3 * spread * frame[0]
+        thick = (0.80 if kind.roots == 1 else 0.46) * min(kind.along, kind.across) * (1 - 0.68 * steps**1.5)
+        canvas.tube(SOFT, path, thick + 0.014, over=(BONE,))  # the ligament
+        canvas.tube(DENTIN, path, thick)
+        canvas.tube(SOFT, path[:-1], 0.20 * thick[:-1] + 0.006, over=(DENTIN,))
+
+
+SITES = (5, 12, 3, 10, 6, 4, 13, 11)  # slots of the lower jaw that can carry inserts, in order of use
+
+
+def _sites(rng: np.random.Generator, params: Teeth) -> tuple[list[int], list[int]]:
+    """Slots of implants and of crowns; drawn from the settings, not from the metal, so twins agree."""
+    total = min(4 if params.n_inserts is None else params.n_inserts, len(SITES))
+    crowned = min(params.crowns, total)
+    slots = list(SITES[:total])
+    return slots[: total - crowned], slots[total - crowned :]
+
+
+def _metal(rng: np.random.Generator, params: Teeth, unit: float, row: list[Tooth]) -> list[Solid]:
+    if count(params, 4) == 0:
+        return []
+    make, d = inserts(params, unit), diameter(params, 4.2, unit)
+    implants, crowns = _sites(rng, params)
+    by_slot = {tooth.slot: tooth for tooth in row}
+    solids: list[Solid] = []
+    for slot in implants:
+        tooth = by_slot[slot]
+        length = 0.42 * unit * rng.uniform(0.9, 1.1)
+        solids.append(make.screw(f"implant{slot}", tooth.neck + 0.02 * tooth.frame[2], -tooth.frame[2], d, length))
+        foot, top = tooth.neck, tooth.neck + 0.6 * tooth.kind.crown * tooth.frame[2]
+        solids.append(make.rod(f"abutment{slot}", foot, top, 0.62 * d, round_ends=False))
+    for slot in crowns:
+        tooth = by_slot[slot]
+        kind = tooth.kind
+        centre = tooth.neck + 0.55 * kind.crown * tooth.frame[2]
+        radii = (0.98 * kind.along * unit, 0.98 * kind.across * unit, 0.50 * kind.crown * unit)
+        solids.append(make.ellipsoid(f"crown{slot}", centre, radii, tooth.frame[2]))
+    return solids
