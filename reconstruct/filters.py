@@ -1,5 +1,7 @@
 """The ramp filter of filtered backprojection, in its band-limited spatial form, and its windows."""
 
+from typing import cast
+
 import numba
 import numpy as np
 import scipy.fft
@@ -12,7 +14,7 @@ WINDOWS = ("ram-lak", "shepp-logan", "cosine", "hamming", "hann")
 
 def padded_length(n: int) -> int:
     """Return the FFT length for rows of `n` samples: at least 2 n, so that the convolution does not wrap."""
-    return int(scipy.fft.next_fast_len(2 * n, real=True))
+    return cast(int, scipy.fft.next_fast_len(2 * n, real=True))
 
 
 def ramp_kernel(n: int, spacing: float) -> NDArray[np.float64]:

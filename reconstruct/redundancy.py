@@ -95,11 +95,11 @@ def _view_steps(geometry: Geometry) -> tuple[NDArray[np.float64], NDArray[np.flo
     if geometry.angles_deg is None:
         arc = math.radians(abs(geometry.arc_deg))
         step = np.full(n, arc / n)
-        place = (np.arange(n) + 0.5) * (arc / n)
+        place = (np.arange(n, dtype=np.float64) + 0.5) * (arc / n)
         return (place if geometry.arc_deg > 0 else arc - place), step, arc, abs(geometry.arc_deg) > 360 - 1e-6
     turn = 2 * math.pi
     # Rounding merges repeated views, which then share one step.
-    angle = np.round(np.mod(geometry.angles, turn), 9)
+    angle = np.round(np.mod(geometry.angles, turn), 9).astype(np.float64)
     angle[angle >= round(turn, 9)] = 0.0
     distinct, which, repeats = np.unique(angle, return_inverse=True, return_counts=True)
     if len(distinct) == 1:

@@ -82,15 +82,18 @@ def test_water_keeps_its_attenuation(name):
     assert disc_mean(geometry, fdk(p, geometry), centre=centre) == pytest.approx(MU, rel=tolerance)
 
 
-@pytest.mark.parametrize("changes", [{"arc_deg": 220.0}, {"off_detector": (0.0, 30.0)}])
+@pytest.mark.parametrize("changes", [{"arc_deg": 220.0}, {"off_detector": (0.0, 30.4)}])
 def test_other_scans_agree_with_the_full_turn(changes):
+    # A shift by whole pixels samples the same rays, so that only the shares differ.
     reference = fdk(cylinder(GEOMETRY), GEOMETRY)[4]
     other = fdk(cylinder(with_(**changes)), with_(**changes))[4]
     _, y, x = GEOMETRY.voxel_centres()
     radius = np.sqrt(np.add.outer(y**2, x**2))
-    smooth = torch.from_numpy((radius < 17) | ((radius > 23) & (radius < 30)))
-    # Away from the edge only the streaks of 180 views differ: 0.5 % of water, root mean square.
-    assert 0 < float((reference - other)[smooth].square().mean().sqrt()) < 0.005 * MU
+    difference = (other - reference).numpy() / MU
+    # Inside, nothing is left but rounding; outside the streaks of 180 views, which fall with the number of views.
+    assert np.sqrt(np.mean(difference[radius < 17] ** 2)) < 1e-4
+    assert np.sqrt(np.mean(difference[(radius > 23) & (radius < 30)] ** 2)) < 0.012
+    assert difference.any()
 
 
 @pytest.mark.parametrize("window", WINDOWS)
