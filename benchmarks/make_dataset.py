@@ -16,7 +16,6 @@ from ctsim.errors import InputError
 
 if TYPE_CHECKING:
     from ctsim.plan import Plan
-
     from ctsim.types import Phantom, Scanner
     from phantoms.scene import Scene
 
@@ -115,7 +114,6 @@ def _verify(data_dir: Path) -> int:
 
 def _plan(scene: "Scene") -> "tuple[Plan, Phantom, Scanner]":
     from ctsim.plan import make_plan
-
     from phantoms.scene import build, stream_id
 
     phantom, scanner = build(scene), scene.resolve()
@@ -170,7 +168,6 @@ def make_scene(
         When another scene is in the way or the disk is full.
     """
     from ctsim.simulate import scan_info, simulate_views, truth_volumes
-
     from ctsim.writer import SceneWriter, Stack
     from phantoms.scene import scene_id, scene_to_toml
 
@@ -191,8 +188,7 @@ def make_scene(
         info = dict(scan_info(plan, phantom, scanner))
         writer.write_image("flat", info.pop("flat"), geometry.d_detector)
         for name, volume in truth_volumes(plan, phantom, scanner).items():
-            own_grid = name.endswith("labels") and volume.shape != geometry.n_voxel
-            writer.write_image(name, volume, phantom.d_voxel if own_grid else geometry.d_voxel)
+            writer.write_image(name, volume, geometry.d_voxel)
         writer.write_text("scene.toml", scene_to_toml(scene))
         writer.write_text("scan.json", _json(info))
         writer.write_text("plan.json", _json(plan.to_dict()))
