@@ -3,8 +3,8 @@
 The body's labels are averaged by volume (box overlap; exact where the grids coincide, air outside the
 phantom). Solids are painted over by their volume fraction, later ones covering earlier ones. Voxels that
 no surface can cross are exact; the others are cut into about 8³ sub-cells whose coverage is linear in the
-distance to the surface: measured error at most 1/250 of a voxel (rms over surface voxels 1/1600). Where the body itself changes within a voxel that a solid
-crosses, the uncovered part counts with the voxel's mean.
+distance to the surface: measured error at most 1/250 of a voxel (rms over surface voxels 1/1600). Where
+the body itself changes within a voxel that a solid crosses, the uncovered part counts with its mean.
 """
 
 import math

@@ -4,6 +4,7 @@ Every place where a ray may cross the surface of a primitive is collected (exten
 coordinates) and sorted; a stretch between neighbours belongs to the primitive if its middle does.
 """
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ def intersect(
     point = point + shift * direction
     times = sorted(t for t in _candidates(prim, point, direction) if np.isfinite(t))
     intervals: list[list[Any]] = []
-    for t0, t1 in zip(times, times[1:], strict=False):
+    for t0, t1 in itertools.pairwise(times):
         if t1 > t0 and _inside_local(prim, point + (t0 + t1) / 2 * direction):
             if intervals and intervals[-1][1] == t0:
                 intervals[-1][1] = t1

@@ -131,9 +131,9 @@ def mark(prims, start, pitch, touched):
             x0, x1 = _span(prim[18], prim[21], start[2], pitch[2], nx)
             for j in range(y0, y1):
                 for i in range(x0, x1):
-                    if touched[k, j, i] == 0:
-                        if bound(prim, start[2] + i * pitch[2], start[1] + j * pitch[1], z) < reach:
-                            touched[k, j, i] = 1
+                    x, y = start[2] + i * pitch[2], start[1] + j * pitch[1]
+                    if touched[k, j, i] == 0 and bound(prim, x, y, z) < reach:
+                        touched[k, j, i] = 1
 
 
 @njit(parallel=True, cache=True)
@@ -152,6 +152,7 @@ def cover(prims, channel, start, pitch, cells, shape, index, first, out):
     for k in prange(nz):
         row_prims = np.empty(prims.shape[0], np.int64)
         crossing = np.empty(prims.shape[0], np.int64)
+        total = np.empty(out.shape[1])
         z, row, n_row = start[0] + k * pitch[0], -1, 0
         for m in range(first[k], first[k + 1]):
             j, i = (index[m] // nx) % ny, index[m] % nx
@@ -180,6 +181,7 @@ def cover(prims, channel, start, pitch, cells, shape, index, first, out):
                 if full >= 0:
                     out[m, full] = 1.0
                 continue
+            total[:] = 0.0
             for kk in range(cells[0]):
                 sz = z - 0.5 * pitch[0] + (kk + 0.5) * dz
                 for jj in range(cells[1]):
@@ -190,9 +192,10 @@ def cover(prims, channel, start, pitch, cells, shape, index, first, out):
                         for r in range(n):
                             p = crossing[r]
                             part = left * share(prims[p], sx, sy, sz, width)
-                            out[m, channel[p]] += part
+                            total[channel[p]] += part
                             left -= part
                             if left <= 0:
                                 break
                         if full >= 0:
-                            out[m, full] += left
+                            total[full] += left
+            out[m, :] = total
