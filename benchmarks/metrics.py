@@ -104,7 +104,7 @@ def ssim3d_naf(values: Array, reference: Array) -> float | None:
     _check(values, reference, None, 2.0)
     if min(values.shape) < 7:
         return None
-    return float(structural_similarity(reference, values, win_size=7, data_range=2.0))
+    return float(np.asarray(structural_similarity(reference, values, win_size=7, data_range=2.0)))
 
 
 def least_squares_gain(values: Array, reference: Array, region: Mask) -> float | None:
@@ -126,12 +126,12 @@ def boundary_rms(found: Mask, truth: Mask, d_voxel: tuple[float, float, float]) 
 
     Distances run between surface voxel centres; None where either mask has no surface.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     a, b = (np.argwhere(surface(m)) * np.asarray(d_voxel) for m in (found, truth))
     if len(a) == 0 or len(b) == 0:
         return None
-    ab, ba = cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
+    ab, ba = KDTree(b).query(a)[0], KDTree(a).query(b)[0]
     return float(np.sqrt((np.vdot(ab, ab) + np.vdot(ba, ba)) / (len(ab) + len(ba))))
 
 

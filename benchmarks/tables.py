@@ -96,21 +96,23 @@ def tidy(records: list[Record]) -> pd.DataFrame:
 
 def _against(frame: pd.DataFrame) -> pd.DataFrame:
     """Derive gains over FDK and NMAR (tissue PSNR3D, dB), the anchored score (tissue RMSE) and harm, per run."""
-    scored = frame[(frame.protocol == "tissue") & (frame.status == OK)]
-    keys = ["scene", "seed"]
-    metal = scored[scored.variant == "metal"]
+    scored: list[dict[Any, Any]] = [
+        row for row in _rows(frame) if row["protocol"] == "tissue" and row["status"] == OK and pd.notna(row["value"])
+    ]
 
-    def series(rows: pd.DataFrame, method: str, metric: str) -> dict[Any, float]:
-        chosen = rows[(rows.method == method) & (rows.metric == metric)]
-        return dict(zip(chosen[keys].itertuples(index=False, name=None), chosen.value, strict=True))
+    def series(variant: str, method: str, metric: str) -> dict[Any, float]:
+        wanted = (variant, method, metric)
+        chosen = [row for row in scored if (row["variant"], row["method"], row["metric"]) == wanted]
+        return {(row["scene"], row["seed"]): row["value"] for row in chosen}
 
-    fdk, nmar = series(metal, "fdk", "psnr3d"), series(metal, "nmar", "psnr3d")
-    worst = series(metal, "fdk", "rmse")
-    best = series(scored[scored.variant == "metal_free"], "fdk", "rmse")
+    fdk, nmar = series("metal", "fdk", "psnr3d"), series("metal", "nmar", "psnr3d")
+    worst, best = series("metal", "fdk", "rmse"), series("metal_free", "fdk", "rmse")
     rows = []
-    for row in metal.to_dict("records"):
+    for row in scored:
         key = (row["scene"], row["seed"])
         found: dict[str, float] = {}
+        if row["variant"] != "metal":
+            continue
         if row["metric"] == "psnr3d":
             found = {n: row["value"] - base[key] for n, base in (("over_fdk", fdk), ("over_nmar", nmar)) if key in base}
         elif row["metric"] == "rmse" and key in worst and key in best and worst[key] != best[key]:
@@ -120,6 +122,10 @@ def _against(frame: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=frame.columns).astype(frame.dtypes.to_dict())
 
 
+def _rows(frame: pd.DataFrame) -> list[dict[Any, Any]]:
+    return frame.to_dict("records")
+
+
 def summary(records: list[Record]) -> pd.DataFrame:
     """Return mean, std (over seeds, ddof 1) and n of every number, as table.csv holds it."""
     frame = tidy(records)
@@ -127,17 +133,16 @@ def summary(records: list[Record]) -> pd.DataFrame:
     if frame.empty:
         return pd.DataFrame(columns=[*keys, "mean", "std", "n", "status", "identical"])
     grouped = frame.groupby(keys, sort=False, dropna=False)
-    table = grouped["value"].agg(["mean", "std", "count"]).rename(columns={"count": "n"})
+    table = grouped["value"].agg(mean="mean", std="std", n="count")
     table["status"] = grouped["status"].agg(lambda s: ", ".join(dict.fromkeys(s)))
     table["identical"] = grouped["identical"].all()
     return table.reset_index()
 
 
-def _cell(rows: pd.DataFrame, column: Column) -> tuple[float | None, str]:
+def _cell(row: dict[Any, Any] | None, column: Column) -> tuple[float | None, str]:
     """Return the number to rank by and the text of one cell."""
-    if rows.empty:
+    if row is None:
         return None, "–"
-    row = rows.iloc[0]
     if row["n"] == 0:
         return (float("inf"), "identical") if row["identical"] else (None, "–")
     mean = row["mean"] * column.scale
@@ -155,12 +160,12 @@ def _grid(table: pd.DataFrame, protocol: str, records: list[Record]) -> tuple[li
     scenes = list(dict.fromkeys(r.run.scene for r in own))
     columns = [(s, m) for s in scenes for m in metrics]
     failed = {(r.run.scene, r.label): r.status for r in own if r.status != OK}
+    chosen = {(row["scene"], row["method"], row["metric"]): row for row in _rows(pd.DataFrame(part))}
     rows = []
     for inputs, method in dict.fromkeys((r.inputs, r.label) for r in own):
         cells = []
         for scene, metric in columns:
-            chosen = part[(part.scene == scene) & (part.method == method) & (part.metric == metric)]
-            number, text = _cell(chosen, COLUMNS[protocol][metric])
+            number, text = _cell(chosen.get((scene, method, metric)), COLUMNS[protocol][metric])
             if (scene, method) in failed:
                 status = failed[scene, method]
                 number, text = None, status if number is None or protocol == "cost" else f"{text} ({status})"
