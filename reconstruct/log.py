@@ -16,24 +16,24 @@ def count_floor(scan: Scan) -> float:
     Half a photon's worth (mean open field / (2 i0)), and at least half a count where counts are integers:
     below that a reading says no more than "nothing seen".
     """
-    half_photon = 0.5 * float(scan.flat.double().mean()) / scan.i0
+    half_photon = 0.5 * (float(scan.flat.double().mean()) - scan.dark) / scan.i0
     half_count = 0.0 if scan.counts.is_floating_point() else 0.5
     floor = max(half_photon, half_count)
     return floor if math.isfinite(floor) and floor > 0 else 0.5
 
 
 def line_integrals(scan: Scan, view: int | slice) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return p = −ln(max(counts − dark, floor) / flat), float32, and the mask of clamped pixels, bool.
+    """Return p = −ln(max(counts − dark, floor) / (flat − dark)), float32, and the mask of clamped pixels, bool.
 
-    Shapes are [v, u] for one view and [view, v, u] for a slice. `flat` is the open field above the
-    pedestal. Readings that are not finite, and pixels whose open field is below the floor, count as clamped.
+    Shapes are [v, u] for one view and [view, v, u] for a slice. Both images
+    contain the pedestal. Readings that are not finite, and pixels whose open field is below the floor, count as clamped.
     """
     counts = scan.counts[view].numpy()
     stack = counts[None] if counts.ndim == 2 else counts
     p = np.empty(stack.shape, np.float32)
     clamped = np.empty(stack.shape, np.bool_)
     floor = count_floor(scan)
-    log_open, dead = _log_open(scan.flat.numpy(), floor)
+    log_open, dead = _log_open(scan.flat.numpy() - np.float32(scan.dark), floor)
     if stack.dtype == np.uint16:
         # 65536 logarithms serve all pixels.
         signal = np.arange(65536) - scan.dark
@@ -45,9 +45,9 @@ def line_integrals(scan: Scan, view: int | slice) -> tuple[torch.Tensor, torch.T
     return torch.from_numpy(p), torch.from_numpy(clamped)
 
 
-def _log_open(flat: NDArray[np.float32], floor: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    usable = np.isfinite(flat) & (flat > floor)
-    log_open = np.log(np.where(usable, flat, floor).astype(np.float64)).astype(np.float32)
+def _log_open(open_field: NDArray[np.float32], floor: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    usable = np.isfinite(open_field) & (open_field > floor)
+    log_open = np.log(np.where(usable, open_field, floor).astype(np.float64)).astype(np.float32)
     return log_open, ~usable
 
 

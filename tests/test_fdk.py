@@ -159,7 +159,7 @@ def test_poor_scans_stay_finite(changes):
 
 
 def make_scan(geometry, counts, dark=0.0, i0=1e4):
-    flat = torch.full(geometry.n_detector, 1e4)
+    flat = torch.full(geometry.n_detector, 1e4 + dark)
     return Scan(geometry=geometry, counts=counts, flat=flat, dark=dark, i0=i0)
 
 
