@@ -12,8 +12,11 @@ from ctsim.geometry import Triple
 from ctsim.solids import FRUSTUM, Primitive, Solid, Vector
 from ctsim.types import Phantom
 
+REACH = 0.92
+"""Every object stays within this share of its cube: radius and half height are REACH·size/2."""
+
 Shape = tuple[int, int, int]
-Millimetres = Annotated[float, msgspec.Meta(gt=0, le=2000)]
+Millimetres = Annotated[float, msgspec.Meta(ge=1e-3, le=2000)]
 Side = Annotated[int, msgspec.Meta(ge=1, le=2048)]
 Inserts = Annotated[int, msgspec.Meta(ge=0, le=16)]
 
@@ -34,14 +37,16 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     insert_mm: Millimetres | None = None
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.size) and 0 < self.size <= 2000):
-            raise InputError(f"size must be within (0, 2000] mm, got {self.size}")
+        if not (math.isfinite(self.size) and 1e-3 <= self.size <= 2000):
+            raise InputError(f"size must be within 0.001 to 2000 mm, got {self.size}")
         if not all(1 <= n <= 2048 for n in self.n_voxel):
             raise InputError(f"n_voxel must be within 1 to 2048 along every axis, got {self.n_voxel}")
         if self.n_inserts is not None and not 0 <= self.n_inserts <= 16:
             raise InputError(f"n_inserts must be 0 to 16, got {self.n_inserts}")
-        if self.insert_mm is not None and not 0 < self.insert_mm <= 0.25 * self.size:
-            raise InputError(f"insert_mm must be positive and at most a quarter of size {self.size}: {self.insert_mm}")
+        if self.insert_mm is not None and not 1e-3 <= self.insert_mm <= 0.25 * self.size:
+            raise InputError(
+                f"insert_mm must be at least 0.001 mm and at most a quarter of size {self.size}: {self.insert_mm}"
+            )
         if self.metal != "none":
             from ctsim.materials import material
 
@@ -69,10 +74,15 @@ def half_box(n: Shape, d_voxel: Triple) -> float:
     return min(k * d for k, d in zip(n, d_voxel, strict=True)) / 2
 
 
-def assemble(
-    labels: np.ndarray, d_voxel: Triple, materials: Sequence[str], solids: Sequence[Solid]
-) -> Phantom:
-    """Make a phantom, adding the solids' materials to the table."""
+def assemble(labels: np.ndarray, d_voxel: Triple, materials: Sequence[str], solids: Sequence[Solid]) -> Phantom:
+    """Make a phantom, adding the solids' materials to the table and clearing labels beyond the reach.
+
+    The cleared rim makes the bounding cylinder that scene checks rely on hold for every seed.
+    """
+    z, y, x = (((np.arange(k) + 0.5 - k / 2) * d) for k, d in zip(labels.shape, d_voxel, strict=True))
+    limit = REACH * half_box(labels.shape, d_voxel)
+    labels[:, np.hypot(y[:, None], x) > limit] = 0
+    labels[np.abs(z) > limit] = 0
     names = list(materials)
     for solid in solids:
         if solid.material not in names:

@@ -58,11 +58,12 @@ def broccoli(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Brocco
 def _stem(canvas: Canvas, rng: np.random.Generator) -> None:
     """Thick stalk with a fibrous rind, a ring of bundles and a soft pith."""
     ridges = Noise(rng, 7)
-    low, high = ROOT[2], FORK[2] + 0.05
+    low, high = ROOT[2], FORK[2] + 0.2
 
     def inside(scale: float) -> Callable[[Field, Field, Field], Mask]:
-        return lambda x, y, z: (np.hypot(x, y) <= scale * (0.235 - 0.05 * (z + 0.5) + 0.014 * ridges(x, y, z))) & (
-            (z > low + (1 - scale) * 0.1) & (z < high)
+        return lambda x, y, z: (
+            (np.hypot(x, y) <= scale * (0.235 - 0.10 * (z + 0.5) + 0.014 * ridges(x, y, z)))
+            & ((z > low + (1 - scale) * 0.1) & (z < high))
         )
 
     box = ((-0.4, -0.4, low), (0.4, 0.4, high))
@@ -73,9 +74,7 @@ def _stem(canvas: Canvas, rng: np.random.Generator) -> None:
         canvas.tube(FIBRE, [ROOT + 0.17 * c + [0, 0, 0.02], FORK + 0.14 * c], 0.016, over=(WATER,))
 
 
-def _branches(
-    canvas: Canvas, rng: np.random.Generator, params: Broccoli
-) -> list[tuple[NDArray[np.float64], float]]:
+def _branches(canvas: Canvas, rng: np.random.Generator, params: Broccoli) -> list[tuple[NDArray[np.float64], float]]:
     """Grow the branches, painting them; returns the buds (centre, radius)."""
     buds: list[tuple[NDArray[np.float64], float]] = []
     shells: list[tuple[NDArray[np.float64], NDArray[np.float64], float]] = []

@@ -39,7 +39,7 @@ class Lung(Recipe, frozen=True, kw_only=True, tag="lung"):
 def lung(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Lung) -> Phantom:
     """Draw a thorax; metal: two rods along the spine, then balls in muscle, heart and chest wall."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel)
+    canvas = Canvas(n, d_voxel, shrink=0.95)
     wall = _wall(canvas, body)
     _lungs(canvas, body, params.vessels)
     _heart(canvas, body)
@@ -94,8 +94,12 @@ def _lungs(canvas: Canvas, rng: np.random.Generator, vessels: int) -> None:
     )
     canvas.fill(
         FAT,
-        lambda x, y, z: ((x / 0.6) ** 2 + ((y + 0.03) / 0.46) ** 2 <= 1) & (z < -0.5) & (z > -0.86)
-        & (np.abs(liver(x, y, z)) < 0.12),
+        lambda x, y, z: (
+            ((x / 0.6) ** 2 + ((y + 0.03) / 0.46) ** 2 <= 1)
+            & (z < -0.5)
+            & (z > -0.86)
+            & (np.abs(liver(x, y, z)) < 0.12)
+        ),
         over=(SOFT,),
     )
     canvas.ellipsoid(AIR, (0.3, 0.16, -0.74), (0.16, 0.12, 0.07))  # gas in the stomach
@@ -103,13 +107,14 @@ def _lungs(canvas: Canvas, rng: np.random.Generator, vessels: int) -> None:
         dome = 0.24 if side < 0 else 0.16  # the liver lifts the right dome
         canvas.fill(LUNG, lambda x, y, z, s=side, d=dome: _in_lung(x, y, z, s, d))
         hilum = np.array([0.15 * side, -0.06, 0.10])
-        points = rng.uniform((-0.3, -0.5, -0.75), (0.3, 0.45, 0.85), (vessels * 12, 3)) + [0.36 * side, 0, 0]
+        points = rng.uniform((-0.3, -0.5, -0.75), (0.3, 0.45, 0.85), (vessels * 12, 3))
+        points[:, 0] += 0.36 * side
         kept = [p for p in points if _in_lung(p[0], p[1], p[2], side, dome - 0.03)][:vessels]
         if not kept:
             continue
         for start, end, r0, r1 in supply_tree(hilum, np.array(kept), 0.07, 0.011):
             canvas.capsule(SOFT, start, end, (r0, r1), over=(LUNG,))
-        for start, end, r0, r1 in supply_tree(hilum + [0, -0.05, 0], np.array(kept[::8]) + 0.03, 0.045, 0.012):
+        for start, end, r0, r1 in supply_tree(hilum - np.array([0, 0.05, 0]), np.array(kept[::8]) + 0.03, 0.045, 0.012):
             canvas.capsule(SOFT, start, end, (r0 + 0.008, r1 + 0.006), over=(LUNG,))
             canvas.capsule(AIR, start, end, (r0, r1), over=(LUNG, SOFT))
         fissure, bend = rng.uniform(-0.1, 0.1), Noise(rng, 3)

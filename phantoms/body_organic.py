@@ -47,7 +47,7 @@ def walnut(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Walnut) 
     """Draw a shell with seam, two folded kernel halves (fat), a membrane between them, and air gaps."""
     body, metal = rng.spawn(2)
     canvas = Canvas(n, d_voxel)
-    dents, folds, warp = Noise(body, 9), Noise(body, 6), Noise(body, 4)
+    dents, folds, warp = Noise(body, 9), Noise(body, 8), Noise(body, 4)
     radii = np.array([0.74, 0.70, 0.84]) * (1 + 0.03 * body.uniform(-1, 1, 3))
 
     def level(x: Field, y: Field, z: Field) -> Field:
@@ -58,10 +58,10 @@ def walnut(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Walnut) 
 
     def kernel(x: Field, y: Field, z: Field) -> Mask:
         wave = np.sin(9.0 * z + 3.0 * folds(x, y, z)) * np.sin(8.0 * x + 2.6 * warp(x, y, z))
-        depth = 0.80 + 0.075 * wave + 0.03 * folds(x, y, z)
+        depth = 0.79 + 0.09 * wave + 0.035 * folds(x, y, z)
         lobe = level(x, y, z) + 0.10 * np.exp(-((x / 0.10) ** 2)) * (np.abs(z) > 0.12)
         gap = 0.05 + 0.035 * warp(x, y, z) ** 2
-        furrow = np.abs(folds(x, y, z) + 0.5 * wave) < 0.11
+        furrow = np.abs(folds(x, y, z) + 0.6 * wave) < 0.13
         heart = level(x, y, z) < 0.36
         return (lobe < depth) & (np.abs(y) > gap) & ~(furrow & (level(x, y, z) > 0.34)) & ~(heart & (np.abs(x) < 0.1))
 
@@ -84,7 +84,7 @@ def chicken(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Chicken
     """Draw skin, fat, muscle bundles, a long bone with marrow and knobs, a splint bone; wire: a helix."""
     body, _ = rng.spawn(2)
     canvas = Canvas(n, d_voxel)
-    air, meat, fat, bone = range(4)
+    _, meat, fat, bone = range(4)
     bumps, sheets, spongy = Noise(body, 6), Noise(body, 7), Noise(body, 50)
 
     def flesh(scale: float) -> Callable[[Field, Field, Field], Mask]:
@@ -104,15 +104,26 @@ def chicken(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Chicken
     canvas.fill(meat, lambda x, y, z: flesh(1.0)(x, y, z) & ~flesh(0.95)(x, y, z))
     shaft = np.array([(0.0, 0.0, -0.78), (0.03, 0.01, -0.3), (0.06, 0.0, 0.2), (0.09, 0.0, 0.56)])
     canvas.tube(bone, shaft, (0.10, 0.085, 0.095, 0.12))
-    for at, r in (((0.03, 0.0, 0.6), 0.15), ((0.17, 0.02, 0.6), 0.14), ((-0.05, 0, -0.76), 0.115), ((0.06, 0, -0.76), 0.11)):
+    for at, r in (
+        ((0.03, 0.0, 0.6), 0.15),
+        ((0.17, 0.02, 0.6), 0.14),
+        ((-0.05, 0, -0.76), 0.115),
+        ((0.06, 0, -0.76), 0.11),
+    ):
         canvas.ellipsoid(bone, at, r)
-    for at, r in (((0.03, 0.0, 0.6), 0.12), ((0.17, 0.02, 0.6), 0.11), ((-0.05, 0, -0.76), 0.09), ((0.06, 0, -0.76), 0.085)):
+    for at, r in (
+        ((0.03, 0.0, 0.6), 0.12),
+        ((0.17, 0.02, 0.6), 0.11),
+        ((-0.05, 0, -0.76), 0.09),
+        ((0.06, 0, -0.76), 0.085),
+    ):
         canvas.fill(
             fat,
-            lambda x, y, z, c=at, q=r: ((x - c[0]) ** 2 + (y - c[1]) ** 2 + (z - c[2]) ** 2 < q * q)
-            & (spongy(x, y, z) > -0.3),
+            lambda x, y, z, c=at, q=r: (
+                ((x - c[0]) ** 2 + (y - c[1]) ** 2 + (z - c[2]) ** 2 < q * q) & (spongy(x, y, z) > -0.3)
+            ),
         )
-    canvas.tube(fat, shaft[:-1] + [0, 0, 0.1], (0.05, 0.045, 0.055))
+    canvas.tube(fat, np.add(shaft[:-1], [0, 0, 0.1]), (0.05, 0.045, 0.055))
     canvas.tube(bone, [(0.16, 0.1, 0.45), (0.14, 0.09, 0.1), (0.08, 0.06, -0.4)], (0.032, 0.026, 0.012))
     solids: list[Solid] = []
     if count(params, 1):
@@ -149,10 +160,12 @@ def bell_pepper(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Bel
         across = (-math.sin(a), math.cos(a))
         canvas.fill(
             water,
-            lambda x, y, z, a=a, c=across: (np.abs(x * c[0] + y * c[1]) < 0.022 + 0.008 * wobble(x, y, z))
-            & (x * math.cos(a) + y * math.sin(a) > 0.0)
-            & (np.hypot(x, y) > 0.50 - 0.7 * np.clip(z, 0, 1))
-            & (level(x, y, z) < 0.9),
+            lambda x, y, z, a=a, c=across: (
+                (np.abs(x * c[0] + y * c[1]) < 0.022 + 0.008 * wobble(x, y, z))
+                & (x * math.cos(a) + y * math.sin(a) > 0.0)
+                & (np.hypot(x, y) > 0.50 - 0.7 * np.clip(z, 0, 1))
+                & (level(x, y, z) < 0.9)
+            ),
             over=(air,),
         )
     canvas.ellipsoid(water, core, (0.19, 0.19, 0.26), over=(air,))

@@ -30,16 +30,17 @@ class Random(Recipe, frozen=True, kw_only=True, tag="random"):
 def random(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Random) -> Phantom:
     """Draw a warped ellipsoid of tissue with a fat layer, organs, bones; metal of random kinds inside."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel)
+    canvas = Canvas(n, d_voxel, shrink=0.95)
     wobble, texture = Noise(body, 4), Noise(body, 12)
     a, b, c = body.uniform((0.62, 0.55, 0.65), (0.84, 0.8, 0.84))
     power = body.uniform(2.0, 4.0)
     for label, scale in ((1, 1.0), (2, 0.96), (1, 0.96 - body.uniform(0.03, 0.15))):
         canvas.fill(
             label,
-            lambda x, y, z, s=scale: np.abs(x / a) ** power + np.abs(y / b) ** power + np.abs(z / c) ** power
-            + 0.07 * wobble(x, y, z)
-            <= s**power,
+            lambda x, y, z, s=scale: (
+                np.abs(x / a) ** power + np.abs(y / b) ** power + np.abs(z / c) ** power + 0.07 * wobble(x, y, z)
+                <= s**power
+            ),
         )
     canvas.fill(2, lambda x, y, z: np.abs(texture(x, y, z)) < 0.08, over=(1,))
     for _ in range(params.organs):

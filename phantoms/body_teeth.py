@@ -71,7 +71,7 @@ class Tooth(NamedTuple):
 def teeth(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Teeth) -> Phantom:
     """Draw the jaws; metal: implants under crowns of their own, and crowns over whole teeth."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel)
+    canvas = Canvas(n, d_voxel, shrink=0.9)
     _soft(canvas, body)
     spongy = Noise(body, 56)
     rows = [_row(body, jaw) for jaw in (-1, 1)]
@@ -117,7 +117,9 @@ def _soft(canvas: Canvas, rng: np.random.Generator) -> None:
     )
     canvas.fill(
         SOFT,
-        lambda x, y, z: ((x / 0.40) ** 2 + ((y + 0.22) / 0.52) ** 2 + ((z + 0.18 - 0.1 * wobble(x, y, z)) / 0.27) ** 2 <= 1),
+        lambda x, y, z: (
+            (x / 0.40) ** 2 + ((y + 0.22) / 0.52) ** 2 + ((z + 0.18 - 0.1 * wobble(x, y, z)) / 0.27) ** 2 <= 1
+        ),
     )
     canvas.ellipsoid(AIR, (0.0, -0.3, 0.82), (0.2, 0.5, 0.05))  # floor of the nose
 

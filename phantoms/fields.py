@@ -51,18 +51,19 @@ class Noise:
 class Canvas:
     """A label volume that shapes are painted on; later paint covers earlier, unless `over` restricts it.
 
-    Coordinates are relative: x, y, z in units of half the shortest edge of the box. `over` lists the
+    Coordinates are relative: x, y, z in units of `shrink` times half the shortest edge of the box. `over` lists the
     labels that may be replaced (None: all).
     """
 
     n: tuple[int, int, int]
     d_voxel: Triple
+    shrink: float = 1.0
     unit: float = field(init=False)
     labels: NDArray[np.uint8] = field(init=False)
     axes: tuple[Field, Field, Field] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.unit = min(k * d for k, d in zip(self.n, self.d_voxel, strict=True)) / 2
+        self.unit = self.shrink * min(k * d for k, d in zip(self.n, self.d_voxel, strict=True)) / 2
         self.labels = np.zeros(self.n, np.uint8)
         z, y, x = (
             ((np.arange(k) + 0.5 - k / 2) * d / self.unit).astype(np.float32)
@@ -103,7 +104,8 @@ class Canvas:
 
         def inside(x: Field, y: Field, z: Field) -> Mask:
             p = [x - np.float32(c[0]), y - np.float32(c[1]), z - np.float32(c[2])]
-            return sum(((row[0] * p[0] + row[1] * p[1] + row[2] * p[2]) / k) ** 2 for row, k in zip(rows, r)) <= 1
+            along = (row[0] * p[0] + row[1] * p[1] + row[2] * p[2] for row in rows)
+            return sum((q / k) ** 2 for q, k in zip(along, r, strict=True)) <= 1
 
         reach = np.sqrt(((rows * r[:, None]) ** 2).sum(0))
         self.fill(label, inside, (c - reach, c + reach), over)

@@ -1,5 +1,6 @@
 """Insert layouts in relative units: metal rods, balls, pins, rivets, screws, crowns and wires as solids."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,9 +41,7 @@ class Inserts:
 
     def ellipsoid(self, name: str, centre: ArrayLike, radii: Triple, axis: ArrayLike = (0, 0, 1)) -> Solid:
         """Return an ellipsoid with semi-axes `radii` (mm), the third along `axis`."""
-        return self._solid(
-            name, [Primitive(kind=ELLIPSOID, centre=self._mm(centre), params=radii, axis=_vector(axis))]
-        )
+        return self._solid(name, [Primitive(kind=ELLIPSOID, centre=self._mm(centre), params=radii, axis=_vector(axis))])
 
     def box(self, name: str, centre: ArrayLike, half: Triple, axis: ArrayLike = (0, 0, 1)) -> Solid:
         """Return a box with half edges `half` (mm), the third along `axis`."""
@@ -70,7 +69,9 @@ class Inserts:
             [
                 Primitive(kind=ELLIPSOID, centre=_vector(p), params=(1.9 * r, 1.9 * r, 0.7 * r), axis=_vector(w)),
                 Primitive(kind=FRUSTUM, centre=_vector(p + w * length / 2), params=(length / 2, r, r), axis=_vector(w)),
-                Primitive(kind=ELLIPSOID, centre=_vector(p + w * length), params=(1.3 * r, 1.3 * r, r), axis=_vector(w)),
+                Primitive(
+                    kind=ELLIPSOID, centre=_vector(p + w * length), params=(1.3 * r, 1.3 * r, r), axis=_vector(w)
+                ),
             ],
         )
 
@@ -118,9 +119,12 @@ class Inserts:
         at, r = np.asarray(points, float) * self.unit, diameter / 2
         pieces = [
             Primitive(
-                kind=CAPSULE, centre=_vector((p + q) / 2), params=(float(np.linalg.norm(q - p)) / 2, r), axis=_vector(q - p)
+                kind=CAPSULE,
+                centre=_vector((p + q) / 2),
+                params=(float(np.linalg.norm(q - p)) / 2, r),
+                axis=_vector(q - p),
             )
-            for p, q in zip(at[:-1], at[1:], strict=True)
+            for p, q in itertools.pairwise(at)
         ]
         return self._solid(name, pieces)
 

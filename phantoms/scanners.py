@@ -16,9 +16,7 @@ from ctsim.noise import Noise
 from ctsim.scatter import Scatter
 from ctsim.spectrum import Filter, Tube
 from ctsim.types import Scanner
-
-REACH = 0.92
-"""Every object stays within this share of its cube: radius and half height are REACH·size/2."""
+from phantoms.bodies import REACH
 
 MARGIN = 1.06  # air beside the object's shadow, so that filters and flat-field checks see open pixels
 

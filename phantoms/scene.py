@@ -30,7 +30,7 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     name: str
     phantom: AnyRecipe
     scanner: ScannerSettings = ScannerSettings()
-    seed: Annotated[int, msgspec.Meta(ge=0, lt=2**63)] = 0
+    seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)] = 0
     truncated: bool = False
     truth: Truth = Truth()
     simulation: Simulation = Simulation()
@@ -161,7 +161,12 @@ def check_geometry(geometry: Geometry, size: float, truncated: bool) -> None:
     _check_source(poses[:, :3], geometry, size)
     u, v = _shadow(poses, size)
     half_v, half_u = ((n / 2) for n in geometry.n_detector)
-    if geometry.poses is None and geometry.off_detector[1] and abs(geometry.arc_deg) >= 360 - 1e-9 and geometry.angles_deg is None:
+    if (
+        geometry.poses is None
+        and geometry.off_detector[1]
+        and abs(geometry.arc_deg) >= 360 - 1e-9
+        and geometry.angles_deg is None
+    ):
         half_u += abs(geometry.off_detector[1]) / geometry.d_detector[1]  # the opposite view sees the other side
         u = u + geometry.off_detector[1] / geometry.d_detector[1]
     seen = (u.min(1) < half_u) & (u.max(1) > -half_u) & (v.min(1) < half_v) & (v.max(1) > -half_v)
@@ -188,7 +193,7 @@ def _shadow(poses: NDArray[np.float64], size: float) -> tuple[NDArray[np.float64
     """Detector coordinates (pixels from the centre) of the object's bounding cylinder: u, v [view, point]."""
     angle = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     ring = REACH * size / 2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
-    points = np.concatenate([ring + [0, 0, h] for h in (-REACH * size / 2, REACH * size / 2)])
+    points = np.concatenate([np.add(ring, [0, 0, h]) for h in (-REACH * size / 2, REACH * size / 2)])
     source, centre, du, dv = (poses[:, k : k + 3] for k in (0, 3, 6, 9))
     normal = np.cross(du, dv)
     ray = points[None] - source[:, None]
