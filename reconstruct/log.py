@@ -26,7 +26,8 @@ def line_integrals(scan: Scan, view: int | slice) -> tuple[torch.Tensor, torch.T
     """Return p = −ln(max(counts − dark, floor) / (flat − dark)), float32, and the mask of clamped pixels, bool.
 
     Shapes are [v, u] for one view and [view, v, u] for a slice. Both images
-    contain the pedestal. Readings that are not finite, and pixels whose open field is below the floor, count as clamped.
+    contain the pedestal. Readings that are not finite, and pixels whose open field is below the floor,
+    count as clamped.
     """
     counts = scan.counts[view].numpy()
     stack = counts[None] if counts.ndim == 2 else counts
