@@ -1,6 +1,6 @@
 """The ramp filter of filtered backprojection, in its band-limited spatial form, and its windows."""
 
-from typing import cast
+from typing import Any, cast
 
 import numba
 import numpy as np
@@ -64,8 +64,8 @@ def ramp_response(n: int, spacing: float, window: str = "ram-lak", cutoff: float
 
 def filter_rows(rows: NDArray[np.float32], response: NDArray[np.float32], n_fft: int) -> NDArray[np.float32]:
     """Convolve the last axis of `rows` with the filter of the given `response`; same shape and type."""
-    spectrum = scipy.fft.rfft(rows, n_fft, axis=-1, workers=numba.get_num_threads())
+    # SciPy's types for these calls are those of its backend dispatch.
+    spectrum: Any = scipy.fft.rfft(rows, n_fft, axis=-1, workers=workers)
     spectrum *= response
-    return scipy.fft.irfft(spectrum, n_fft, axis=-1, workers=numba.get_num_threads(), overwrite_x=True)[
-        ..., : rows.shape[-1]
-    ]
+    filtered: Any = scipy.fft.irfft(spectrum, n_fft, axis=-1, workers=workers, overwrite_x=True)
+    return filtered[..., : rows.shape[-1]]
