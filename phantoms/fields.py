@@ -6,6 +6,7 @@ draws that does not depend on the grid, so one seed is one object at every resol
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +15,7 @@ from ctsim.geometry import Triple
 
 Field = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-Inside = Callable[[Field, Field, Field], Mask]
+Inside = Callable[[Field, Field, Field], Any]
 
 
 class Noise:
