@@ -64,6 +64,7 @@ def ramp_response(n: int, spacing: float, window: str = "ram-lak", cutoff: float
 
 def filter_rows(rows: NDArray[np.float32], response: NDArray[np.float32], n_fft: int) -> NDArray[np.float32]:
     """Convolve the last axis of `rows` with the filter of the given `response`; same shape and type."""
+    workers = numba.get_num_threads()
     # SciPy's types for these calls are those of its backend dispatch.
     spectrum: Any = scipy.fft.rfft(rows, n_fft, axis=-1, workers=workers)
     spectrum *= response
