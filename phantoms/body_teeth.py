@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ctsim.geometry import Triple
 from ctsim.solids import Solid
@@ -96,7 +96,7 @@ def _arch_gap(x: Field, y: Field) -> Field:
     px, py = _arch(np.linspace(-1.12, 1.12, 240))
     shape = np.broadcast_shapes(x.shape, y.shape)
     at = np.stack([np.broadcast_to(x, shape).ravel(), np.broadcast_to(y, shape).ravel()], 1)
-    gap, nearest = cKDTree(np.stack([px, py], 1)).query(at)
+    gap, nearest = KDTree(np.stack([px, py], 1)).query(at)
     inner = np.hypot(at[:, 0], at[:, 1] + 0.48) < np.hypot(px[nearest], py[nearest] + 0.48)
     return np.where(inner, -gap, gap).reshape(shape).astype(np.float32)
 
@@ -222,7 +222,7 @@ def _roots(canvas: Canvas, tooth: Tooth, bend: NDArray[np.float64]) -> None:
         canvas.tube(SOFT, path[:-1], 0.20 * thick[:-1] + 0.006, over=(DENTIN,))
 
 
-SITES = (5, 12, 3, 10, 6, 4, 13, 11)  # slots of the lower jaw that can carry inserts, in order of use
+SITES: tuple[int, ...] = (5, 12, 3, 10, 6, 4, 13, 11)  # slots of the lower jaw that can carry inserts, in order of use
 
 
 def _sites(rng: np.random.Generator, params: Teeth) -> tuple[list[int], list[int]]:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctsim.geometry import Triple
 
-Field = NDArray[np.float32]
+Field = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 Inside = Callable[[Field, Field, Field], Any]
 
@@ -106,7 +106,7 @@ class Canvas:
         def inside(x: Field, y: Field, z: Field) -> Mask:
             p = [x - np.float32(c[0]), y - np.float32(c[1]), z - np.float32(c[2])]
             along = (row[0] * p[0] + row[1] * p[1] + row[2] * p[2] for row in rows)
-            return sum((q / k) ** 2 for q, k in zip(along, r, strict=True)) <= 1
+            return np.asarray(sum((q / k) ** 2 for q, k in zip(along, r, strict=True)) <= 1)
 
         reach = np.sqrt(((rows * r[:, None]) ** 2).sum(0))
         self.fill(label, inside, (c - reach, c + reach), over)
