@@ -2,9 +2,10 @@
 
 The signal behind path lengths L is m1·Σ w1_k exp(−Σ_m μ_m(E_k) L_m), and its variance per incident photon,
 over m1², Σ w2_k exp(−τ_k). Nodes come from Lanczos with full reorthogonalisation on the fine spectrum, in
-intervals split at the K-edges of the object (Golub and Welsch 1969, doi:10.1090/S0025-5718-69-99647-1).
+intervals split at the K- and L-edges of the object (Golub and Welsch 1969, doi:10.1090/S0025-5718-69-99647-1).
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,11 +15,12 @@ from numpy.typing import NDArray
 
 from ctsim.detector import Detector, response
 from ctsim.errors import InputError
-from ctsim.materials import Material, attenuation, k_edges
+from ctsim.materials import Material, absorption_edges, attenuation
 from ctsim.spectrum import Spectrum
 
 P_MAX = 14.6  # −log of the faintest signal that a rule answers for
-_N_MAX = 40
+_N_MAX = 60
+_SPLIT = 0.1  # in tolerances
 _STEPS = (0.0, 0.03, 0.15, 0.5, 1.0)  # shares of each material's greatest length in the combinations tried
 
 
@@ -65,7 +67,8 @@ def energy_rule(
     """Return the smallest Gauss rule whose |ΔP| stays within `tolerance`.
 
     `max_lengths` (mm) are the longest path per material; every combination of five shares of them is tried
-    up to P = 14.6. Raises InputError where 40 energies an interval do not reach the tolerance.
+    up to P = 14.6, and the error reached is in the rule. Where 60 energies do not
+    suffice the fine spectrum itself is the rule.
     """
     if len(materials) != len(max_lengths):
         raise InputError(f"max_lengths must have one entry per material ({len(materials)}), got {len(max_lengths)}")
@@ -82,21 +85,32 @@ def energy_rule(
     p_fine = _log_signal(fine.w1, lengths, mu_fine)
     reached = p_fine <= P_MAX
     lengths, p_fine = lengths[reached], p_fine[reached]
-    intervals = _intervals(fine, k_edges([m for m, _ in used], fine.energies[0], fine.energies[-1]))
-    error = math.inf
-    for n in range(1, _N_MAX + 1):
-        rule = _gauss(fine, intervals, n)
+    edges = absorption_edges([m for m, _ in used], fine.energies[0], fine.energies[-1])
+    below = [float(fine.w1[fine.energies < edge].sum()) for edge in edges]
+    # An edge that leaves next to no signal on one side is not worth a node of its own.
+    edges = tuple(e for e, share in zip(edges, below, strict=True) if min(share, 1 - share) > _SPLIT * tolerance)
+    intervals = _intervals(fine, edges)
+
+    def measured(counts: tuple[int, ...]) -> tuple[float, EnergyRule]:
+        rule = _gauss(fine, intervals, counts)
         mu = np.array([attenuation(m, rule.energies) for m, _ in used]).reshape(len(used), rule.energies.size)
-        error = float(np.max(np.abs(_log_signal(rule.w1, lengths, mu) - p_fine)))
-        if error <= tolerance:
-            return EnergyRule(energies=rule.energies, w1=rule.w1, w2=rule.w2, mean_signal=rule.mean_signal, error=error)
-    raise InputError(f"{_N_MAX} energies leave |ΔP| = {error:.1e}, more than the tolerance {tolerance:.1e}")
+        return float(np.max(np.abs(_log_signal(rule.w1, lengths, mu) - p_fine))), rule
+
+    error, rule = measured(counts := (1,) * len(intervals))
+    while error > tolerance:
+        if sum(counts) >= _N_MAX:
+            return fine
+        # One node more, in the interval where it helps most.
+        more = [(*counts[:i], counts[i] + 1, *counts[i + 1 :]) for i in range(len(counts))]
+        (error, rule), counts = min(((measured(c), c) for c in more), key=lambda found: found[0][0])
+    return EnergyRule(energies=rule.energies, w1=rule.w1, w2=rule.w2, mean_signal=rule.mean_signal, error=error)
 
 
 def gauss_rule(spectrum: Spectrum, detector: Detector, n: int, edges: Sequence[float] = ()) -> EnergyRule:
     """Return the Gauss rule with `n` energies in every interval between `edges` (keV); its error is not measured."""
     fine = full_rule(spectrum, detector)
-    return _gauss(fine, _intervals(fine, edges), n)
+    intervals = _intervals(fine, edges)
+    return _gauss(fine, intervals, (n,) * len(intervals))
 
 
 def effective_weights(
@@ -133,12 +147,12 @@ def _log_signal(w1: NDArray[np.float64], lengths: NDArray[np.float64], mu: NDArr
 
 def _intervals(fine: EnergyRule, edges: Sequence[float]) -> list[slice]:
     cuts = np.unique(np.concatenate([[0], np.searchsorted(fine.energies, edges), [fine.energies.size]])).astype(int)
-    return [slice(a, b) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
+    return [slice(a, b) for a, b in itertools.pairwise(cuts)]
 
 
-def _gauss(fine: EnergyRule, intervals: list[slice], n: int) -> EnergyRule:
+def _gauss(fine: EnergyRule, intervals: list[slice], counts: tuple[int, ...]) -> EnergyRule:
     energies, w1, w2 = [], [], []
-    for part in intervals:
+    for part, n in zip(intervals, counts, strict=True):
         e, w = fine.energies[part], fine.w1[part]
         nodes, weights = _lanczos(e, w, min(n, e.size))
         # a2/a1 at the nodes, least squares with the weight w1 and orthogonal polynomials, keeps the moments of m2.
