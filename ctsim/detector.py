@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import expn
 
 from ctsim.errors import InputError
-from ctsim.materials import attenuation, compton, k_shell, k_vacancies, photoelectric
+from ctsim.materials import E_MIN, attenuation, compton, k_shell, k_vacancies, photoelectric
 
 _SLAB = {"gos": "GOS", "csi": "CsI", "ideal": "GOS", "counting": "CdTe@5.85"}
 _DEPTHS = 24  # Gauss–Legendre nodes over the depth of the first interaction, in its own probability
@@ -89,18 +89,22 @@ def outcomes(
         if shell is None or not vacancies.any():
             continue
         for line, part in shell.lines:
-            mu_line = float((attenuation(which, [line]))[0]) if line > 1 else math.inf
-            if math.isinf(mu_line):
-                continue
-            escape = _escape(np.full(e.size, mu_line), depth, weight, thickness)
+            if line < E_MIN:
+                continue  # such soft lines stay where they are made
+            escape = _escape(np.full(e.size, _stopping(which, np.array([line]))[0]), depth, weight, thickness)
             probability = interacting * vacancies / mu * shell.fluorescence_yield * part * escape
             pairs.append((np.maximum(e - line, 0.0), probability))
             full -= probability
-    away = np.maximum(e * (1 - share), 1.0)
-    probability = interacting * scattered / mu * _escape(attenuation(which, away), depth, weight, thickness)
+    away = np.maximum(e * (1 - share), E_MIN)
+    probability = interacting * scattered / mu * _escape(_stopping(which, away), depth, weight, thickness)
     pairs.append((e * share, probability))
     pairs.append((e, full - probability))
     return pairs
+
+
+def _stopping(which: str, energies: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Attenuation (1/mm) [n] without coherent scatter."""
+    return photoelectric(which, energies) + compton(which, energies)[0]
 
 
 def _depths(mu: NDArray[np.float64], thickness: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

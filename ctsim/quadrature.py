@@ -2,7 +2,7 @@
 
 The signal behind path lengths L is m1·Σ w1_k exp(−Σ_m μ_m(E_k) L_m), and its variance per incident photon,
 over m1², Σ w2_k exp(−τ_k). Nodes come from Lanczos with full reorthogonalisation on the fine spectrum, in
-intervals split at the K- and L-edges of the object (Golub and Welsch 1969, doi:10.1090/S0025-5718-69-99647-1).
+intervals split at the K-edges of the object (Golub and Welsch 1969, doi:10.1090/S0025-5718-69-99647-1).
 """
 
 import itertools
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ctsim.detector import Detector, response
 from ctsim.errors import InputError
-from ctsim.materials import Material, absorption_edges, attenuation
+from ctsim.materials import Material, attenuation, k_edges
 from ctsim.spectrum import Spectrum
 
 P_MAX = 14.6  # −log of the faintest signal that a rule answers for
@@ -85,7 +85,7 @@ def energy_rule(
     p_fine = _log_signal(fine.w1, lengths, mu_fine)
     reached = p_fine <= P_MAX
     lengths, p_fine = lengths[reached], p_fine[reached]
-    edges = absorption_edges([m for m, _ in used], fine.energies[0], fine.energies[-1])
+    edges = k_edges([m for m, _ in used], fine.energies[0], fine.energies[-1])
     below = [float(fine.w1[fine.energies < edge].sum()) for edge in edges]
     # An edge that leaves next to no signal on one side is not worth a node of its own.
     edges = tuple(e for e, share in zip(edges, below, strict=True) if min(share, 1 - share) > _SPLIT * tolerance)
