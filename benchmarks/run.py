@@ -216,14 +216,14 @@ def warm_up(method: Method, scan: "Scan", device: str) -> float:
 
 
 def tiny(scan: "Scan") -> "Scan":
-    """Return a scan of the first 8 views of `scan` and 8³ voxels over the same extent.
+    """Return a scan of the first 8 views of `scan` and 8 whole slices of its volume.
 
-    The counts are a view into the scan's own, mapped as they are, so that kernels are compiled for
-    the very types (dtype, layout, alignment) of the run that is timed.
+    The counts are a view into the scan's own and the slices keep their size, so that kernels are
+    compiled for the very types (dtype, layout, alignment; one tile or several) of the timed run.
     """
     g = scan.geometry
     n = min(8, g.n_views)
-    changes: dict[str, Any] = {"n_views": n, "n_voxel": (8, 8, 8), "d_voxel": tuple(s / 8 for s in g.s_voxel)}
+    changes: dict[str, Any] = {"n_views": n, "n_voxel": (min(8, g.n_voxel[0]), *g.n_voxel[1:])}
     for name in ("angles_deg", "poses"):
         if getattr(g, name) is not None:
             changes[name] = getattr(g, name)[:n]
