@@ -251,7 +251,9 @@ def _stages(
     why = "no solids" if not phantom.solids else ""
     stages.append(Stage(name="sub-rays", runs=not why, reason=why or "edges only"))
     level = scanner.scatter.level
-    stages.append(Stage(name=f"scatter {level}" if level else "scatter", runs=bool(level), reason="" if level else "off"))
+    stages.append(
+        Stage(name=f"scatter {level}" if level else "scatter", runs=bool(level), reason="" if level else "off")
+    )
     stages.append(Stage(name="heel", runs=scanner.tube.heel, reason="" if scanner.tube.heel else "off"))
     bowtie = scanner.tube.bowtie is not None
     stages.append(Stage(name="bow-tie", runs=bowtie, reason="" if bowtie else "off"))

@@ -1,6 +1,6 @@
 """How a scan is simulated and which ground truth is written beside it."""
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 import msgspec
 

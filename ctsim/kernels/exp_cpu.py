@@ -17,10 +17,10 @@ LARGEST = np.float32(80.0)  # exp(−80) = 1.8e-35 is still a normal float32
 
 
 @intrinsic
-def _as_float(typingctx, bits):  # noqa: ANN001, ANN202 (numba's intrinsic protocol)
+def _as_float(typingctx, bits):
     """Reinterpret an int32 as a float32."""
 
-    def codegen(context, builder, signature, args):  # noqa: ANN001, ANN202
+    def codegen(context, builder, signature, args):
         return builder.bitcast(args[0], ir.FloatType())
 
     return types.float32(types.int32), codegen

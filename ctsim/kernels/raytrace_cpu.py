@@ -20,6 +20,7 @@ CELLS = SIDE**3
 SHIFT = SIDE.bit_length() - 1
 TINY = 1e-12  # a direction cosine below this counts as parallel to the axis
 GOLDEN = 0.6180339887498949
+MOST_TIMES = 16  # a primitive thinner than a pixel gets at most this many times the usual sub-rays
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
@@ -101,9 +102,9 @@ def _walk(code, slot, pool, density, grid, ray, t_from, t_to, lengths):
                     break
             if t >= end:
                 return
-            bx += (x >> SHIFT)
-            by += (y >> SHIFT)
-            bz += (z >> SHIFT)
+            bx += x >> SHIFT
+            by += y >> SHIFT
+            bz += z >> SHIFT
         if bx < 0 or by < 0 or bz < 0 or bx >= mx or by >= my or bz >= mz:
             return
 
@@ -217,102 +218,114 @@ def _corners(prims, rects, active, pose, v, shift, edge_mu, out):
 
 @njit(cache=True, error_model="numpy")
 def _grazes(fat, rects, active, u, ray, pair):
-    """Tell whether the ray meets a primitive so thin that it can hide between a pixel's corners."""
+    """Return how many times the usual sub-rays a primitive needs that can hide between a pixel's corners."""
+    times = 0
     for p in active:
         near = fat[p, 0] >= 0 and rects[p, 2] <= u <= rects[p, 3]
         if near and intersect(fat[p], ray[0], ray[1], ray[2], ray[3], ray[4], ray[5], pair) > 0:
-            return True
-    return False
+            times = max(times, int(fat[p, 1]))
+    return times
+
+
+@njit(cache=True, error_model="numpy")
+def _add_row(grid_arrays, prims, rects, active, u, ray, scratch, layer, lengths, column):
+    """Write one ray's path lengths into column `column` of `lengths` [material, ray]; return its intervals."""
+    code, slot, pool, density, grid = grid_arrays
+    pair, hits, row = scratch
+    n = _collect(prims, rects, active, u, ray, pair, hits)
+    row[:] = 0.0
+    _add_lengths(code, slot, pool, density, grid, ray, hits, n, row)
+    row[-1] += layer
+    for m in range(1, row.size):
+        lengths[m, column] = row[m]
+    return n
+
+
+@njit(cache=True, error_model="numpy")
+def _measure_row(bricks, solids, pose, v, span, extra, rule, edge, m1, m2):
+    """Measure columns span[0]…span[1] of row v: central rays first, then the pixels on an edge again."""
+    code, slot, pool, density, grid, _ = bricks
+    arrays = (code, slot, pool, density, grid)
+    prims, fat, rects = solids
+    mu, w1, w2 = rule
+    edge_mu, threshold, most = edge
+    n_v, n_u = m1.shape
+    shift = ((n_v - 1) / 2, (n_u - 1) / 2)
+    first, last = span[0], span[1]
+    size = max(last - first, most * MOST_TIMES)
+    lengths = np.zeros((mu.shape[0], size), np.float32)
+    tau, s1, s2 = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
+    active = _active(rects, v)
+    ray, pair, hits = np.empty(7), np.empty(4), np.empty((2 * active.size + 1, 3))
+    scratch = (pair, hits, np.zeros(mu.shape[0]))
+    centre, corners = np.zeros(n_u), np.zeros((2, n_u + 1))
+    for u in range(first, last):
+        _aim(pose, u - shift[1], v - shift[0], ray)
+        layer = extra[v, u] if extra.size else 0.0
+        n = _add_row(arrays, prims, rects, active, u, ray, scratch, layer, lengths, u - first)
+        centre[u] = _thickness(hits, n, edge_mu)
+    _signal(lengths, last - first, mu, w1, w2, tau, s1, s2)
+    for u in range(first, last):
+        m1[v, u], m2[v, u] = s1[u - first], s2[u - first]
+    if active.size == 0 or most < 2:
+        return
+    _corners(prims, rects, active, pose, v, shift, edge_mu, corners)
+    for u in range(first, last):
+        a, b, c, d = corners[0, u], corners[0, u + 1], corners[1, u], corners[1, u + 1]
+        change = max(max(max(a, b), max(c, d)), centre[u]) - min(min(min(a, b), min(c, d)), centre[u])
+        _aim(pose, u - shift[1], v - shift[0], ray)
+        times = _grazes(fat, rects, active, u, ray, pair)
+        if times == 0 and change <= threshold:
+            continue
+        count = most * times if times else int(min(float(most), 4.0 + 4.0 * change))
+        layer = extra[v, u] if extra.size else 0.0
+        for i in range(count):
+            # a golden-section lattice has `count` distinct positions along u and along v
+            du, dv = (i + 0.5) / count - 0.5, (i * GOLDEN + 0.5) % 1.0 - 0.5
+            _aim(pose, u + du - shift[1], v + dv - shift[0], ray)
+            _add_row(arrays, prims, rects, active, u + du, ray, scratch, layer, lengths, i)
+        _signal(lengths, count, mu, w1, w2, tau, s1, s2)
+        mean1, mean2 = 0.0, 0.0
+        for i in range(count):
+            mean1 += s1[i]
+            mean2 += s2[i]
+        m1[v, u], m2[v, u] = mean1 / count, mean2 / count
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def transmit_view(bricks, solids, pose, order, spans, extra, rule, edge, m1, m2):
     """Measure one view: mean signal `m1` and second moment `m2` [v, u] relative to the open field.
 
-    `solids` is (prims, fat, rects): primitive rows, their inflated twins (kind −1 where not thin) and
-    their shadows (v from, to, u from, to). `pose` [12]; `order` [row] is the order of work; only
-    columns spans[row] = (from, to) are touched. `extra` [v, u] is a length (mm) in the last material
-    that every ray crosses, or empty. `rule` is (mu [material, node] 1/mm, w1 [node], w2 [node]);
-    `edge` is (edge_mu [material], threshold in optical thickness, most sub-rays a pixel).
+    `solids` is (prims, fat, rects): primitive rows; their inflated twins, with kind −1 where not thin and
+    how many times the usual sub-rays in the material's place; and their shadows (v from, to, u from, to).
+    `pose` [12]; `order` [row] is the order of work; only columns spans[row] = (from, to) are touched.
+    `extra` [v, u] is a length (mm) in the last material that every ray crosses, or empty. `rule` is
+    (mu [material, node] 1/mm, w1 [node], w2 [node]); `edge` is (edge_mu [material], threshold in optical
+    thickness, most sub-rays a pixel).
     """
-    code, slot, pool, density, grid, _ = bricks
-    prims, fat, rects = solids
-    mu, w1, w2 = rule
-    edge_mu, threshold, most = edge
-    n_v, n_u = m1.shape
-    shift = np.array([(n_v - 1) / 2, (n_u - 1) / 2])
     for index in prange(order.size):
         v = order[index]
-        first, last = spans[v, 0], spans[v, 1]
-        if last <= first:
-            continue
-        size = max(last - first, most)
-        lengths = np.zeros((mu.shape[0], size), np.float32)
-        tau, s1, s2 = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-        row = np.zeros(mu.shape[0])
-        active = _active(rects, v)
-        ray, pair, hits = np.empty(7), np.empty(4), np.empty((2 * active.size, 3))
-        centre, corners = np.zeros(n_u), np.zeros((2, n_u + 1))
-        for u in range(first, last):
-            _aim(pose, u - shift[1], v - shift[0], ray)
-            n = _collect(prims, rects, active, u, ray, pair, hits)
-            row[:] = 0.0
-            _add_lengths(code, slot, pool, density, grid, ray, hits, n, row)
-            if extra.size:
-                row[-1] += extra[v, u]
-            for m in range(1, mu.shape[0]):
-                lengths[m, u - first] = row[m]
-            centre[u] = _thickness(hits, n, edge_mu)
-        _signal(lengths, last - first, mu, w1, w2, tau, s1, s2)
-        for u in range(first, last):
-            m1[v, u], m2[v, u] = s1[u - first], s2[u - first]
-        if active.size == 0 or most < 2:
-            continue
-        _corners(prims, rects, active, pose, v, shift, edge_mu, corners)
-        for u in range(first, last):
-            a, b, c, d = corners[0, u], corners[0, u + 1], corners[1, u], corners[1, u + 1]
-            change = max(max(max(a, b), max(c, d)), centre[u]) - min(min(min(a, b), min(c, d)), centre[u])
-            _aim(pose, u - shift[1], v - shift[0], ray)
-            if _grazes(fat, rects, active, u, ray, pair):
-                count = most
-            elif change > threshold:
-                count = min(most, 4 + int(4 * change))
-            else:
-                continue
-            for i in range(count):
-                # a golden-section lattice has `count` distinct positions along u and along v
-                du, dv = (i + 0.5) / count - 0.5, (i * GOLDEN + 0.5) % 1.0 - 0.5
-                _aim(pose, u + du - shift[1], v + dv - shift[0], ray)
-                n = _collect(prims, rects, active, u + du, ray, pair, hits)
-                row[:] = 0.0
-                _add_lengths(code, slot, pool, density, grid, ray, hits, n, row)
-                if extra.size:
-                    row[-1] += extra[v, u]
-                for m in range(1, mu.shape[0]):
-                    lengths[m, i] = row[m]
-            _signal(lengths, count, mu, w1, w2, tau, s1, s2)
-            mean1, mean2 = 0.0, 0.0
-            for i in range(count):
-                mean1 += s1[i]
-                mean2 += s2[i]
-            m1[v, u], m2[v, u] = mean1 / count, mean2 / count
+        if spans[v, 1] > spans[v, 0]:
+            _measure_row(bricks, solids, pose, v, spans[v], extra, rule, edge, m1, m2)
+
+
+@njit(cache=True, error_model="numpy")
+def _trace_row(bricks, solids, pose, v, span, lengths):
+    code, slot, pool, density, grid, _ = bricks
+    prims, _, rects = solids
+    n_materials, n_v, n_u = lengths.shape
+    active = _active(rects, v)
+    ray, scratch = np.empty(7), (np.empty(4), np.empty((2 * active.size + 1, 3)), np.zeros(n_materials))
+    arrays = (code, slot, pool, density, grid)
+    for u in range(span[0], span[1]):
+        _aim(pose, u - (n_u - 1) / 2, v - (n_v - 1) / 2, ray)
+        _add_row(arrays, prims, rects, active, u, ray, scratch, 0.0, lengths[:, v], u)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def trace_view(bricks, solids, pose, order, spans, lengths):
     """Fill `lengths` [material, v, u] (mm) along the rays to the pixel centres of one view."""
-    code, slot, pool, density, grid, _ = bricks
-    prims, _, rects = solids
-    _, n_v, n_u = lengths.shape
     for index in prange(order.size):
         v = order[index]
-        active = _active(rects, v)
-        ray, pair, hits = np.empty(7), np.empty(4), np.empty((2 * active.size, 3))
-        row = np.zeros(lengths.shape[0])
-        for u in range(spans[v, 0], spans[v, 1]):
-            _aim(pose, u - (n_u - 1) / 2, v - (n_v - 1) / 2, ray)
-            n = _collect(prims, rects, active, u, ray, pair, hits)
-            row[:] = 0.0
-            _add_lengths(code, slot, pool, density, grid, ray, hits, n, row)
-            for m in range(1, lengths.shape[0]):
-                lengths[m, v, u] = row[m]
+        if spans[v, 1] > spans[v, 0]:
+            _trace_row(bricks, solids, pose, v, spans[v], lengths)

@@ -1,0 +1,129 @@
+"""The ray tracer in float64 for reading: every plane crossing is listed, sorted and looked up.
+
+Same functions and arguments as `raytrace_cpu`. Nothing is skipped, and the position of every piece of a
+ray is found from its midpoint.
+"""
+
+import math
+
+import numpy as np
+
+from ctsim.bricks import SIDE
+from ctsim.kernels.solids_reference import inside, intersect
+
+GOLDEN = 0.6180339887498949
+
+
+def _label_volume(bricks):
+    """Undo the bricks: labels and density, [z, y, x]."""
+    _, mz, my, mx = bricks.code.shape
+    labels = np.zeros((mz, my, mx, SIDE, SIDE, SIDE), np.uint8)
+    density = np.ones(labels.shape)
+    for z, y, x in np.ndindex(mz, my, mx):
+        slot = bricks.slot[z, y, x]
+        cells = slice(slot * SIDE**3, (slot + 1) * SIDE**3)
+        if slot < 0:
+            labels[z, y, x] = bricks.code[0, z, y, x] & 255
+            continue
+        labels[z, y, x] = bricks.pool[cells].reshape(SIDE, SIDE, SIDE)
+        if bricks.density.size:
+            density[z, y, x] = bricks.density[cells].reshape(SIDE, SIDE, SIDE)
+    full = (mz * SIDE, my * SIDE, mx * SIDE)
+    nx, ny, nz = bricks.grid[:3].astype(int)
+    labels = labels.transpose(0, 3, 1, 4, 2, 5).reshape(full)[:nz, :ny, :nx]
+    return labels, density.transpose(0, 3, 1, 4, 2, 5).reshape(full)[:nz, :ny, :nx]
+
+
+def _ray(pose, u, v):
+    source, centre, e_u, e_v = pose.reshape(4, 3)
+    towards = centre + u * e_u + v * e_v - source
+    distance = np.linalg.norm(towards)
+    return source, towards / distance, distance
+
+
+def _lengths(volume, grid, prims, ray, n_materials):
+    """Path length in every material along one ray."""
+    labels, density = volume
+    source, direction, distance = ray
+    n, per_mm, low = grid[:3], grid[3:6], grid[6:]
+    cuts = [0.0, distance]
+    for axis in range(3):
+        if abs(direction[axis]) > 1e-12:
+            planes = low[axis] + np.arange(int(n[axis]) + 1) / per_mm[axis]
+            cuts += list((planes - source[axis]) / direction[axis])
+    for prim in prims:
+        pairs = np.empty(4)
+        found = intersect(prim, *source, *direction, pairs)
+        cuts += list(pairs[: 2 * found])
+    cuts = np.unique(np.clip(cuts, 0.0, distance))
+    lengths = np.zeros(n_materials)
+    for t0, t1 in zip(cuts[:-1], cuts[1:], strict=True):
+        point = source + direction * (t0 + t1) / 2
+        covering = [prim for prim in prims if inside(prim, *point)]
+        if covering:
+            lengths[int(covering[-1][1])] += t1 - t0
+            continue
+        x, y, z = np.floor((point - low) * per_mm).astype(int)
+        if 0 <= x < n[0] and 0 <= y < n[1] and 0 <= z < n[2]:
+            lengths[labels[z, y, x]] += (t1 - t0) * density[z, y, x]
+    lengths[0] = 0.0
+    return lengths
+
+
+def _thickness(prims, ray, edge_mu):
+    source, direction, distance = ray
+    total = 0.0
+    for prim in prims:
+        pairs = np.empty(4)
+        found = intersect(prim, *source, *direction, pairs)
+        for t0, t1 in pairs[: 2 * found].reshape(-1, 2):
+            total += max(min(t1, distance) - max(t0, 0.0), 0.0) * edge_mu[int(prim[1])]
+    return total
+
+
+def _n_subrays(solids, pose, u, v, edge):
+    """How many rays measure the pixel at detector position (u, v)."""
+    prims, fat, _ = solids
+    edge_mu, threshold, most = edge
+    if most < 2 or len(prims) == 0:
+        return 1
+    centre = _ray(pose, u, v)
+    hidden = [prim[1] for prim in fat if prim[0] >= 0 and intersect(prim, *centre[0], *centre[1], np.empty(4)) > 0]
+    if hidden:
+        return most * int(max(hidden))
+    corners = [_ray(pose, u + du, v + dv) for du in (-0.5, 0.5) for dv in (-0.5, 0.5)]
+    tau = [_thickness(prims, ray, edge_mu) for ray in (centre, *corners)]
+    change = max(tau) - min(tau)
+    return min(most, 4 + int(4 * change)) if change > threshold else 1
+
+
+def transmit_view(bricks, solids, pose, order, spans, extra, rule, edge, m1, m2):
+    """Measure one view: mean signal `m1` and second moment `m2` [v, u] relative to the open field."""
+    volume = _label_volume(bricks)
+    mu, w1, w2 = (np.asarray(a, np.float64) for a in rule)
+    n_v, n_u = m1.shape
+    for row in order:
+        for column in range(*spans[row]):
+            u, v = column - (n_u - 1) / 2, row - (n_v - 1) / 2
+            n = _n_subrays(solids, pose, u, v, edge)
+            total1 = total2 = 0.0
+            for i in range(n):
+                du = (i + 0.5) / n - 0.5 if n > 1 else 0.0
+                dv = math.fmod(i * GOLDEN + 0.5, 1.0) - 0.5
+                lengths = _lengths(volume, bricks.grid, solids[0], _ray(pose, u + du, v + dv), len(mu))
+                if extra.size:
+                    lengths[-1] += extra[row, column]
+                passed = np.exp(-np.minimum(lengths @ mu, 80.0))
+                total1 += w1 @ passed
+                total2 += w2 @ passed
+            m1[row, column], m2[row, column] = total1 / n, total2 / n
+
+
+def trace_view(bricks, solids, pose, order, spans, lengths):
+    """Fill `lengths` [material, v, u] (mm) along the rays to the pixel centres of one view."""
+    volume = _label_volume(bricks)
+    n_materials, n_v, n_u = lengths.shape
+    for row in order:
+        for column in range(*spans[row]):
+            ray = _ray(pose, column - (n_u - 1) / 2, row - (n_v - 1) / 2)
+            lengths[:, row, column] = _lengths(volume, bricks.grid, solids[0], ray, n_materials)

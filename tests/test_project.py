@@ -1,0 +1,215 @@
+"""The ray tracer against its float64 twin, closed forms, and itself with every skip turned off."""
+
+import math
+
+import numba
+import numpy as np
+import pytest
+
+from ctsim import project
+from ctsim.detector import Detector
+from ctsim.geometry import Geometry
+from ctsim.kernels import raytrace_cpu, raytrace_reference
+from ctsim.kernels.exp_cpu import exp_minus
+from ctsim.project import Response, Tracer, path_lengths, transmit, work_order
+from ctsim.quadrature import energy_rule
+from ctsim.solids import BOX, CAPSULE, ELLIPSOID, FRUSTUM, TORUS, Primitive, Solid
+from ctsim.spectrum import Tube, spectrum
+from ctsim.types import Phantom
+
+MATERIALS = ("air", "water", "cortical_bone", "Fe", "Ti")
+
+
+def solid(kind, params, centre=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), material="Fe", metal=True):
+    piece = Primitive(kind=kind, centre=centre, params=params, axis=axis)
+    return Solid(name="solid", material=material, primitives=(piece,), metal=metal)
+
+
+def geometry(n_detector=(9, 13), n_views=5, pixel=5.0, **kw):
+    return Geometry(
+        dso=200.0, dsd=400.0, n_voxel=(8, 8, 8), d_voxel=(1.0,) * 3, n_detector=n_detector,
+        d_detector=(pixel, pixel), n_views=n_views, **kw,
+    )  # fmt: skip
+
+
+def blobs(shape=(5, 7, 11), seed=0, **kw):
+    """A body of unequal axis lengths in which uniform and mixed bricks alternate."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.integers(0, 3, [-(-s // 3) for s in shape])
+    labels = np.kron(coarse, np.ones((3, 3, 3))).astype(np.uint8)[: shape[0], : shape[1], : shape[2]]
+    return Phantom(labels=labels, materials=MATERIALS, d_voxel=(3.1, 2.3, 1.7), off_origin=(0.4, -1.1, 0.7), **kw)
+
+
+INSERTS = (
+    solid(ELLIPSOID, (4.0, 2.0, 3.0), (1.0, 2.0, 0.5), (1.0, 1.0, 0.3)),
+    solid(FRUSTUM, (5.0, 2.0, 1.0), (-3.0, -1.0, 0.0), (0.2, 0.1, 1.0), "Ti"),
+    solid(CAPSULE, (4.0, 1.0), (3.0, -4.0, 1.0), (1.0, 0.0, 0.2)),
+    solid(BOX, (1.0, 2.0, 3.0), (2.1, 2.2, -1.0), (0.3, 0.0, 1.0), "air"),
+    solid(TORUS, (4.0, 0.7), (-2.0, 3.0, 0.0), (0.1, 1.0, 0.4)),
+)
+
+
+def reference_lengths(tracer, geometry, view):
+    lengths = np.zeros((len(tracer.materials), *geometry.n_detector))
+    shape, pose = geometry.n_detector, geometry.pose_array()[view]
+    everywhere = np.tile(np.array([0, shape[1]]), (shape[0], 1))
+    solids = project._solids(tracer, pose, shape)
+    raytrace_reference.trace_view(tracer.bricks, solids, pose, work_order(shape[0]), everywhere, lengths)
+    return lengths
+
+
+@pytest.mark.parametrize("solids", [(), INSERTS], ids=["body", "body and solids"])
+@pytest.mark.parametrize("dense", [False, True])
+def test_path_lengths_equal_the_reference(solids, dense):
+    density = np.random.default_rng(1).uniform(0.5, 1.5, (5, 7, 11)).astype(np.float32) if dense else None
+    tracer = Tracer.of(blobs(solids=solids, density=density))
+    g = geometry(off_detector=(1.3, -2.0), start_deg=11.0)
+    for view in range(g.n_views):
+        # float32 output of lengths up to 30 mm: half an ulp is 1e-6 mm, the density map is float32 too
+        got, want = path_lengths(tracer, g, view), reference_lengths(tracer, g, view)
+        np.testing.assert_allclose(got, want, atol=4e-6)
+        assert want[1].max() > 1
+
+
+def test_a_large_uniform_region_is_crossed_exactly():
+    labels = np.zeros((40, 44, 52), np.uint8)
+    labels[3:37, 5:41, 2:50] = 1
+    labels[10:20, 12:30, 20:33] = 2
+    tracer = Tracer.of(Phantom(labels=labels, materials=MATERIALS, d_voxel=(1.0, 1.1, 0.9)))
+    g = geometry(n_detector=(11, 17), pixel=7.0, start_deg=3.0)
+    for view in range(g.n_views):
+        np.testing.assert_allclose(path_lengths(tracer, g, view), reference_lengths(tracer, g, view), atol=8e-6)
+
+
+def test_rays_along_planes_edges_and_corners_keep_their_length():
+    labels = np.ones((8, 8, 8), np.uint8)
+    tracer = Tracer.of(Phantom(labels=labels, materials=MATERIALS, d_voxel=(2.0,) * 3))
+    g = geometry(n_detector=(1, 1), n_views=8)
+    for view in range(8):
+        # the central ray runs in the plane z = 0 between voxels, along y = 0, x = 0 or the diagonals
+        want = 16.0 * (1 if view % 2 == 0 else math.sqrt(2))
+        assert path_lengths(tracer, g, view)[1, 0, 0] == pytest.approx(want, rel=1e-6)
+
+
+def test_rods_in_a_cylinder_equal_the_closed_form():
+    rods = [(12.0, 0.3), (10.0, 2.4), (13.0, 4.6)]
+    water = solid(FRUSTUM, (30.0, 27.0, 27.0), material="water", metal=False)
+    metal = [solid(FRUSTUM, (25.0, 3.0, 3.0), (r * math.cos(a), r * math.sin(a), 0.0)) for r, a in rods]
+    phantom = Phantom(
+        labels=np.zeros((4, 4, 4), np.uint8), materials=MATERIALS, d_voxel=(15.0,) * 3, solids=(water, *metal)
+    )
+    g = geometry(n_detector=(1, 301), n_views=7, pixel=0.5)
+    for view, angle in enumerate(g.angles):
+        u = (np.arange(301) - 150) * 0.5
+        source = 200 * np.array([math.cos(angle), math.sin(angle)])
+        pixel = (
+            -200 * np.array([math.cos(angle), math.sin(angle)])[:, None]
+            + np.array([-math.sin(angle), math.cos(angle)])[:, None] * u
+        )
+        d = pixel - source[:, None]
+        d /= np.linalg.norm(d, axis=0)
+
+        def chord(x, y, r, d=d, source=source):
+            offset = np.array([x, y]) - source
+            miss = offset[0] * d[1] - offset[1] * d[0]
+            return 2 * np.sqrt(np.maximum(r * r - miss**2, 0))
+
+        fe = sum(chord(r * math.cos(a), r * math.sin(a), 3.0) for r, a in rods)
+        got = path_lengths(Tracer.of(phantom), g, view)
+        # float32 lengths up to 54 mm: half an ulp is 2e-6 mm
+        np.testing.assert_allclose(got[3, 0], fe, atol=3e-6)
+        np.testing.assert_allclose(got[1, 0], chord(0, 0, 27.0) - fe, atol=5e-6)
+
+
+def response(materials=MATERIALS):
+    rule = energy_rule(spectrum(Tube()), Detector(), materials[1:], [40.0, 10.0, 5.0, 5.0], 1e-4)
+    return Response.of(rule, materials)
+
+
+def test_intensities_equal_the_reference():
+    tracer, g, r = Tracer.of(blobs(solids=INSERTS)), geometry(n_detector=(6, 9), n_views=2, pixel=6.0), response()
+    shape = g.n_detector
+    everywhere = np.tile(np.array([0, shape[1]]), (shape[0], 1))
+    extra = np.random.default_rng(0).uniform(0, 1, shape).astype(np.float32)
+    for view in range(2):
+        pose = g.pose_array()[view]
+        arguments = (
+            tracer.bricks, project._solids(tracer, pose, shape), pose, work_order(shape[0]), everywhere, extra,
+            (r.mu, r.w1, r.w2), (r.edge_mu, project.EDGE_THRESHOLD, 21),
+        )  # fmt: skip
+        got, want = np.zeros((2, *shape), np.float32), np.zeros((2, *shape))
+        raytrace_cpu.transmit_view(*arguments, got[0], got[1])
+        raytrace_reference.transmit_view(*arguments, want[0], want[1])
+        # float32 optical thickness up to 40 has an error of 4e-6 absolute, the exponential 4e-7 relative
+        np.testing.assert_allclose(got, want, rtol=1e-5)
+        assert want[0].min() < 0.05 < 0.5 < want[0].max()
+
+
+def test_the_exponential_is_accurate_to_its_bound():
+    @numba.njit
+    def each(x, out):
+        for i in range(x.size):
+            out[i] = exp_minus(x[i])
+
+    x = np.concatenate([[0.0], np.geomspace(1e-6, 79.9, 20001), [81.0, 1e9]]).astype(np.float32)
+    out = np.empty_like(x)
+    each(x, out)
+    want = np.exp(-np.minimum(x.astype(np.float64), 80))
+    assert np.all(np.abs(out / want - 1) < 4e-7 * np.maximum(1, x / 4))
+    assert out[0] == 1.0 and out[-1] > 0
+
+
+def test_skipping_changes_nothing():
+    labels = np.zeros((40, 40, 40), np.uint8)
+    labels[12:28, 14:25, 10:30] = 1
+    phantom = Phantom(labels=labels, materials=MATERIALS, d_voxel=(1.0,) * 3, solids=INSERTS)
+    g, r = geometry(n_detector=(40, 50), n_views=3, pixel=2.5), response()
+    for view in range(3):
+        fast = transmit(Tracer.of(phantom), g, view, r)
+        slow = transmit(Tracer.of(phantom, skip=False), g, view, r)
+        assert np.array_equal(fast[0], slow[0]) and np.array_equal(fast[1], slow[1])
+
+
+def test_results_do_not_depend_on_the_number_of_threads():
+    tracer, g, r = Tracer.of(blobs(solids=INSERTS)), geometry(n_detector=(31, 40), pixel=1.5), response()
+    several = transmit(tracer, g, 1, r)
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        one = transmit(tracer, g, 1, r)
+    finally:
+        numba.set_num_threads(before)
+    assert np.array_equal(several[0], one[0]) and np.array_equal(several[1], one[1])
+
+
+def test_sub_rays_bring_an_edge_pixel_to_its_measured_intensity():
+    rod = solid(FRUSTUM, (20.0, 4.0, 4.0), (3.0, 1.0, 0.0))
+    phantom = Phantom(labels=np.zeros((4,) * 3, np.uint8), materials=MATERIALS, d_voxel=(10.0,) * 3, solids=(rod,))
+    g, r = geometry(n_detector=(3, 61), n_views=3, pixel=0.5), response()
+    tracer = Tracer.of(phantom)
+    fine = geometry(n_detector=(3 * 40, 61 * 40), n_views=3, pixel=0.5 / 40)
+    worst = {}
+    for view in range(3):
+        exact = transmit(tracer, fine, view, r, subrays=1)[0].reshape(3, 40, 61, 40).mean((1, 3), dtype=np.float64)
+        for subrays in (1, 8, 34):
+            error = np.log(transmit(tracer, g, view, r, subrays=subrays)[0] / exact)
+            worst.setdefault(subrays, []).append(np.sqrt(np.mean(error**2)))
+    rms = {n: max(w) for n, w in worst.items()}
+    # n lattice points have a spacing 1/n across the edge: the error must fall at least like that
+    assert rms[8] < rms[1] / 4 and rms[34] < rms[1] / 12
+
+
+def test_a_wire_thinner_than_a_pixel_is_not_missed():
+    wire = solid(CAPSULE, (15.0, 0.05), (0.33, 0.61, 0.0), (0.0, 0.3, 1.0))
+    phantom = Phantom(labels=np.zeros((4,) * 3, np.uint8), materials=MATERIALS, d_voxel=(10.0,) * 3, solids=(wire,))
+    g, r = geometry(n_detector=(21, 21), n_views=1, pixel=3.0), response()
+    m1, _ = transmit(Tracer.of(phantom), g, 0, r)
+    darkened = m1 < 1 - 1e-4
+    assert darkened.any(axis=1).sum() >= 16  # 30 mm, magnified twice, over 3 mm rows, tilted
+
+
+def test_the_energy_mean_ray_outside_the_shadow_is_open():
+    tracer, g, r = Tracer.of(blobs()), geometry(n_detector=(40, 60), pixel=3.0), response()
+    m1, m2 = transmit(tracer, g, 0, r)
+    assert m1[0, 0] == pytest.approx(1.0, abs=1e-6) and m2[0, 0] == pytest.approx(r.w2.sum(), rel=1e-6)
+    assert m1.min() < 0.9
