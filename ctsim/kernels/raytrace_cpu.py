@@ -191,7 +191,7 @@ def _signal(lengths, n, mu, w1, w2, tau, s1, s2):
 
 @njit(cache=True, error_model="numpy")
 def _active(rects, v):
-    """Indices of the primitives whose shadow may reach row v."""
+    """Return the indices of the primitives whose shadow may reach row v."""
     out = np.empty(rects.shape[0], np.int64)
     n = 0
     for p in range(rects.shape[0]):

@@ -4,6 +4,7 @@ Same functions and arguments as `raytrace_cpu`. Nothing is skipped, and the posi
 ray is found from its midpoint.
 """
 
+import itertools
 import math
 
 import numpy as np
@@ -57,7 +58,7 @@ def _lengths(volume, grid, prims, ray, n_materials):
         cuts += list(pairs[: 2 * found])
     cuts = np.unique(np.clip(cuts, 0.0, distance))
     lengths = np.zeros(n_materials)
-    for t0, t1 in zip(cuts[:-1], cuts[1:], strict=True):
+    for t0, t1 in itertools.pairwise(cuts):
         point = source + direction * (t0 + t1) / 2
         covering = [prim for prim in prims if inside(prim, *point)]
         if covering:
