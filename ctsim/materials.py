@@ -177,10 +177,24 @@ def attenuation(which: str | Material, energies: ArrayLike) -> NDArray[np.float6
 
 def k_edges(which: Iterable[str | Material], e_min: float, e_max: float) -> tuple[float, ...]:
     """Return the K-edges (keV) of all elements of the materials that lie inside (e_min, e_max), ascending."""
+    return _edges(which, ("K",), e_min, e_max)
+
+
+def absorption_edges(which: Iterable[str | Material], e_min: float, e_max: float) -> tuple[float, ...]:
+    """Return the K- and L-edges (keV) of the materials that lie inside (e_min, e_max), ascending."""
+    return _edges(which, ("K", "L1", "L2", "L3"), e_min, e_max)
+
+
+def _edges(which: Iterable[str | Material], shells: tuple[str, ...], e_min: float, e_max: float) -> tuple[float, ...]:
     xrl = _xraylib()
-    elements = {z for w in which for z, _ in _mass_fractions(_as_material(w).formula)}
-    edges = {float(xrl.EdgeEnergy(z, xrl.K_SHELL)) for z in elements}
-    return tuple(sorted(e for e in edges if e_min < e < e_max))
+    found = set()
+    for z in {z for w in which for z, _ in _mass_fractions(_as_material(w).formula)}:
+        for shell in shells:
+            try:
+                found.add(float(xrl.EdgeEnergy(z, getattr(xrl, f"{shell}_SHELL"))))
+            except ValueError:  # light elements lack the outer shells
+                continue
+    return tuple(sorted(e for e in found if e_min < e < e_max))
 
 
 @functools.lru_cache(maxsize=256)

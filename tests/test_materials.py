@@ -30,9 +30,8 @@ NIST_EN = {
     "Al": [25.43, 3.094, 0.8778, 0.1840, 0.1099, 0.05511, 0.03794, 0.02827],
     "water": [4.944, 0.5503, 0.1557, 0.04223, 0.03190, 0.02597, 0.02546, 0.02764],
 }
-REQUIRED = (
-    ["air", "water", "soft_tissue", "lung", "adipose", "cortical_bone", "enamel", "dentin", "PLA", "PMMA", "cellulose", "Fe", "Ti", "Al", "CoCr", "Au", "steel"]
-)
+TISSUES = ("soft_tissue", "lung", "adipose", "cortical_bone", "enamel", "dentin")
+REQUIRED = {"air", "water", *TISSUES, "PLA", "PMMA", "cellulose", "Fe", "Ti", "Al", "CoCr", "Au", "steel"}
 
 
 @pytest.mark.parametrize("name", NIST)
@@ -48,7 +47,7 @@ def test_energy_transfer_is_nists(name: str) -> None:
 
 
 def test_every_promised_name_is_known() -> None:
-    assert set(REQUIRED) <= set(names())
+    assert set(names()) >= REQUIRED
     for name in names():
         made = material(name)
         assert sum(made.mass_fractions.values()) == pytest.approx(1)
@@ -58,8 +57,9 @@ def test_every_promised_name_is_known() -> None:
 
 
 def test_weights_and_formulas_agree() -> None:
-    weights = Material(name="w", formula="H 11.1898 O 88.8102", density=1.0)
-    assert attenuation(weights, ENERGIES) == pytest.approx(attenuation("water", ENERGIES), rel=1e-5)
+    share = material("water").mass_fractions
+    weights = Material(name="w", formula=f"H {100 * share[1]:.9f} O {100 * share[8]:.9f}", density=1.0)
+    assert attenuation(weights, ENERGIES) == pytest.approx(attenuation("water", ENERGIES), rel=1e-8)
     assert attenuation("H2O@2", ENERGIES) == pytest.approx(2 * attenuation("water", ENERGIES))
 
 

@@ -75,7 +75,7 @@ def test_k_lines_need_their_edge() -> None:
 
 
 def test_closed_form_covers_what_the_table_refuses() -> None:
-    with pytest.raises(InputError, match="20 to 300 kVp.*finkelshtein-pavlova"):
+    with pytest.raises(InputError, match=r"20 to 300 kVp.*finkelshtein-pavlova"):
         Tube(kvp=450)
     made = spectrum(Tube(kvp=450, model="finkelshtein-pavlova"))
     assert 100 < made.mean < 225
