@@ -21,7 +21,7 @@ truth = { noise_free = true, mono_kev = [60.0], trace = true, paths = true }
 [defaults.scanner]
 n_views = 7
 n_detector = [10, 12]
-n_voxel = [5, 7, 11]
+n_voxel = [10, 14, 22]
 [defaults.phantom]
 recipe = "validation"
 n_voxel = [16, 16, 16]
