@@ -132,7 +132,7 @@ def _thickness_to(kerma: NDArray[np.float64], mu: NDArray[np.float64], share: fl
         thickness += step
         if abs(step) <= 1e-12 * max(thickness, 1e-12):
             break
-    return thickness
+    return float(thickness)
 
 
 @functools.lru_cache(maxsize=64)
@@ -193,8 +193,8 @@ def _anode(
         return _from_spekpy(tube.kvp, takeoff, e), np.zeros(0), np.zeros(0)
     t = _table()
     weights = _node_weights(t, tube.kvp, math.degrees(takeoff))
-    log_g = sum(w * t["log_continuum"][i, j] for i, j, w in weights)
-    log_line = sum(w * t["log_line"][i, j] for i, j, w in weights)
+    log_g = np.sum([w * t["log_continuum"][i, j] for i, j, w in weights], axis=0)
+    log_line = np.sum([w * t["log_line"][i, j] for i, j, w in weights], axis=0)
     continuum = np.exp(np.interp(e / tube.kvp, t["u"], log_g)) * (tube.kvp / e - 1)
     continuum *= anode.self_absorption(tube.kvp, takeoff, e)
     on = tube.kvp > t["line_edge"]
@@ -210,14 +210,16 @@ def _table() -> dict[str, NDArray[np.float64]]:
 
 def _node_weights(t: dict[str, NDArray[np.float64]], kvp: float, angle_deg: float) -> list[tuple[int, int, float]]:
     """Bilinear weights in log kVp and log angle: (kVp index, angle index, weight)."""
-    out = [(0, 0, 1.0)]
-    for axis, value in enumerate((kvp, angle_deg)):
-        grid = np.log(t["kvp"] if axis == 0 else t["angle_deg"])
-        at = float(np.clip(np.interp(math.log(value), grid, np.arange(grid.size)), 0, grid.size - 1))
-        low = min(int(at), grid.size - 2)
-        parts = ((low, 1 - (at - low)), (low + 1, at - low))
-        out = [((i, j) if axis == 0 else (o[0], i)) + (o[2] * w,) for o in out for i, w in parts for j in (0,)]
-    return [o for o in out if o[2] > 0]
+    by_kvp = _line_weights(np.log(t["kvp"]), math.log(kvp))
+    by_angle = _line_weights(np.log(t["angle_deg"]), math.log(angle_deg))
+    return [(i, j, v * w) for i, v in by_kvp for j, w in by_angle if v * w > 0]
+
+
+def _line_weights(grid: NDArray[np.float64], value: float) -> tuple[tuple[int, float], tuple[int, float]]:
+    """Weights of the two grid points around `value`, clamped to the grid."""
+    at = float(np.interp(value, grid, np.arange(grid.size)))
+    low = min(int(at), grid.size - 2)
+    return (low, 1 - (at - low)), (low + 1, at - low)
 
 
 def _from_spekpy(kvp: float, takeoff: float, e: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -229,7 +231,7 @@ def _from_spekpy(kvp: float, takeoff: float, e: NDArray[np.float64]) -> NDArray[
         kvp=kvp, th=math.degrees(takeoff), physics="casim", mu_data_source="nist", dk=e[1] - e[0], mas=1, z=100
     )
     k, flux = tube.get_spectrum()
-    return np.interp(e, k, flux)
+    return np.interp(e, np.asarray(k), np.asarray(flux))
 
 
 def heel_factor(tube: Tube, angles_rad: ArrayLike) -> NDArray[np.float64]:

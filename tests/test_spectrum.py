@@ -87,7 +87,10 @@ def test_closed_form_is_near_the_table() -> None:
     # No oracle: parametric models differ by some percent, and this one is kept for comparison.
     closed, table = (spectrum(Tube(model=m)) for m in ("finkelshtein-pavlova", "table"))
     assert closed.mean == pytest.approx(table.mean, rel=0.02)
-    assert closed.hvl() == pytest.approx(table.hvl(), rel=0.12)
+    assert closed.hvl() == pytest.approx(table.hvl(), rel=0.1)
+    # Without the lines that the continuum excites in the anode, K is three times too faint.
+    line = [float(s.weights[np.abs(s.energies - 59.32) < 0.4].max()) for s in (closed, table)]
+    assert line[0] == pytest.approx(line[1], rel=0.2)
 
 
 def test_one_energy_has_a_closed_half_value_layer() -> None:
