@@ -16,7 +16,7 @@ import pkgutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
@@ -82,7 +82,7 @@ def resolve(target: str) -> Callable[..., "Volume"]:
         raise InputError(f"method {target!r} cannot be imported: {error}") from None
     if not callable(found):
         raise InputError(f"method {target!r} is not a function")
-    return found
+    return cast("Callable[..., Volume]", found)
 
 
 def find(name: str, overrides: dict[str, Any] | None = None) -> Method:

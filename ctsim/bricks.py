@@ -56,7 +56,7 @@ def make_bricks(phantom: Phantom) -> Bricks:
         slot=slot,
         pool=labels[mixed].ravel(),
         density=dense.ravel(),
-        grid=np.concatenate([n, 1 / d, low]),
+        grid=np.concatenate([n.astype(np.float64), 1 / d, low]),
         box=_bounding_box(kind, n, d, low),
     )
 

@@ -112,7 +112,7 @@ class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def voxel_centres(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Coordinates of the voxel centres along z, y and x in mm."""
         z, y, x = (
-            (np.arange(n) + 0.5 - n / 2) * d + o
+            (np.arange(n, dtype=np.float64) + 0.5 - n / 2) * d + o
             for n, d, o in zip(self.n_voxel, self.d_voxel, self.off_origin, strict=True)
         )
         return z, y, x

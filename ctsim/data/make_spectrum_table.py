@@ -25,7 +25,8 @@ def _spectrum(kvp: float, angle: float, dk: float, brem: bool) -> tuple[np.ndarr
     tube = spekpy.Spek(
         kvp=kvp, th=angle, physics="casim", mu_data_source="nist", dk=dk, mas=1, z=100, brem=brem, char=not brem
     )
-    return tube.get_spectrum()
+    e, flux = tube.get_spectrum()
+    return np.asarray(e), np.asarray(flux)
 
 
 def main() -> None:
