@@ -3,7 +3,8 @@
 Rays run from the source to the pixel. Solids are intersected exactly and replace the background along
 their intervals; between them the ray walks the bricks of the label volume (see `ctsim.bricks`). Pixels
 that the edge of a solid crosses are measured by several rays and averaged in *intensity*, as a detector
-does. Rows are independent, so results are bitwise equal for any number of threads.
+does. Rows are independent, so results are bitwise equal for any number of threads. What runs once a ray is
+inlined: a call would count references of its arrays atomically, which costs more than the ray.
 """
 
 import math
@@ -18,13 +19,15 @@ from ctsim.kernels.solids_cpu import intersect
 CODE_BITS = np.uint16(255)
 CELLS = SIDE**3
 SHIFT = SIDE.bit_length() - 1
+FIXED = 2.0**40  # ray parameter as an integer in 2⁻⁴⁰ mm inside a mixed brick
+FARTHEST = 1e6  # mm; no ray is longer, and crossings of a parallel plane lie beyond
 TINY = 1e-12  # a direction cosine below this counts as parallel to the axis
 GOLDEN = 0.6180339887498949
 MOST_TIMES = 16  # a primitive thinner than a pixel gets at most this many times the usual sub-rays
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
-@njit(cache=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _walk(code, slot, pool, density, grid, ray, t_from, t_to, lengths):
     """Add the background's path lengths between t_from and t_to (mm along the ray) to `lengths`."""
     # positions in voxels; the ray parameter stays in mm
@@ -43,7 +46,9 @@ def _walk(code, slot, pool, density, grid, ray, t_from, t_to, lengths):
     octant = ux + 2 * uy + 4 * uz
     _, mz, my, mx = code.shape
     sx, sy, sz = 2 * ux - 1, 2 * uy - 1, 2 * uz - 1
-    ax, ay, az = abs(ix), abs(iy), abs(iz)
+    step_x = np.int64(min(abs(ix), FARTHEST) * FIXED)
+    step_y = np.int64(min(abs(iy), FARTHEST) * FIXED)
+    step_z = np.int64(min(abs(iz), FARTHEST) * FIXED)
     scale = 1.0 / SIDE
     bx = min(max(int((ox + dx * t) * scale), 0), mx - 1)
     by = min(max(int((oy + dy * t) * scale), 0), my - 1)
@@ -79,28 +84,33 @@ def _walk(code, slot, pool, density, grid, ray, t_from, t_to, lengths):
             x = min(max(int(ox + dx * t) - bx * SIDE, 0), SIDE - 1)
             y = min(max(int(oy + dy * t) - by * SIDE, 0), SIDE - 1)
             z = min(max(int(oz + dz * t) - bz * SIDE, 0), SIDE - 1)
-            tx = (bx * SIDE + x + ux - ox) * ix
-            ty = (by * SIDE + y + uy - oy) * iy
-            tz = (bz * SIDE + z + uz - oz) * iz
+            # fixed point: the chain of one step is half as long in integers as in floating point
+            cx = np.int64(min((bx * SIDE + x + ux - ox) * ix, FARTHEST) * FIXED)
+            cy = np.int64(min((by * SIDE + y + uy - oy) * iy, FARTHEST) * FIXED)
+            cz = np.int64(min((bz * SIDE + z + uz - oz) * iz, FARTHEST) * FIXED)
+            at, stop = np.int64(t * FIXED), np.int64(end * FIXED)
+            cell = base + (z * SIDE + y) * SIDE + x
             while True:
-                cell = base + (z * SIDE + y) * SIDE + x
-                leave = min(tx, min(ty, tz))
-                step = max(min(leave, end) - t, 0.0)
-                t = max(t, leave)
+                leave = min(cx, min(cy, cz))
+                step = max(min(leave, stop) - at, 0)
+                at = max(at, leave)
                 if density.size > 0:
-                    step *= density[cell]
-                lengths[pool[cell]] += step
-                # no branch tells the axes apart: a wrong guess costs more than three additions
-                cross_x, cross_y, cross_z = tx == leave, ty == leave, tz == leave
-                x += sx if cross_x else 0
-                y += sy if cross_y else 0
-                z += sz if cross_z else 0
-                tx += ax if cross_x else 0.0
-                ty += ay if cross_y else 0.0
-                tz += az if cross_z else 0.0
+                    lengths[pool[cell]] += step * density[cell] * (1.0 / FIXED)
+                else:
+                    lengths[pool[cell]] += step * (1.0 / FIXED)
+                # no branch tells the axes apart: a wrong guess costs more than the additions
+                gx, gy, gz = -np.int64(cx == leave), -np.int64(cy == leave), -np.int64(cz == leave)
+                x += sx & gx
+                y += sy & gy
+                z += sz & gz
+                cx += step_x & gx
+                cy += step_y & gy
+                cz += step_z & gz
                 if (x | y | z) & ~(SIDE - 1):
                     break
-            if t >= end:
+                cell += (sx & gx) + (sy * SIDE & gy) + (sz * SIDE * SIDE & gz)
+            t = at * (1.0 / FIXED)
+            if at >= stop:
                 return
             bx += x >> SHIFT
             by += y >> SHIFT
@@ -109,7 +119,7 @@ def _walk(code, slot, pool, density, grid, ray, t_from, t_to, lengths):
             return
 
 
-@njit(cache=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _aim(pose, u, v, ray):
     """Fill `ray` with the source, the unit direction to detector position (u, v), and the distance."""
     dx = pose[3] + u * pose[6] + v * pose[9] - pose[0]
@@ -121,7 +131,7 @@ def _aim(pose, u, v, ray):
     ray[6] = length
 
 
-@njit(cache=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _collect(prims, rects, active, u, ray, pair, hits):
     """List the intervals of the active primitives near column u as (enter, leave, material); return how many."""
     n = 0
@@ -136,12 +146,9 @@ def _collect(prims, rects, active, u, ray, pair, hits):
     return n
 
 
-@njit(cache=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _add_lengths(code, slot, pool, density, grid, ray, hits, n, lengths):
     """Add one ray's path length in every material: solids in paint order over the background."""
-    if n == 0:
-        _walk(code, slot, pool, density, grid, ray, 0.0, ray[6], lengths)
-        return
     t = 0.0
     while t < ray[6]:
         # the topmost interval that covers t decides, until it ends or one painted later begins
@@ -161,7 +168,7 @@ def _add_lengths(code, slot, pool, density, grid, ray, hits, n, lengths):
         t = until
 
 
-@njit(cache=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _thickness(hits, n, edge_mu):
     """Optical thickness of the solids alone; overlaps count twice, since only its change matters."""
     total = 0.0
@@ -216,7 +223,7 @@ def _corners(prims, rects, active, pose, v, shift, edge_mu, out):
                     out[side, u] = _thickness(hits, n, edge_mu) + 1e-300  # marks the corner as done
 
 
-@njit(cache=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _grazes(fat, rects, active, u, ray, pair):
     """Return how many times the usual sub-rays a primitive needs that can hide between a pixel's corners."""
     times = 0
@@ -227,7 +234,7 @@ def _grazes(fat, rects, active, u, ray, pair):
     return times
 
 
-@njit(cache=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _add_row(grid_arrays, prims, rects, active, u, ray, scratch, layer, lengths, column):
     """Write one ray's path lengths into column `column` of `lengths` [material, ray]; return its intervals."""
     code, slot, pool, density, grid = grid_arrays
