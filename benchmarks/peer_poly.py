@@ -1,0 +1,165 @@
+"""Case 5 of `run-benchmark peers`: polychromatic projections, against what a pixel of finite size measures."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks import host, peer_rtk
+from benchmarks.peer_cases import OURS, RTK, SIZE, Measurement, Setup, absent, in_turns, relative, voxelised
+from ctsim.materials import attenuation
+from ctsim.plan import make_plan
+from ctsim.project import Response, Tracer, transmit
+from ctsim.quadrature import EnergyRule, full_rule
+from ctsim.settings import Simulation, Truth
+from ctsim.spectrum import spectrum
+from ctsim.types import Phantom, Scanner
+from ctsim.voxelise import fractions
+from phantoms.bodies import upright
+
+BINS = 80
+FINER = 16  # rays along each side of a pixel in the oracle
+CHECKED = 2  # views that the oracle measures
+
+
+def poly_scene(n: int) -> Phantom:
+    """Return the scene of case 5, all analytic: water cylinder, bone rod, two iron rods."""
+    solids = (
+        upright("water", "water", (0.0, 0.0, 0.0), (25.0, 27.0)),
+        upright("bone", "cortical_bone", (11.0, 6.0, 0.0), (5.0, 24.0)),
+        upright("iron 1", "Fe", (-9.0, 9.0, 0.0), (2.5, 22.0), metal=True),
+        upright("iron 2", "Fe", (-4.0, -13.0, 0.0), (2.0, 22.0), metal=True),
+    )
+    names = ("air", "water", "cortical_bone", "Fe")
+    return Phantom(labels=np.zeros((n, n, n), np.uint8), materials=names, d_voxel=(SIZE / n,) * 3, solids=solids)
+
+
+def eighty_bins(rule: EnergyRule) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Gather a fine spectrum in at most 80 equal bins: mean energy (keV) and signal share of each."""
+    bins = np.linspace(rule.energies[0], rule.energies[-1], BINS + 1)
+    of = np.clip(np.searchsorted(bins, rule.energies, side="right") - 1, 0, BINS - 1)
+    share = np.bincount(of, rule.w1, BINS)
+    energy = np.bincount(of, rule.w1 * rule.energies, BINS)[share > 0] / share[share > 0]
+    return energy, share[share > 0]
+
+
+def measured_pixel(phantom: Phantom, scanner: Scanner, views: tuple[int, ...]) -> NDArray[np.float64]:
+    """P of every pixel as a detector has it: 16² rays a pixel averaged in intensity, the whole fine spectrum.
+
+    Chords are our tracer's closed forms, for an all-analytic scene, in central rays of a 16-fold finer detector.
+    """
+    coarse = scanner.geometry
+    (n_v, n_u), (d_v, d_u) = coarse.n_detector, coarse.d_detector
+    fine = msgspec.structs.replace(coarse, n_detector=(n_v * FINER, n_u * FINER), d_detector=(d_v / FINER, d_u / FINER))
+    tracer = Tracer.of(phantom)
+    response = Response.of(full_rule(spectrum(scanner.tube), scanner.detector), tracer.materials)
+    out = np.empty((len(views), n_v, n_u))
+    for k, view in enumerate(views):
+        signal, _ = transmit(tracer, fine, view, response, subrays=1)
+        out[k] = signal.reshape(n_v, FINER, n_u, FINER).mean((1, 3), dtype=np.float64)
+    return -np.log(out)
+
+
+class Contenders:
+    """The polychromatic contenders of one scene, each prepared as a function that measures all views: [view, v, u]."""
+
+    def __init__(self, setup: Setup) -> None:
+        self.setup, self.scanner = setup, setup.scanner(setup.views(30))
+        self.geometry, self.phantom = self.scanner.geometry, poly_scene(setup.n)
+
+    def ours(self, *, voxels: bool) -> Callable[[], NDArray[np.float32]]:
+        """Prepare our measurement, the body in voxels or analytic as the metal always is."""
+        metal = tuple(s for s in self.phantom.solids if s.metal)
+        phantom = voxelised(self.phantom, self.geometry, metal) if voxels else self.phantom
+        rule = make_plan(phantom, self.scanner, Simulation(tolerance=1e-4), Truth(twin=False), "peers").rule
+        tracer = Tracer.of(phantom)
+        response = Response.of(rule, tracer.materials)
+
+        def run() -> NDArray[np.float32]:
+            views = range(self.geometry.n_views)
+            return np.stack([-np.log(transmit(tracer, self.geometry, k, response)[0]) for k in views])
+
+        return run
+
+    def rtk(self) -> Callable[[], NDArray[np.float32]]:
+        """Prepare Joseph's projector on each material's volume share, and 80 bins in NumPy."""
+        rtk = peer_rtk.Rtk(self.geometry, self.setup.threads)
+        share = fractions(self.phantom, self.geometry)
+        volumes = [rtk.volume(share[m]) for m in self.phantom.materials[1:]]
+        del share
+        energies, weights = eighty_bins(full_rule(spectrum(self.scanner.tube), self.scanner.detector))
+        mu = np.stack([attenuation(m, energies) for m in self.phantom.materials[1:]], 1).astype(np.float32)
+        w = weights.astype(np.float32)
+
+        def run() -> NDArray[np.float32]:
+            lengths = np.stack([rtk.project(v) for v in volumes], 1)  # [view, material, v, u]
+            signal = [w @ np.exp(-(mu @ view.reshape(len(volumes), -1))) for view in lengths]
+            return -np.log(np.stack(signal)).reshape(self.geometry.shape)
+
+        return run
+
+    def prepare(self, contender: str) -> Callable[[], NDArray[np.float32]]:
+        """Prepare a contender by its name in the table."""
+        return self.rtk() if contender == RTK else self.ours(voxels="voxels" in contender)
+
+
+POLY = (f"{OURS}, exact metal in voxels", f"{OURS}, exact solids", RTK)
+
+NOTES = {
+    POLY[0]: "water and bone from voxels, metal exact, sub-rays",
+    POLY[1]: "all solids exact, sub-rays",
+    RTK: f"Joseph per material, {BINS} bins in NumPy",
+}
+
+
+def poly(setup: Setup) -> list[Measurement]:
+    """Case 5: time, relative RMS of P against the measured pixel, and peak memory of each contender alone."""
+    contenders = Contenders(setup)
+    n_views = contenders.geometry.n_views
+    checked = tuple(round((k + 0.5) * n_views / CHECKED) % n_views for k in range(CHECKED))
+    runs = {name: contenders.prepare(name) for name in POLY if setup.rtk or name != RTK}
+    timed = in_turns(runs, setup.repeats)
+    oracle = measured_pixel(contenders.phantom, contenders.scanner, checked)
+    out = []
+    for name, run in runs.items():
+        first, seconds = timed[name]
+        out.append(
+            Measurement(
+                case="poly",
+                scene="water, bone, Fe",
+                contender=name,
+                seconds=seconds,
+                views=n_views,
+                warm_up=first,
+                error=relative(run()[list(checked)], oracle),
+                error_kind="relative RMS of P",
+                peak_bytes=_alone(setup, name),
+                note=NOTES[name],
+            )
+        )
+    return out + ([] if setup.rtk else [absent("poly", "water, bone, Fe")])
+
+
+def peak(n: int, threads: int, contender: str) -> int:
+    """Prepare a contender, then return the peak resident memory (bytes) of this process while it runs twice.
+
+    It holds the interpreter and the libraries that are loaded, and the contender's volumes.
+    """
+    import numba
+
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+    run = Contenders(Setup(n=n, threads=threads)).prepare(contender)
+    with host.measured() as usage:
+        run()
+        run()
+    return usage.peak_bytes
+
+
+def _alone(setup: Setup, contender: str) -> int | None:
+    """Measure `peak` in a process of its own; None where that failed."""
+    code = f"from benchmarks import peer_poly; print(peer_poly.peak({setup.n}, {setup.threads}, {contender!r}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    return int(done.stdout.split()[-1]) if done.returncode == 0 else None
