@@ -1,0 +1,200 @@
+"""The simulator from plan to counts: what it promises about accuracy, skipping, twins and noise."""
+
+import dataclasses
+
+import msgspec
+import numpy as np
+import pytest
+
+from ctsim.detector import Detector
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+from ctsim.materials import attenuation
+from ctsim.noise import Noise
+from ctsim.plan import make_plan, present_materials
+from ctsim.scatter import Scatter
+from ctsim.settings import Simulation, Truth
+from ctsim.simulate import compact, flat_image, scan_info, simulate_views, truth_volumes
+from ctsim.solids import FRUSTUM, Primitive, Solid
+from ctsim.spectrum import Bowtie, Filter, Tube
+from ctsim.types import Phantom, Scanner
+
+GEOMETRY = Geometry(
+    dso=250.0,
+    dsd=500.0,
+    n_voxel=(12, 14, 16),
+    d_voxel=(3.0,) * 3,
+    n_detector=(24, 30),
+    d_detector=(3.5, 3.5),
+    n_views=4,
+)
+QUIET = Noise(model="none")
+
+
+def rod(material="Fe", x=8.0, radius=3.0, metal=True, height=15.0):
+    piece = Primitive(kind=FRUSTUM, centre=(x, 2.0, 0.0), params=(height, radius, radius))
+    return Solid(name="rod", material=material, primitives=(piece,), metal=metal)
+
+
+def phantom(solids=None):
+    z, y, x = np.meshgrid(*(np.arange(20) - 9.5,) * 3, indexing="ij")
+    labels = np.where((x**2 + y**2 < 64) & (abs(z) < 8), 1, 0).astype(np.uint8)
+    labels[x**2 + (y - 3) ** 2 + z**2 < 6] = 3
+    names = ("air", "water", "Ti", "cortical_bone", "Fe")
+    return Phantom(labels=labels, materials=names, d_voxel=(2.0,) * 3, solids=(rod(),) if solids is None else solids)
+
+
+def scanner(**changes):
+    return Scanner(**{"geometry": GEOMETRY, "noise": QUIET, **changes})
+
+
+def run(body, machine, simulation=None, truth=None, first_view=0):
+    plan = make_plan(body, machine, simulation or Simulation(), truth or Truth(), "scene")
+    views = [out for _, out in simulate_views(plan, body, machine, first_view)]
+    return plan, {name: np.stack([v[name] for v in views]) for name in views[0]}
+
+
+EVERYTHING = Truth(noise_free=True, scatter_free=True, mono_kev=(60.0, 80.0), trace=True, metal_path=True, paths=True)
+
+
+def test_only_materials_that_occur_are_planned_and_renumbering_keeps_them():
+    body = phantom()
+    names = present_materials(body)
+    assert names == ("air", "water", "cortical_bone", "Fe")
+    small = compact(body, names)
+    before = np.array(body.materials)[body.labels]
+    assert np.array_equal(np.array(small.materials)[small.labels], before)
+
+
+def test_skipping_stays_within_the_stated_tolerance():
+    body, tolerance = phantom(), 1e-4
+    for tube in (Tube(), Tube(kvp=120.0, filters=(Filter(material="Cu", thickness=0.3),))):
+        machine = scanner(tube=tube)
+        plan, fast = run(body, machine, Simulation(tolerance=tolerance), EVERYTHING)
+        full, slow = run(body, machine, Simulation(skip=False), EVERYTHING)
+        assert len(full.rule.energies) > 5 * len(plan.rule.energies)
+        for name in ("noise_free", "metal_free/noise_free"):
+            # the quadrature's bound, plus float32 over some 150 nodes: 150·6e-8 relative in the signal
+            assert np.abs(fast[name] - slow[name]).max() < tolerance + 1e-5, name
+            assert fast[name].max() > 1
+        np.testing.assert_array_equal(fast["trace"], slow["trace"])
+        np.testing.assert_allclose(fast["mono_60kev"], slow["mono_60kev"], rtol=1e-6, atol=1e-7)
+
+
+def test_a_single_energy_is_beer_lambert():
+    machine = scanner(tube=Tube(model="mono", kvp=60.0, filters=()), detector=Detector(kind="ideal"))
+    plan, out = run(phantom(solids=()), machine, truth=EVERYTHING)
+    assert len(plan.rule.energies) == 1
+    # float32 lengths and thicknesses of at most 2
+    np.testing.assert_allclose(out["noise_free"], out["mono_60kev"], atol=2e-6)
+    mu = [attenuation(m, np.array([60.0]))[0] for m in plan.materials[1:]]
+    np.testing.assert_allclose(np.tensordot(out["paths"], mu, (1, 0)), out["mono_60kev"], rtol=1e-5, atol=1e-6)
+
+
+def test_the_twin_is_the_scan_of_the_body_without_metal_to_the_last_count():
+    body, machine = phantom(), scanner(noise=Noise(), scatter=Scatter(level=1))
+    plan, out = run(body, machine)
+    bare = body.without_metal()
+    # same quadrature for both, or the nodes would differ
+    bare_plan = dataclasses.replace(
+        make_plan(bare, machine, Simulation(), Truth(), "scene"), rule=plan.rule, materials=plan.materials
+    )
+    alone = np.stack([v["counts"] for _, v in simulate_views(bare_plan, bare, machine)])
+    np.testing.assert_array_equal(out["metal_free/counts"], alone)
+    changed = out["counts"] != out["metal_free/counts"]
+    assert 0.02 < changed.mean() < 0.6
+
+
+def test_any_view_can_be_made_alone():
+    machine = scanner(noise=Noise(fixed_pattern=0.01))
+    _, whole = run(phantom(), machine)
+    _, rest = run(phantom(), machine, first_view=2)
+    np.testing.assert_array_equal(whole["counts"][2:], rest["counts"])
+
+
+def test_ground_truth_is_made_only_when_asked_for():
+    _, few = run(phantom(), scanner(), truth=Truth(twin=False))
+    assert set(few) == {"counts"}
+    plan, _ = run(phantom(solids=()), scanner(), truth=EVERYTHING)
+    names = {o.name for o in plan.outputs}
+    assert not {"trace", "metal_path", "scatter_free", "metal_free/counts"} & names
+    assert not plan.runs("metal-free twin") and not plan.runs("Ti") and plan.runs("water")
+
+
+def test_scatter_lifts_the_signal_by_its_fraction():
+    machine = scanner(scatter=Scatter(level=1, fraction=0.05))
+    _, out = run(phantom(), machine, truth=EVERYTHING)
+    lifted = np.exp(-out["noise_free"].astype(np.float64)) - np.exp(-out["scatter_free"].astype(np.float64))
+    np.testing.assert_allclose(lifted, 0.05, rtol=1e-5)
+
+
+def test_bow_tie_and_heel_cancel_in_the_flat_field():
+    tube = Tube(bowtie=Bowtie(material="Al", center=1.0, edge=5.0, half_angle_deg=10.0), heel=True)
+    machine = scanner(tube=tube, noise=Noise(model="none"))
+    empty_side = Phantom(
+        labels=np.zeros((4, 4, 4), np.uint8),
+        materials=("air", "Fe"),
+        d_voxel=(2.0,) * 3,
+        solids=(rod(x=0.0, radius=1.0),),
+    )
+    plan, out = run(empty_side, machine, truth=Truth(noise_free=True))
+    flat = flat_image(plan, machine)
+    assert flat.max() > 1.2 * flat.min()
+    np.testing.assert_allclose(out["counts"][:, :, 0], np.tile(flat[:, 0], (4, 1)), rtol=1e-5)
+    assert np.abs(out["noise_free"][:, :, 0]).max() < 1e-5
+    assert out["noise_free"].max() > 1
+
+
+def test_references_hold_the_attenuation_of_their_materials():
+    body, machine = phantom(), scanner()
+    plan = make_plan(body, machine, Simulation(), Truth(), "scene")
+    volumes = truth_volumes(plan, body, machine)
+    assert volumes["reference_50kev"].shape == GEOMETRY.n_voxel
+    fe = attenuation("Fe", np.array([50.0]))[0]
+    # a 3 mm voxel in the middle of a rod of 3 mm radius is full of iron
+    assert volumes["reference_50kev"].max() == pytest.approx(fe, rel=1e-6)
+    water = attenuation("water", np.array([50.0]))[0]
+    inside = volumes["labels"] == plan.materials.index("water")
+    assert np.median(volumes["reference_50kev"][inside]) == pytest.approx(water, rel=1e-6)
+    assert volumes["metal"].sum() > 0 and volumes["metal_free/reference_50kev"].max() < 0.2
+    info = scan_info(plan, body, machine)
+    assert 10 < info["l0"] < 40 and info["metal"] == ["Fe"]
+
+
+def test_an_empty_scene_is_refused_by_name():
+    empty = Phantom(labels=np.zeros((4, 4, 4), np.uint8), materials=("air", "water"), d_voxel=(1.0,) * 3)
+    with pytest.raises(InputError, match="empty"):
+        make_plan(empty, scanner(), Simulation(), Truth(), "scene")
+
+
+def test_heel_needs_a_circular_orbit():
+    poses = tuple(tuple(float(x) for x in row) for row in GEOMETRY.pose_array())
+    machine = scanner(geometry=msgspec.structs.replace(GEOMETRY, poses=poses), tube=Tube(heel=True))
+    plan = make_plan(phantom(), machine, Simulation(), Truth(), "scene")
+    with pytest.raises(InputError, match="circular orbit"):
+        next(simulate_views(plan, phantom(), machine))
+
+
+def test_arbitrary_poses_give_what_the_orbit_gives():
+    poses = tuple(tuple(float(x) for x in row) for row in GEOMETRY.pose_array())
+    _, orbit = run(phantom(), scanner())
+    _, posed = run(phantom(), scanner(geometry=msgspec.structs.replace(GEOMETRY, poses=poses)))
+    np.testing.assert_array_equal(orbit["counts"], posed["counts"])
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        {"i0": 10.0, "noise": Noise()},
+        {"tube": Tube(kvp=40.0)},
+        {"detector": Detector(kind="counting")},
+        {"noise": Noise(model="tigre")},
+        {"geometry": msgspec.structs.replace(GEOMETRY, n_views=1, off_detector=(4.0, -9.0))},
+    ],
+    ids=["ten photons", "40 kVp", "counting", "tigre", "one view, offset"],
+)
+def test_extreme_scans_stay_finite(case):
+    thick = phantom(solids=(rod(x=0.0, radius=14.0), rod("air", x=0.0, radius=2.0, metal=False)))
+    _, out = run(thick, scanner(**case), truth=Truth(noise_free=True))
+    assert all(np.isfinite(images).all() for images in out.values())
+    assert out["noise_free"].max() > 8
