@@ -1,0 +1,32 @@
+import os
+from pathlib import Path
+
+import pytest
+
+os.environ.setdefault("MPLBACKEND", "agg")
+
+SMALLEST = """
+name = "smallest"
+seed = 5
+
+[phantom]
+recipe = "validation"
+metal = "Al"
+n_voxel = [16, 16, 16]
+
+[scanner]
+n_voxel = [10, 12, 12]
+n_detector = [16, 18]
+n_views = 12
+"""
+
+
+@pytest.fixture(scope="session")
+def smallest(tmp_path_factory) -> Path:
+    """A dataset of one scene, rods in water, as make-dataset writes it; not to be changed."""
+    from benchmarks.make_dataset import main
+
+    folder = tmp_path_factory.mktemp("smallest")
+    (folder / "scene.toml").write_text(SMALLEST, encoding="utf-8")
+    assert main([str(folder / "scene.toml"), str(folder / "data")]) == 0
+    return folder / "data"

@@ -1,0 +1,48 @@
+"""What every method of the table owes its caller, on the smallest scene."""
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.methods import TABLE, find
+from ctsim.store import list_scans, open_scan
+from ctsim.types import Status
+
+
+@pytest.fixture(scope="module")
+def stored(smallest):
+    return open_scan(list_scans(smallest)[0])
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_a_method_gives_a_finite_volume_of_the_scans_grid(name, stored):
+    method = find(name)
+    if reason := method.skip(stored.scan):
+        assert isinstance(reason, str)
+        pytest.skip(reason)
+    volume = method.reconstruct(stored.scan, "cpu")
+    assert volume.status is Status.OK and not volume.reason
+    assert volume.values.dtype == torch.float32
+    assert tuple(volume.values.shape) == stored.geometry.n_voxel
+    assert bool(torch.isfinite(volume.values).all())
+    # 1/mm, not 1/cm, HU or counts: water at 90 kV is near 0.025, so a factor of 2 tells the units apart
+    water = stored.reference("effective")[stored.labels == 1]
+    measured = volume.values.numpy()[stored.labels == 1]
+    assert np.median(water) / 2 < np.median(measured) < 2 * np.median(water)
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_a_method_leaves_the_scan_as_it_was_and_repeats_itself(name, stored):
+    method, counts = find(name), stored.scan.counts.clone()
+    if method.skip(stored.scan):
+        pytest.skip("does not apply")
+    first = method.reconstruct(stored.scan, "cpu").values
+    assert torch.equal(stored.scan.counts, counts)
+    assert torch.equal(method.reconstruct(stored.scan, "cpu").values, first)
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_a_method_refuses_a_device_that_is_not_there(name, stored):
+    # "meta" holds no data: nothing can be computed on it, so falling back silently would show
+    with pytest.raises((ValueError, RuntimeError, NotImplementedError)):
+        find(name).reconstruct(stored.scan, "meta")
