@@ -50,7 +50,7 @@ def test_commands_in_the_pages_are_understood():
 
     parsed = 0
     for kind, text in (p.values for p in BLOCKS):
-        for line in text.splitlines() if kind == "bash" else ():
+        for line in re.split(r"\n|&&", text.replace("\\\n", " ")) if kind == "bash" else ():
             name, *words = shlex.split(line, comments=True) or [""]
             form = {"make-dataset": Options, "run-benchmark": Arguments}.get(name.rpartition("/")[2])
             if form and words[:1] != ["peers"]:
