@@ -5,6 +5,7 @@ RTK wants prepared (its axis order, its pose matrices) is prepared when a `Rtk` 
 runs. Rit et al., J. Phys. Conf. Ser. 489, 2014, doi:10.1088/1742-6596/489/1/012079.
 """
 
+import warnings
 from importlib import metadata, util
 from typing import Any
 
@@ -35,12 +36,19 @@ class Rtk:
     def __init__(self, geometry: Geometry, threads: int = 2) -> None:
         if geometry.poses is not None:
             raise InputError("RTK's geometry here is a circular orbit: give angles instead of poses")
-        import itk
-        from itk import RTK
+        with warnings.catch_warnings():
+            # SWIG's modules crash where its own deprecation warnings are errors; ITK loads them on first use
+            warnings.simplefilter("ignore")
+            import itk
+            from itk import RTK
 
+            image = itk.Image[itk.F, 3]
+            self._joseph = RTK.JosephForwardProjectionImageFilter[image, image]
+            self._feldkamp = RTK.FDKConeBeamReconstructionFilter[image]
+            self._zero = RTK.ConstantImageSource[image]
+            itk.array_from_image(itk.image_from_array(np.zeros((2, 2, 2), np.float32)))
         itk.MultiThreaderBase.SetGlobalDefaultNumberOfThreads(threads)
-        self._itk, self._rtk = itk, RTK
-        self._image = itk.Image[itk.F, 3]
+        self._itk = itk
         self._geometry = geometry
         self._orbit = RTK.ThreeDCircularProjectionGeometry.New()
         for angle in angles_to(Library.RTK, geometry.angles):
@@ -76,13 +84,13 @@ class Rtk:
     def project(self, volume: Any) -> NDArray[np.float32]:
         """Integrate an image of `volume` along the rays of all views by Joseph's method: [view, v, u]."""
         g = self._geometry
-        zero = self._rtk.ConstantImageSource[self._image].New()
+        zero = self._zero.New()
         spacing, origin = self._pixels()
         zero.SetSpacing(spacing)
         zero.SetOrigin(origin)
         zero.SetSize([g.n_detector[1], g.n_detector[0], g.n_views])
         zero.SetConstant(0.0)
-        joseph = self._rtk.JosephForwardProjectionImageFilter[self._image, self._image].New()
+        joseph = self._joseph.New()
         joseph.SetInput(0, zero.GetOutput())
         joseph.SetInput(1, volume)
         joseph.SetGeometry(self._orbit)
@@ -93,12 +101,12 @@ class Rtk:
         """Reconstruct an image of `stack` by FDK with the plain ramp: [z, y, x] in 1/mm."""
         n = self._geometry.n_voxel
         grid = self.volume(np.zeros((1, 1, 1), np.float32))  # for spacing and origin only
-        zero = self._rtk.ConstantImageSource[self._image].New()
+        zero = self._zero.New()
         zero.SetSpacing(grid.GetSpacing())
         zero.SetOrigin(grid.GetOrigin())
         zero.SetSize([n[k] for k in self._axes])
         zero.SetConstant(0.0)
-        feldkamp = self._rtk.FDKConeBeamReconstructionFilter[self._image].New()
+        feldkamp = self._feldkamp.New()
         feldkamp.SetInput(0, zero.GetOutput())
         feldkamp.SetInput(1, stack)
         feldkamp.SetGeometry(self._orbit)

@@ -110,7 +110,10 @@ def render(records: Sequence[PeerRecord]) -> str:
     out += ["| " + " | ".join(_cells(m)) + " |" for m in measurements]
     found = verdicts(measurements)
     if records[-1].side < FULL:
-        out += ["", "Grids this small are all overhead: they prove the command, not the speed, and meet or miss no target."]
+        out += [
+            "",
+            "Grids this small are all overhead: they prove the command, not the speed, and meet or miss no target.",
+        ]
     elif found:
         out += ["", "| case | scene | quantity | reached | target | met |", "|---|---|---|--:|--:|---|"]
         out += [
