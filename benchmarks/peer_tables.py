@@ -14,7 +14,10 @@ MEGA = 1e6
 
 
 class PeerRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One measurement with its provenance; `side` is that of the grids, `rtk` the version of itk-rtk."""
+    """One measurement with its provenance; `side` is that of the grids, `rtk` the version of itk-rtk.
+
+    `run` is when the command was started: it tells the runs in one file apart.
+    """
 
     measurement: Measurement
     side: int
@@ -22,6 +25,7 @@ class PeerRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     host: Host
     commit: str
     time: str
+    run: str = ""
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
@@ -51,6 +55,21 @@ def read(path: Path) -> list[PeerRecord]:
     """Read the records of a peers file."""
     decoder = msgspec.json.Decoder(PeerRecord)
     return [decoder.decode(line) for line in path.read_bytes().splitlines() if line.strip()]
+
+
+def latest(records: Sequence[PeerRecord], side: int) -> list[PeerRecord]:
+    """Keep the last measurement of each case on grids of `side`, all of its contenders from one run, oldest first.
+
+    Contenders that did not run in turns with each other are never put side by side.
+    """
+    last: dict[tuple[str, str, str], PeerRecord] = {}
+    for record in records:
+        if record.side == side:
+            m = record.measurement
+            last.pop((m.case, m.scene, m.contender), None)
+            last[m.case, m.scene, m.contender] = record
+    newest = {record.measurement.case: record.run for record in last.values()}
+    return [record for record in last.values() if record.run == newest[record.measurement.case]]
 
 
 def time_ratio(ours: Measurement, theirs: Measurement) -> float:

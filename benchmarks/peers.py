@@ -1,6 +1,7 @@
 """`run-benchmark peers RESULTS`: speed and error side by side with RTK, in one process, in turns.
 
-Records go to RESULTS/peers.jsonl, one line per contender and scene, the table to RESULTS/peers.md.
+Records go to RESULTS/peers.jsonl, one line per contender and scene; the table, RESULTS/peers.md, shows the
+last of each, so that cases can be measured one by one.
 """
 
 import dataclasses
@@ -53,7 +54,8 @@ def main(argv: list[str]) -> int:
     found = _measure(given, wanted)
     from benchmarks import peer_tables
 
-    text = peer_tables.render(found)
+    stored = peer_tables.latest(peer_tables.read(given.results / NAME), found[-1].side)
+    text = peer_tables.render(stored)
     (given.results / "peers.md").write_text(text, encoding="utf-8")
     sys.stdout.write(text + f"\nWritten: {given.results}/peers.md; records in {NAME}\n")
     return 1 if any(r.measurement.status == "error" for r in found) else 0
@@ -80,6 +82,7 @@ def _measure(given: Arguments, wanted: tuple[Case, ...]) -> "list[PeerRecord]":
         "poly": peer_poly.poly,
     }
     found = []
+    began = datetime.now(UTC).isoformat(timespec="microseconds")
     for case in wanted:
         sys.stderr.write(f"{case} …\n")
         measured: list[Measurement] = cases[case](setup)
@@ -91,6 +94,7 @@ def _measure(given: Arguments, wanted: tuple[Case, ...]) -> "list[PeerRecord]":
                 host=host.host(),
                 commit=host.commit(),
                 time=datetime.now(UTC).isoformat(timespec="seconds"),
+                run=began,
             )
             peer_tables.append(given.results / NAME, record)
             found.append(record)

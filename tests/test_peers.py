@@ -5,7 +5,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks import peer_cases, peer_poly, peer_rtk, peer_tables, peers
+from benchmarks import host, peer_cases, peer_poly, peer_rtk, peer_tables, peers
 from benchmarks.peer_cases import OURS, RTK, Measurement
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -155,6 +155,23 @@ def test_the_command_without_rtk_says_so_and_stores_records(tmp_path, monkeypatc
     assert exact.error is not None and exact.error < 1e-6
     assert records[0].host.cores > 0 and records[0].commit
     assert (tmp_path / "new" / "peers.md").read_text() in table
+
+
+def test_the_table_keeps_contenders_of_one_run_together():
+    def record(contender, run, case="fdk", side=256):
+        m = measurement(contender, (1.0,), case=case)
+        where = host.host()
+        return peer_tables.PeerRecord(measurement=m, side=side, rtk="", host=where, commit="", time=run, run=run)
+
+    stored = [
+        record(OURS, "1"),
+        record(RTK, "1"),
+        record(OURS, "1", "exact"),
+        record(OURS, "2"),
+        record(OURS, "3", side=32),
+    ]
+    kept = [(r.measurement.case, r.measurement.contender, r.run) for r in peer_tables.latest(stored, 256)]
+    assert kept == [("exact", OURS, "1"), ("fdk", OURS, "2")]
 
 
 def test_repeats_must_be_positive(tmp_path):
