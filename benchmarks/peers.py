@@ -82,6 +82,7 @@ def _measure(given: Arguments, wanted: tuple[Case, ...]) -> "list[PeerRecord]":
         "poly": peer_poly.poly,
     }
     found = []
+    host.commit()  # remembered: the code that is loaded, whatever is committed meanwhile
     began = datetime.now(UTC).isoformat(timespec="microseconds")
     for case in wanted:
         sys.stderr.write(f"{case} …\n")
