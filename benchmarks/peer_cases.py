@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -80,7 +80,9 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     note: str = ""
 
 
-def in_turns(contenders: dict[str, Callable[[], object]], repeats: int) -> dict[str, tuple[float, tuple[float, ...]]]:
+def in_turns(
+    contenders: Mapping[str, Callable[[], object]], repeats: int
+) -> dict[str, tuple[float, tuple[float, ...]]]:
     """Run the contenders once each, then in turns; return (seconds of the first call, seconds of the others)."""
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(repeats + 1):
@@ -115,7 +117,9 @@ def path_scenes(n: int) -> dict[str, Phantom]:
     disc[np.hypot(y, x - 13) < 4] = 2
     disc[np.hypot(y - 9, x + 9) < 3] = 3
     labels = (disc[None] * (np.abs(z) < 27)[:, None, None]).astype(np.uint8)
-    cylinder = Phantom(labels=labels, materials=("air", "water", "cortical_bone", "Al"), d_voxel=(SIZE / n,) * 3)
+    cylinder = Phantom(
+        labels=labels, materials=("air", "water", "cortical_bone", "Al"), d_voxel=(SIZE / n, SIZE / n, SIZE / n)
+    )
     return {
         "lung": compact(bare, present_materials(bare)),
         "lung + Fe": compact(thorax, present_materials(thorax)),
@@ -182,7 +186,7 @@ def exact(setup: Setup) -> list[Measurement]:
     geometry = setup.scanner(setup.views(30)).geometry
     out = []
     for metal in ("Al", "Fe"):
-        phantom = build_recipe(Validation(n_voxel=(setup.n,) * 3, size=SIZE, metal=metal), 1)
+        phantom = build_recipe(Validation(n_voxel=(setup.n, setup.n, setup.n), size=SIZE, metal=metal), 1)
         mu = {m: float(attenuation(m, KEV)[0]) for m in ("water", metal)}
         water, *rods = phantom.solids
         truth = np.empty(geometry.shape)
@@ -196,7 +200,9 @@ def exact(setup: Setup) -> list[Measurement]:
             f"{OURS}, exact rods in voxels": voxelised(phantom, geometry, tuple(rods)),
             f"{OURS}, voxels only": voxelised(phantom, geometry, ()),
         }
-        integrals = {name: _integrals(Tracer.of(p), geometry, weights) for name, p in variants.items()}
+        integrals: dict[str, NDArray] = {
+            name: _integrals(Tracer.of(p), geometry, weights) for name, p in variants.items()
+        }
         if setup.rtk:
             rtk = peer_rtk.Rtk(geometry, setup.threads)
             integrals[RTK] = rtk.project(rtk.volume(attenuation_volume(phantom, geometry, mu)))
@@ -252,7 +258,7 @@ def paper(setup: Setup) -> list[Measurement]:
 def fdk(setup: Setup) -> list[Measurement]:
     """Case 4: FDK of exact line integrals at 50 keV; RMSE against the truth where every view sees the voxel."""
     geometry = setup.scanner(setup.views(180)).geometry
-    phantom = build_recipe(Validation(n_voxel=(setup.n,) * 3, size=SIZE, metal="Al"), 1)
+    phantom = build_recipe(Validation(n_voxel=(setup.n, setup.n, setup.n), size=SIZE, metal="Al"), 1)
     mu = {m: float(attenuation(m, KEV)[0]) for m in ("water", "Al")}
     weights = np.array([mu.get(m, 0.0) for m in phantom.materials])
     p = _integrals(Tracer.of(phantom), geometry, weights).astype(np.float32)
@@ -265,7 +271,7 @@ def fdk(setup: Setup) -> list[Measurement]:
     def run_ours() -> None:
         last[OURS] = ours_fdk(torch.from_numpy(p), geometry).numpy()
 
-    contenders: dict[str, Callable[[], object]] = {OURS: run_ours}
+    contenders: Mapping[str, Callable[[], object]] = {OURS: run_ours}
     if setup.rtk:
         rtk = peer_rtk.Rtk(geometry, setup.threads)
         stack = rtk.stack(p)

@@ -34,7 +34,9 @@ def poly_scene(n: int) -> Phantom:
         upright("iron 2", "Fe", (-4.0, -13.0, 0.0), (2.0, 22.0), metal=True),
     )
     names = ("air", "water", "cortical_bone", "Fe")
-    return Phantom(labels=np.zeros((n, n, n), np.uint8), materials=names, d_voxel=(SIZE / n,) * 3, solids=solids)
+    return Phantom(
+        labels=np.zeros((n, n, n), np.uint8), materials=names, d_voxel=(SIZE / n, SIZE / n, SIZE / n), solids=solids
+    )
 
 
 def eighty_bins(rule: EnergyRule) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -42,8 +44,9 @@ def eighty_bins(rule: EnergyRule) -> tuple[NDArray[np.float64], NDArray[np.float
     bins = np.linspace(rule.energies[0], rule.energies[-1], BINS + 1)
     of = np.clip(np.searchsorted(bins, rule.energies, side="right") - 1, 0, BINS - 1)
     share = np.bincount(of, rule.w1, BINS)
-    energy = np.bincount(of, rule.w1 * rule.energies, BINS)[share > 0] / share[share > 0]
-    return energy, share[share > 0]
+    kept = share > 0
+    energy = np.bincount(of, rule.w1 * rule.energies, BINS)[kept] / share[kept]
+    return energy, np.asarray(share[kept], np.float64)
 
 
 def measured_pixel(phantom: Phantom, scanner: Scanner, views: tuple[int, ...]) -> NDArray[np.float64]:
@@ -150,7 +153,7 @@ def peak(n: int, threads: int, contender: str) -> int:
     """
     import numba
 
-    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+    numba.set_num_threads(min(threads, numba.get_num_threads()))
     run = Contenders(Setup(n=n, threads=threads)).prepare(contender)
     with host.measured() as usage:
         run()

@@ -6,7 +6,7 @@ runs. Rit et al., J. Phys. Conf. Ser. 489, 2014, doi:10.1088/1742-6596/489/1/012
 """
 
 import warnings
-from importlib import metadata, util
+from importlib import import_module, metadata, util
 from typing import Any
 
 import numpy as np
@@ -39,9 +39,8 @@ class Rtk:
         with warnings.catch_warnings():
             # SWIG's modules crash where its own deprecation warnings are errors; ITK loads them on first use
             warnings.simplefilter("ignore")
-            import itk
-            from itk import RTK
-
+            itk: Any = import_module("itk")
+            RTK = itk.RTK
             image = itk.Image[itk.F, 3]
             self._joseph = RTK.JosephForwardProjectionImageFilter[image, image]
             self._feldkamp = RTK.FDKConeBeamReconstructionFilter[image]

@@ -68,7 +68,7 @@ def _measure(given: Arguments, wanted: tuple[Case, ...]) -> "list[PeerRecord]":
 
     from benchmarks import host, peer_cases, peer_poly, peer_rtk, peer_tables
 
-    threads = min(given.threads, numba.config.NUMBA_NUM_THREADS)
+    threads = min(given.threads, numba.get_num_threads())
     numba.set_num_threads(threads)
     torch.set_num_threads(threads)
     rtk = peer_rtk.version()

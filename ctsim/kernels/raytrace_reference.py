@@ -42,6 +42,12 @@ def _ray(pose, u, v):
     return source, towards / distance, distance
 
 
+def _intervals(prim, source, direction, pairs):
+    ox, oy, oz = source
+    dx, dy, dz = direction
+    return intersect(prim, ox, oy, oz, dx, dy, dz, pairs)
+
+
 def _lengths(volume, grid, prims, ray, n_materials):
     """Path length in every material along one ray."""
     labels, density = volume
@@ -54,7 +60,7 @@ def _lengths(volume, grid, prims, ray, n_materials):
             cuts += list((planes - source[axis]) / direction[axis])
     for prim in prims:
         pairs = np.empty(4)
-        found = intersect(prim, *source, *direction, pairs)
+        found = _intervals(prim, source, direction, pairs)
         cuts += list(pairs[: 2 * found])
     cuts = np.unique(np.clip(cuts, 0.0, distance))
     lengths = np.zeros(n_materials)
@@ -76,7 +82,7 @@ def _thickness(prims, ray, edge_mu):
     total = 0.0
     for prim in prims:
         pairs = np.empty(4)
-        found = intersect(prim, *source, *direction, pairs)
+        found = _intervals(prim, source, direction, pairs)
         for t0, t1 in pairs[: 2 * found].reshape(-1, 2):
             total += max(min(t1, distance) - max(t0, 0.0), 0.0) * edge_mu[int(prim[1])]
     return total
@@ -89,7 +95,7 @@ def _n_subrays(solids, pose, u, v, edge):
     if most < 2 or len(prims) == 0:
         return 1
     centre = _ray(pose, u, v)
-    hidden = [prim[1] for prim in fat if prim[0] >= 0 and intersect(prim, *centre[0], *centre[1], np.empty(4)) > 0]
+    hidden = [prim[1] for prim in fat if prim[0] >= 0 and _intervals(prim, centre[0], centre[1], np.empty(4)) > 0]
     if hidden:
         return most * int(max(hidden))
     corners = [_ray(pose, u + du, v + dv) for du in (-0.5, 0.5) for dv in (-0.5, 0.5)]
