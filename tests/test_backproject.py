@@ -16,7 +16,7 @@ CASES = {
 }
 
 
-def run(kernel, views, case, shape=(5, 7, 11), dtype=np.float32):
+def run(kernel, views, case, shape=(5, 7, 11), dtype: type = np.float32):
     volume = np.zeros(shape, dtype)
     orbit, grid = (np.array(values, float) for values in CASES[case])
     kernel.backproject(views, ANGLES, orbit, grid, volume)
@@ -50,6 +50,13 @@ def test_thread_count_changes_no_bit():
     finally:
         numba.set_num_threads(before)
     assert all(np.array_equal(results[0], other) for other in results[1:])
+
+
+def test_one_tile_and_many_share_one_compilation():
+    # A second one costs seconds, and would be spent where a run is timed after a warm-up on a small grid.
+    for shape in ((1, 1, 1), (5, 40, 41)):
+        run(backproject_cpu, VIEWS, "centred", shape)
+    assert len(backproject_cpu._add_tiles.signatures) == 1
 
 
 def test_columns_outside_the_field_of_view_stay_untouched():

@@ -48,7 +48,8 @@ def _tiles(shape: tuple[int, ...], grid: NDArray[np.float64]) -> NDArray[np.int6
         nearest.append([float(np.min(centres[i : i + size] ** 2)) for i in range(0, n, size)])
     # A lower bound on the distance: y and x minimised apart.
     inside = np.add.outer(nearest[0], nearest[1]) <= grid[6] ** 2
-    return np.argwhere(inside) * np.array([TILE_Y, TILE_X])
+    # argwhere gives Fortran order unless there is one tile; the kernel is compiled for one layout only.
+    return np.ascontiguousarray(np.argwhere(inside) * np.array([TILE_Y, TILE_X]))
 
 
 @njit(parallel=True, cache=True)
