@@ -24,9 +24,9 @@ CHUNK_BYTES = 1 << 25
 def reconstruct(scan: Scan, *, device: str = "cpu", window: str = "ram-lak", cutoff: float = 1.0) -> Volume:
     """Reconstruct `scan` by FDK without any correction.
 
-    `window` and `cutoff` are those of `reconstruct.filters.window_gain`. Details hold the clamped pixels
-    and how redundant rays were weighted. Raises InputError for another device than the CPU, for a
-    geometry given by poses, and for an unknown window.
+    `window` and `cutoff` are those of `reconstruct.filters.window_gain`. Details hold the clamped pixels,
+    the number of views backprojected (`view_updates`) and how redundant rays were weighted. Raises
+    InputError for another device than the CPU, for a geometry given by poses, and for an unknown window.
     """
     if torch.device(device).type != "cpu":
         raise InputError(f"fdk runs on device 'cpu' only, got {device!r}")
@@ -44,6 +44,7 @@ def reconstruct(scan: Scan, *, device: str = "cpu", window: str = "ram-lak", cut
     details = {
         "window": window,
         "cutoff": cutoff,
+        "view_updates": scan.geometry.n_views,
         "clamped_pixels": clamped,
         "count_floor": count_floor(scan),
         "rays": weights.kind,

@@ -5,6 +5,7 @@ import torch
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.kernels.backproject_cpu import backproject
 from ctsim.types import Scan, Status
 from reconstruct.fdk import fdk, reconstruct
 from reconstruct.filters import WINDOWS
@@ -206,6 +207,19 @@ def test_reconstruct_equals_fdk_of_the_line_integrals():
     torch.testing.assert_close(volume.values, fdk(p, GEOMETRY, window="hann"), rtol=0, atol=1e-6)
     assert volume.details["clamped_pixels"] == 0
     assert "limitation" not in volume.details
+
+
+def test_view_updates_count_the_backprojected_views(monkeypatch):
+    calls = []
+
+    def counted(filtered, angles, orbit, grid, volume):
+        calls.append(len(angles))
+        backproject(filtered, angles, orbit, grid, volume)
+
+    monkeypatch.setattr("reconstruct.fdk.backproject", counted)
+    geometry = with_(arc_deg=220.0)
+    volume = reconstruct(make_scan(geometry, torch.full(geometry.shape, 5e3)))
+    assert len(calls) > 1 and volume.details["view_updates"] == sum(calls) == 180
 
 
 def test_a_black_scan_is_finite_and_says_so():
