@@ -69,9 +69,14 @@ def _load(source, index_v, index_u, padded):
 
 
 @njit(parallel=True, cache=True)
-def slice_sums(x, y, region, weights, index_v, index_u, c1, c2):
-    """Sum the SSIM map of x and y over `region`, for every slice along the first axis: float64 [n]."""
+def slice_sums(x, y, region, weights, borders, constants):
+    """Sum the SSIM map of x and y over `region`, for every slice along the first axis: float64 [n].
+
+    `borders` are the source indices of the padded rows and columns, `constants` are (c1, c2).
+    """
     n, height, width = x.shape
+    index_v, index_u = borders
+    c1, c2 = constants
     sums = np.zeros(n)
     for k in prange(n):
         if region[k].any():
@@ -112,10 +117,11 @@ def ssim_along_axes(
     """
     box = _crop(region) if mode == "mirror" else (slice(None),) * 3
     arrays = [np.ascontiguousarray(a[box]) for a in (values, reference, region)]
-    c1, c2 = (K1 * data_range) ** 2, (K2 * data_range) ** 2
+    constants = (K1 * data_range) ** 2, (K2 * data_range) ** 2
     sums = []
     for axis in range(3):
         x, y, inside = (np.moveaxis(a, axis, 0) for a in arrays)
         _, height, width = x.shape
-        sums.append(slice_sums(x, y, inside, window(), border(height, mode), border(width, mode), c1, c2))
+        borders = border(height, mode), border(width, mode)
+        sums.append(slice_sums(x, y, inside, window(), borders, constants))
     return sums[0], sums[1], sums[2]
