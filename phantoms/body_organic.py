@@ -10,7 +10,7 @@ from ctsim.solids import Solid
 from ctsim.types import Phantom
 from phantoms.bodies import Recipe, Shape, assemble
 from phantoms.fields import Canvas, Field, Mask, Noise
-from phantoms.inserts import count, diameter, helix, inserts
+from phantoms.inserts import count, diameter, inserts
 
 
 class Walnut(Recipe, frozen=True, kw_only=True, tag="walnut"):
@@ -127,9 +127,8 @@ def chicken(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Chicken
     canvas.tube(bone, [(0.16, 0.1, 0.45), (0.14, 0.09, 0.1), (0.08, 0.06, -0.4)], (0.032, 0.026, 0.012))
     solids: list[Solid] = []
     if count(params, 1):
-        make, d = inserts(params, canvas.unit), diameter(params, 1.4, canvas.unit)
-        path = helix((0.04, 0.0, 0.1), (0.36, 0.62), 0.38, params.turns)
-        solids.append(make.wire("wire", path, d))
+        make, d, u = inserts(params, canvas.unit), diameter(params, 1.4, canvas.unit), canvas.unit
+        solids.append(make.helix("wire", (0.04, 0.0, 0.1), (0.36 * u, 0.62 * u, d / 2, 0.76 * u), params.turns))
     return assemble(canvas.labels, d_voxel, ("air", "soft_tissue", "adipose", "cortical_bone"), solids)
 
 

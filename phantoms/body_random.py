@@ -7,7 +7,7 @@ from ctsim.solids import Solid
 from ctsim.types import Phantom
 from phantoms.bodies import Recipe, Shape, assemble
 from phantoms.fields import Canvas, Noise
-from phantoms.inserts import Inserts, count, diameter, helix, inserts
+from phantoms.inserts import Inserts, count, diameter, inserts
 
 MATERIALS = ("air", "soft_tissue", "adipose", "lung", "cortical_bone", "water")
 
@@ -71,7 +71,7 @@ def _insert(make: Inserts, rng: np.random.Generator, k: int, d: float, reach: fl
     if kind == 1:
         return make.ellipsoid(f"ellipsoid{k}", place, (0.6 * d, 0.4 * d, 0.8 * d), axis)
     if kind == 2:
-        return make.box(f"box{k}", place, (0.3 * d, 0.5 * d, 0.6 * d), axis)
+        return make.box(f"box{k}", place, (0.6 * d, 1.0 * d, 1.2 * d), axis)
     if kind == 3:
         return make.ring(f"ring{k}", place, (0.7 * d, 0.2 * d), axis)
     if kind == 4:
@@ -81,5 +81,5 @@ def _insert(make: Inserts, rng: np.random.Generator, k: int, d: float, reach: fl
     if kind == 6:
         return make.pin(f"pin{k}", place - half, axis, 0.4 * d, length)
     if kind == 7:
-        return make.wire(f"wire{k}", helix(place, (0.12, 0.12), 0.15, 3.0), 0.2 * d)
+        return make.helix(f"wire{k}", place, (0.12 * make.unit, 0.12 * make.unit, 0.1 * d, 0.3 * make.unit), 3.0)
     return make.rod(f"rod{k}", place - half, place + half, 0.7 * d, round_ends=bool(rng.integers(0, 2)))

@@ -1,5 +1,6 @@
 """Analytic solids by name: each function returns one `ctsim.solids.Solid`, in world x, y, z and mm."""
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -104,10 +105,8 @@ def torus(
     return _one(name, material, Primitive(kind=TORUS, centre=centre, params=tuple(radii), axis=axis), metal)
 
 
-def wire(
-    name: str, material: str, points: Sequence[Vector] | NDArray[np.float64], radius: float, *, metal: bool = True
-) -> Solid:
-    """Return a wire through `points` [k ≥ 2, 3]: a chain of capsules, so its ends and joints are round."""
+def wire(name: str, material: str, points: Sequence[Vector] | NDArray[np.float64], radius: float) -> Solid:
+    """Return a metal wire through `points` [k ≥ 2, 3]: a chain of capsules, so its ends and joints are round."""
     at = np.asarray(points, np.float64)
     if at.ndim != 2 or at.shape[0] < 2 or at.shape[1] != 3:
         raise InputError(f"solid {name!r}: points must be [k >= 2, 3], got shape {at.shape}")
@@ -119,34 +118,34 @@ def wire(
         Primitive(kind=CAPSULE, centre=_triple((p + q) / 2), params=(float(length) / 2, radius), axis=_triple(q - p))
         for p, q, length in zip(at[:-1], at[1:], lengths, strict=True)
     ]
-    return Solid(name=name, material=material, primitives=tuple(pieces), metal=metal)
+    return Solid(name=name, material=material, primitives=tuple(pieces), metal=True)
 
 
 def helix(
     name: str,
     material: str,
-    size: Vector,
+    size: tuple[float, float, float, float],
     turns: float,
     *,
     centre: Vector = _ORIGIN,
     axis: Vector = _UP,
     sagitta: float = 0.01,
 ) -> Solid:
-    """Return a metal coil of `size` = (coil radius, wire radius, length between the wire's ends).
+    """Return a metal coil of `size` = (coil radius at the low end, at the high end, wire radius, length).
 
     The wire is a chain of capsules whose joints lie on the helix and whose middles are at most
-    `sagitta` mm inside it. It turns counter-clockwise as it rises along `axis`.
+    `sagitta` mm inside it; `length` is between its ends. It turns counter-clockwise as it rises along `axis`.
     """
-    coil, radius, length = size
-    _positive(name, size=(coil, radius), turns=(turns,), sagitta=(sagitta,))
+    low, high, radius, length = size
+    _positive(name, size=(low, high, radius), turns=(turns,), sagitta=(sagitta,))
     if not (math.isfinite(length) and length >= 0):
         raise InputError(f"solid {name!r}: length must be finite and not negative, got {length}")
     # A chord over the angle 2h stands coil·(1 − cos h) inside the arc.
-    step = 2 * math.acos(max(1 - sagitta / coil, 0.5))
+    step = 2 * math.acos(max(1 - sagitta / max(low, high), 0.5))
     n = max(math.ceil(2 * math.pi * turns / step), 2)
     if n > 100_000:
         raise InputError(f"solid {name!r}: sagitta {sagitta} mm needs {n} pieces; at most 100000 are allowed")
-    angle = np.linspace(0, 2 * math.pi * turns, n + 1)
+    angle, coil = np.linspace(0, 2 * math.pi * turns, n + 1), np.linspace(low, high, n + 1)
     local = np.stack([coil * np.cos(angle), coil * np.sin(angle), np.linspace(-0.5, 0.5, n + 1) * length], 1)
     frame = Primitive(kind=BOX, centre=centre, params=(1.0, 1.0, 1.0), axis=axis).rotation()
     return wire(name, material, local @ frame + np.asarray(centre), radius)
@@ -158,35 +157,58 @@ def screw(
     diameters: Vector,
     lengths: Vector,
     *,
+    taper: float = 1.0,
     centre: Vector = _ORIGIN,
     axis: Vector = _UP,
-    metal: bool = True,
 ) -> Solid:
-    """Return a screw whose head begins at `centre` and whose shank runs along `axis`.
+    """Return a metal screw whose head begins at `centre` and whose shank runs along `axis`.
 
     `diameters` are (head, outer, core), `lengths` (head, shank, pitch). The V thread is a stack of
-    coaxial rings with no lead: two frusta a pitch, core to outer to core, over whole pitches from the
-    head on; the rest of the shank is a cone from the core to a point.
+    coaxial rings with no lead: two frusta a turn, core to outer to core, in the whole number of turns
+    nearest to the pitch. It narrows evenly to the share `taper` of its diameters at the tip, 0 for a point.
     """
     _positive(name, diameters=diameters, lengths=lengths)
     head, outer, core = (d / 2 for d in diameters)
-    head_length, shank, pitch = lengths
+    length, shank, pitch = lengths
     if not core < outer <= head:
         raise InputError(f"solid {name!r}: expected core < outer <= head diameter, got {tuple(diameters)}")
-    if shank < pitch:
-        raise InputError(f"solid {name!r}: the shank must hold one pitch of {pitch} mm, got {shank}")
-    turns = int(shank / pitch * (1 + 1e-12))
-    profile = [(0.0, head_length, head, head)]
-    for k in range(turns):
-        start = head_length + k * pitch
-        profile += [(start, start + pitch / 2, core, outer), (start + pitch / 2, start + pitch, outer, core)]
-    end, tip = head_length + turns * pitch, head_length + shank
-    if tip - end > 1e-9 * shank:
-        profile.append((end, tip, core, 0.0))
-    return Solid(name=name, material=material, primitives=_stack(profile, centre, axis), metal=metal)
+    if not shank >= pitch >= 1e-4 * shank:
+        raise InputError(f"solid {name!r}: the shank must hold 1 to 10000 pitches of {pitch} mm, got {shank} mm")
+    if not 0 <= taper <= 1:
+        raise InputError(f"solid {name!r}: taper must be within [0, 1], got {taper}")
+    at = np.linspace(0, 1, 2 * round(shank / pitch) + 1)
+    radii = np.where(np.arange(at.size) % 2, outer, core) * (1 - (1 - taper) * at)
+    thread = zip((length + shank * at).tolist(), radii.tolist(), strict=True)
+    pieces = _turned([(0.0, head), (length, head), *thread], centre, axis)
+    return Solid(name=name, material=material, primitives=pieces, metal=True)
 
 
 def rivet(
+    name: str,
+    material: str,
+    diameters: Vector,
+    lengths: Vector,
+    *,
+    centre: Vector = _ORIGIN,
+    axis: Vector = _UP,
+) -> Solid:
+    """Return a metal rivet, set at both ends, whose shank begins at `centre` and runs along `axis`.
+
+    `diameters` are (head, shank, tail), `lengths` (head, shank, tail). Head and tail are ellipsoids about
+    the shank's ends that stand out by their length; their inner halves surround the shank.
+    """
+    _positive(name, diameters=diameters, lengths=lengths)
+    head, r, tail = (d / 2 for d in diameters)
+    if min(head, tail) <= r:
+        raise InputError(f"solid {name!r}: head and tail must be wider than the shank, got {tuple(diameters)}")
+    shank = _turned([(0.0, r), (lengths[1], r)], centre, axis)
+    end = _along(centre, axis, lengths[1])
+    bulges = ((centre, (head, head, lengths[0])), (end, (tail, tail, lengths[2])))
+    pieces = [Primitive(kind=ELLIPSOID, centre=at, params=radii, axis=axis) for at, radii in bulges]
+    return Solid(name=name, material=material, primitives=(*pieces, *shank), metal=True)
+
+
+def pin(
     name: str,
     material: str,
     diameters: tuple[float, float],
@@ -194,54 +216,36 @@ def rivet(
     *,
     centre: Vector = _ORIGIN,
     axis: Vector = _UP,
-    metal: bool = True,
 ) -> Solid:
-    """Return a round-head rivet whose shank begins at `centre` and runs along `axis`.
+    """Return a metal pin with a ball head about `centre` and a point; its shank begins there.
 
-    `diameters` are (head, shank), `lengths` (head, shank). The head is an ellipsoid about `centre`
-    whose height above it is the head's length; its lower half surrounds the shank.
+    `diameters` are (head, shank), `lengths` (shank, point) along `axis`.
     """
     _positive(name, diameters=diameters, lengths=lengths)
-    if diameters[0] <= diameters[1]:
+    head, r = (d / 2 for d in diameters)
+    if head <= r:
         raise InputError(f"solid {name!r}: the head must be wider than the shank, got {tuple(diameters)}")
-    half, r = diameters[0] / 2, diameters[1] / 2
-    dome = Primitive(kind=ELLIPSOID, centre=centre, params=(half, half, lengths[0]), axis=axis)
-    pieces = (dome, *_stack([(0.0, lengths[1], r, r)], centre, axis))
-    return Solid(name=name, material=material, primitives=pieces, metal=metal)
+    shank = _turned([(0.0, r), (lengths[0], r), (sum(lengths), 0.0)], centre, axis)
+    ball = Primitive(kind=ELLIPSOID, centre=centre, params=(head, head, head))
+    return Solid(name=name, material=material, primitives=(ball, *shank), metal=True)
 
 
-def pin(
-    name: str,
-    material: str,
-    diameter: float,
-    lengths: tuple[float, float],
-    *,
-    centre: Vector = _ORIGIN,
-    axis: Vector = _UP,
-    metal: bool = True,
-) -> Solid:
-    """Return a pointed pin that begins at `centre`: `lengths` = (shank, point) along `axis`."""
-    _positive(name, diameter=(diameter,), lengths=lengths)
-    r, (shank, point) = diameter / 2, lengths
-    pieces = _stack([(0.0, shank, r, r), (shank, shank + point, r, 0.0)], centre, axis)
-    return Solid(name=name, material=material, primitives=pieces, metal=metal)
+def _turned(profile: Sequence[tuple[float, float]], base: Vector, axis: Vector) -> tuple[Primitive, ...]:
+    """Return frusta between neighbours of `profile`: (height along the axis from `base`, radius)."""
+    return tuple(
+        Primitive(
+            kind=FRUSTUM, centre=_along(base, axis, (low + high) / 2), params=((high - low) / 2, r0, r1), axis=axis
+        )
+        for (low, r0), (high, r1) in itertools.pairwise(profile)
+        if high > low
+    )
 
 
-def _stack(profile: Sequence[tuple[float, float, float, float]], base: Vector, axis: Vector) -> tuple[Primitive, ...]:
-    """Coaxial frusta (start, stop, radius at start, radius at stop) along the axis from `base`."""
+def _along(base: Vector, axis: Vector, height: float) -> Vector:
     norm = math.hypot(*axis)
     if not (math.isfinite(norm) and norm > 0):
         raise InputError(f"a solid's axis must be finite and not the zero vector, got {tuple(axis)}")
-    w = np.asarray(axis, np.float64) / norm
-    return tuple(
-        Primitive(
-            kind=FRUSTUM,
-            centre=_triple(np.asarray(base) + (start + stop) / 2 * w),
-            params=((stop - start) / 2, r0, r1),
-            axis=axis,
-        )
-        for start, stop, r0, r1 in profile
-    )
+    return _triple(np.asarray(base) + height / norm * np.asarray(axis))
 
 
 def _one(name: str, material: str, primitive: Primitive, metal: bool) -> Solid:

@@ -43,11 +43,15 @@ VOLUMES = [
     (shapes.cone("a", "Fe", (1.5, 0.5, 4.0), axis=TILT), math.pi / 3 * 4 * (2.25 + 0.75 + 0.25)),
     (shapes.box("a", "Fe", (1.0, 2.0, 3.0), axis=TILT, spin=0.4), 6.0),
     (shapes.torus("a", "Fe", (2.0, 0.7), axis=TILT), 2 * math.pi**2 * 2 * 0.49),
-    (shapes.pin("a", "Fe", 2.0, (2.0, 1.5), axis=TILT), math.pi * (2.0 + 0.5)),
-    # head, then per pitch two frusta between core and outer, then the point
+    # a half ball, the half that the shank enters less the shank's bore (a cap and a cylinder), shank and point
     (
-        shapes.screw("a", "Ti", (4.0, 2.0, 1.0), (0.5, 2.5, 1.0), axis=TILT),
-        math.pi * (4 * 0.5 + 2 / 3 * (1 + 0.5 + 0.25) + 0.25 * 0.5 / 3),
+        shapes.pin("a", "Fe", (2.0, 1.2), (2.0, 1.5), axis=TILT),
+        math.pi * (2 / 3 + 2 / 3 * 0.8**3 + 0.36 * (2.0 + 0.5)),
+    ),
+    # head, then per turn two frusta between core and outer
+    (
+        shapes.screw("a", "Ti", (4.0, 2.0, 1.0), (0.5, 2.0, 1.0), axis=TILT),
+        math.pi * (4 * 0.5 + 2 / 3 * (1 + 0.5 + 0.25)),
     ),
 ]
 
@@ -65,22 +69,35 @@ def test_placement():
     assert contains(rod, (1, 3.99, 3)) and not contains(rod, (1, 4.01, 3)) and not contains(rod, (1, 2, 3.51))
     cone = shapes.cone("c", "Fe", (0.0, 2.0, 4.0))
     assert contains(cone, (1.9, 0, 1.99)) and not contains(cone, (1.9, 0, -1.99))
-    pin = shapes.pin("p", "Fe", 1.0, (3.0, 1.0), centre=(0, 0, 5.0), axis=(0, 0, -1))
+    pin = shapes.pin("p", "Fe", (2.0, 1.0), (3.0, 1.0), centre=(0, 0, 5.0), axis=(0, 0, -1))
     assert contains(pin, (0.49, 0, 2.01)) and contains(pin, (0, 0, 1.01)) and not contains(pin, (0, 0, 0.99))
+    assert contains(pin, (0, 0, 5.99)) and contains(pin, (0.99, 0, 5.0)) and not contains(pin, (0.51, 0, 3.9))
 
 
 def test_rivet():
-    rivet = shapes.rivet("r", "Al", (3.0, 1.0), (0.8, 4.0), axis=(0, 0, 2.0))
-    assert along(rivet, (0, 0, -50), (0, 0, 1)) == pytest.approx(4.8, abs=1e-9)
-    assert along(rivet, (-50, 0, 0), (1, 0, 0)) == pytest.approx(3.0, abs=1e-9)
-    assert along(rivet, (-50, 0, 3), (1, 0, 0)) == pytest.approx(1.0, abs=1e-9)
+    rivet = shapes.rivet("r", "Al", (3.0, 1.0, 2.0), (0.8, 4.0, 0.6), axis=(0, 0, 2.0))
+    assert along(rivet, (0, 0, -50), (0, 0, 1)) == pytest.approx(5.4, abs=1e-9)
+    widths = [along(rivet, (-50, 0, z), (1, 0, 0)) for z in (0, 2, 4)]
+    assert widths == pytest.approx([3.0, 1.0, 2.0], abs=1e-9)
 
 
 def test_screw_has_its_thread():
-    screw = shapes.screw("s", "Ti", (4.0, 2.0, 1.0), (0.5, 3.3, 1.0))
-    widths = [along(screw, (-50, 0, z), (1, 0, 0)) for z in (0.25, 0.5 + 1e-9, 1.0, 1.25, 1.5, 2.0, 3.5 + 1e-9, 3.65)]
-    np.testing.assert_allclose(widths, [4, 1, 2, 1.5, 1, 2, 1, 0.5], atol=1e-6)
-    assert along(screw, (0, 0, -50), (0, 0, 1)) == pytest.approx(3.8, abs=1e-9)
+    screw = shapes.screw("s", "Ti", (4.0, 2.0, 1.0), (0.5, 3.2, 1.0))  # 3 turns: 3.2 mm hold 3.2 pitches
+    # just beyond each join: the face itself belongs to either piece or, by rounding, to none
+    heights = np.array([0.25, 0.5, 0.5 + 3.2 / 6, 0.5 + 3.2 / 4, 0.5 + 3.2 / 3, 0.5 + 3.2 / 2, 3.7 - 2e-9]) + 1e-9
+    widths = [along(screw, (-50, 0, z), (1, 0, 0)) for z in heights]
+    np.testing.assert_allclose(widths, [4, 1, 2, 1.5, 1, 2, 1], atol=1e-6)
+    assert along(screw, (0, 0, -50), (0, 0, 1)) == pytest.approx(3.7, abs=1e-9)
+
+
+@pytest.mark.parametrize("taper", [0.5, 0.0])
+def test_screw_narrows_to_its_tip(taper):
+    screw = shapes.screw("s", "Ti", (4.0, 2.0, 1.0), (0.5, 3.0, 1.0), taper=taper)
+    # crests at 1/6, 1/2 and 5/6 of the shank, where the diameter has fallen by that part of 1 - taper
+    parts = (1 / 6, 1 / 2, 5 / 6)
+    crests = [along(screw, (-50, 0, 0.5 + 3 * part + 1e-9), (1, 0, 0)) for part in parts]
+    assert crests == pytest.approx([2 * (1 - (1 - taper) * part) for part in parts], abs=1e-8)
+    assert along(screw, (-50, 0, 3.5 - 1e-9), (1, 0, 0)) == pytest.approx(taper * 1.0, abs=1e-6)
 
 
 def test_wire_joins_its_points():
@@ -94,7 +111,7 @@ def test_wire_joins_its_points():
 @pytest.mark.parametrize("sagitta", [0.1, 0.01])
 def test_helix_stays_within_its_sagitta(sagitta):
     centre, (coil, radius, length), turns = np.array([1.0, -2.0, 3.0]), (5.0, 0.4, 8.0), 2.5
-    helix = shapes.helix("h", "Fe", (coil, radius, length), turns, centre=tuple(centre), sagitta=sagitta)
+    helix = shapes.helix("h", "Fe", (coil, coil, radius, length), turns, centre=tuple(centre), sagitta=sagitta)
     middles = np.array([p.centre for p in helix.primitives]) - centre
     inward = coil - np.hypot(middles[:, 0], middles[:, 1])
     assert 0 < inward.max() <= sagitta * (1 + 1e-9)
@@ -103,6 +120,15 @@ def test_helix_stays_within_its_sagitta(sagitta):
     turned = np.cos(angles) * middles[:, 0] + np.sin(angles) * middles[:, 1]
     np.testing.assert_allclose(turned, coil, atol=sagitta * 1.001)
     assert abs(middles[:, 2]).max() < length / 2
+
+
+def test_helix_widens_from_end_to_end():
+    helix = shapes.helix("h", "Fe", (2.0, 5.0, 0.4, 8.0), 2.0)
+    first, *_, last = (np.array(p.centre) for p in helix.primitives)
+    # the first and last middles lie half a piece from the ends: 3 mm over 2n pieces, and the sagitta inside
+    slack = 3 / (2 * len(helix.primitives)) + 0.01
+    assert math.hypot(*first[:2]) == pytest.approx(2.0, abs=slack) and first[2] < 0
+    assert math.hypot(*last[:2]) == pytest.approx(5.0, abs=slack) and last[2] > 0
 
 
 @pytest.mark.parametrize(
@@ -122,14 +148,19 @@ def test_helix_stays_within_its_sagitta(sagitta):
         lambda: shapes.wire("a", "Fe", [(0, 0, 0)], 1.0),
         lambda: shapes.wire("a", "Fe", [(0, 0, 0), (0, 0, 0)], 1.0),
         lambda: shapes.wire("a", "Fe", [(0, 0, 0), (0, 0, math.nan)], 1.0),
-        lambda: shapes.helix("a", "Fe", (5.0, 0.4, 8.0), 2.0, sagitta=0.0),
-        lambda: shapes.helix("a", "Fe", (5.0, 0.4, 8.0), 1e9),
-        lambda: shapes.helix("a", "Fe", (5.0, 0.4, -8.0), 2.0),
+        lambda: shapes.helix("a", "Fe", (5.0, 5.0, 0.4, 8.0), 2.0, sagitta=0.0),
+        lambda: shapes.helix("a", "Fe", (5.0, 5.0, 0.4, 8.0), 1e9),
+        lambda: shapes.helix("a", "Fe", (5.0, 5.0, 0.4, -8.0), 2.0),
         lambda: shapes.screw("a", "Fe", (4.0, 1.0, 2.0), (1.0, 5.0, 1.0)),
         lambda: shapes.screw("a", "Fe", (4.0, 2.0, 1.0), (1.0, 0.5, 1.0)),
         lambda: shapes.screw("a", "Fe", (4.0, 2.0, 1.0), (1.0, 5.0, 1.0), axis=(0, 0, 0)),
-        lambda: shapes.rivet("a", "Fe", (1.0, 1.0), (1.0, 1.0)),
-        lambda: shapes.pin("a", "Fe", 1.0, (1.0, 0.0)),
+        lambda: shapes.screw("a", "Fe", (4.0, 2.0, 1.0), (1.0, 5.0, 1e-4)),
+        lambda: shapes.screw("a", "Fe", (4.0, 2.0, 1.0), (1.0, 5.0, 1.0), taper=1.1),
+        lambda: shapes.helix("a", "Fe", (0.0, 5.0, 0.4, 8.0), 2.0),
+        lambda: shapes.rivet("a", "Fe", (1.0, 1.0, 2.0), (1.0, 1.0, 1.0)),
+        lambda: shapes.rivet("a", "Fe", (2.0, 1.0, 1.0), (1.0, 1.0, 1.0)),
+        lambda: shapes.pin("a", "Fe", (2.0, 1.0), (1.0, 0.0)),
+        lambda: shapes.pin("a", "Fe", (1.0, 1.0), (1.0, 1.0)),
     ],
 )
 def test_unusable_sizes_are_refused(make):
