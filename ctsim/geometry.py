@@ -99,7 +99,15 @@ class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         """
         if self.poses is not None:
             return np.asarray(self.poses, np.float64)
-        a = self.angles
+        return self._circle(self.angles)
+
+    def pose(self, view: int) -> NDArray[np.float64]:
+        """Return one view's row of `pose_array`, [12]."""
+        if self.poses is not None:
+            return np.asarray(self.poses[view], np.float64)
+        return self._circle(self.angles[view : view + 1])[0]
+
+    def _circle(self, a: NDArray[np.float64]) -> NDArray[np.float64]:
         cos, sin, zero = np.cos(a), np.sin(a), np.zeros_like(a)
         e_r = np.stack([cos, sin, zero], 1)
         e_u = np.stack([-sin, cos, zero], 1)

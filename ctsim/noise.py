@@ -98,14 +98,17 @@ def detect(
     key: np.uint64,
     pattern: NDArray[np.float32] | None = None,
     out: NDArray[Any] | None = None,
+    spans: NDArray[np.int64] | None = None,
 ) -> NDArray[Any]:
     """Draw what the detector writes in one view, [v, u] of type `noise.dtype`, into `out` if given.
 
     `m1` is the mean signal relative to the open field, scatter included, and `m2` the second moment Σ w2·e^(−τ):
     without electronics the relative signal has variance m2/i0. One draw has that mean, that variance and nearly
     the compound Poisson's skewness: g·Poisson(i0·m1²/m2), g = m2/(m1·i0). `key` names the view's stream
-    (`rng.stream_key`); `pattern` comes from `pixel_pattern`. Model "none" draws nothing. Model "tigre" takes p
-    relative to the view's largest p before the draw (TIGRE: the largest of the whole scan), ignoring m2 and pattern.
+    (`rng.stream_key`); `pattern` comes from `pixel_pattern`. With `spans` [v, 2] only columns from…to of each row are
+    drawn and the rest of `out` stands, but models "tigre" and "none" always fill all. Model "none" draws nothing.
+    Model "tigre" takes p relative to the view's largest p before the draw (TIGRE: the largest of the whole scan),
+    ignoring m2 and pattern.
 
     Raises InputError on moments that are negative, not finite, or m2 = 0 where m1 > 0.
     """
@@ -125,7 +128,9 @@ def detect(
         bad = np.zeros(m1.shape[0], np.uint8)
         gains = _NO_PATTERN if pattern is None else pattern.astype(np.float32, copy=False)
         scale = (float(i0), noise.electronic, noise.gain(i0), noise.dark, float(noise.full_scale))
-        noise_cpu.detect(m1, m2, gains, *scale, np.uint64(key), out, bad)
+        if spans is None:
+            spans = np.tile(np.array([0, m1.shape[1]]), (m1.shape[0], 1))
+        noise_cpu.detect(m1, m2, gains, spans, *scale, np.uint64(key), out, bad)
         if bad.any():
             raise InputError(f"detector row {int(bad.argmax())}: m1 and m2 must be finite and m2 > 0 where m1 > 0")
         return out

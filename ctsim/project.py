@@ -1,19 +1,21 @@
 """Rays through a phantom: what every pixel of a view crosses, and what it measures.
 
-A `Tracer` holds a phantom in the form the kernels want. Only pixels inside the shadow of the object
-are traced, primitives are tested only where their shadow lies, and sub-rays are cast only where the
-solids' optical thickness changes within a pixel.
+A `Tracer` holds a phantom in the form the kernels want. What the central rays cross in the label volume
+comes from its columns where the detector stands upright, else from its bricks; the solids are put on top.
+Only pixels inside the shadow of the object are measured, primitives are tested only where their shadow
+lies, and sub-rays are cast only where the solids' optical thickness changes within a pixel.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.bricks import Bricks, make_bricks
+from ctsim.columns import Columns, make_columns
 from ctsim.geometry import Geometry
-from ctsim.kernels import raytrace_cpu
+from ctsim.kernels import bricks_cpu, columns_cpu, raytrace_cpu
 from ctsim.materials import attenuation
 from ctsim.quadrature import EnergyRule
 from ctsim.solids import BOUND, BOX, CAPSULE, ELLIPSOID, FRUSTUM, KIND, MATERIAL, PARAMS, TORUS, pack
@@ -30,6 +32,7 @@ class Tracer:
     """A phantom ready to be traced. `materials[0]` is air and has no length."""
 
     bricks: Bricks
+    columns: Columns | None
     prims: NDArray[np.float64]
     materials: tuple[str, ...]
     metal: NDArray[np.bool_]
@@ -38,29 +41,41 @@ class Tracer:
     @staticmethod
     def of(phantom: Phantom, *, skip: bool = True, extra: str | None = None) -> "Tracer":
         """Prepare a phantom; with `extra`, that material is appended for a layer that every ray crosses."""
-        prims = pack(phantom.solids, phantom.materials)
-        metal = pack([s for s in phantom.solids if s.metal], phantom.materials)
-        is_metal = np.array([any(np.array_equal(p, q) for q in metal) for p in prims], bool)
-        materials = phantom.materials + ((extra,) if extra else ())
-        return Tracer(bricks=make_bricks(phantom), prims=prims, materials=materials, metal=is_metal, skip=skip)
+        return Tracer(
+            bricks=make_bricks(phantom),
+            columns=make_columns(phantom),
+            prims=pack(phantom.solids, phantom.materials),
+            materials=phantom.materials + ((extra,) if extra else ()),
+            metal=np.concatenate(
+                [np.full(len(pack([s], phantom.materials)), s.metal) for s in phantom.solids] or [np.zeros(0, bool)]
+            ),
+            skip=skip,
+        )
 
     def without_metal(self) -> "Tracer":
         """Return the same tracer with the metal primitives taken out."""
-        kept = ~self.metal
-        return Tracer(
-            bricks=self.bricks,
-            prims=self.prims[kept],
-            materials=self.materials,
-            metal=self.metal[kept],
-            skip=self.skip,
-        )
+        return replace(self, prims=self.prims[~self.metal], metal=self.metal[~self.metal])
+
+    def background(self, geometry: Geometry, view: int, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+        """Path length (mm) of one view's central rays in the label volume alone, solids left out: [material, v, u].
+
+        It is written to `out` if given. Material 0 is air and is left as it is, 0 in a new array.
+        """
+        shape, pose = geometry.n_detector, geometry.pose(view)
+        if out is None:
+            out = np.zeros((len(self.materials), *shape), np.float32)
+        if self.columns is not None and _upright(pose):
+            order = work_order(-(-shape[1] // columns_cpu.LANES))
+            columns_cpu.fill_view(tuple(self.columns), self.bricks.grid, pose, order, out)
+        else:
+            spans = self.spans(pose, shape)
+            bricks_cpu.fill_view(self.bricks[:5], pose, work_order(shape[0]), spans, out)
+        return out
 
     def shadows(self, pose: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
         """Rectangle (v from, v to, u from, u to) that holds each primitive's shadow: [primitive, 4]."""
-        lows, highs = self.prims[:, BOUND][:, :3], self.prims[:, BOUND][:, 3:]
-        return np.array([_rectangle(pose, shape, c - r, c + r) for c, r in zip(lows, highs, strict=True)]).reshape(
-            -1, 4
-        )
+        centres, radii = self.prims[:, BOUND][:, :3], self.prims[:, BOUND][:, 3:]
+        return _rectangles(pose, shape, centres - radii, centres + radii)
 
     def spans(self, pose: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.int64]:
         """Columns (from, to) of each row that the object can darken: [v, 2]."""
@@ -68,7 +83,8 @@ class Tracer:
             return np.tile(np.array([0, shape[1]]), (shape[0], 1))
         rects = self.shadows(pose, shape)
         if self.bricks.box[0] <= self.bricks.box[3]:
-            rects = np.vstack([rects, _rectangle(pose, shape, self.bricks.box[:3], self.bricks.box[3:])])
+            low, high = self.bricks.box[None, :3], self.bricks.box[None, 3:]
+            rects = np.vstack([rects, _rectangles(pose, shape, low, high)])
         return row_spans(rects, shape)
 
 
@@ -84,19 +100,34 @@ def row_spans(rects: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.
     return spans
 
 
-def _rectangle(pose: NDArray, shape: tuple[int, int], low: NDArray, high: NDArray) -> tuple[float, float, float, float]:
-    """Shadow of the axis-parallel box low…high in pixels, one pixel of margin; all pixels if behind the source."""
-    corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, -1).T
+def _rectangles(
+    pose: NDArray[np.float64], shape: tuple[int, int], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Shadows of the axis-parallel boxes low…high [box, 3] in pixels, [box, 4]; all pixels if behind the source.
+
+    There is one pixel of margin.
+    """
+    corners = np.where(_CORNERS, high[:, None], low[:, None])  # [box, 8, 3]
     source, centre, e_u, e_v = pose.reshape(4, 3)
     normal = np.cross(e_u, e_v)
-    reach = (corners - source) @ normal
-    distance = (centre - source) @ normal
-    if np.min(reach / distance) <= 1e-9:
-        return 0.0, shape[0] - 1.0, 0.0, shape[1] - 1.0
-    hit = source + (corners - source) * (distance / reach)[:, None] - centre
+    reach = (corners - source) @ normal / ((centre - source) @ normal)
+    behind = reach.min(1) <= 1e-9
+    hit = source + (corners - source) / np.where(behind[:, None], 1.0, reach)[..., None] - centre
     u = hit @ e_u / (e_u @ e_u) + (shape[1] - 1) / 2
     v = hit @ e_v / (e_v @ e_v) + (shape[0] - 1) / 2
-    return np.floor(v.min()) - 1, np.ceil(v.max()) + 1, np.floor(u.min()) - 1, np.ceil(u.max()) + 1
+    tight = np.floor(v.min(1)) - 1, np.ceil(v.max(1)) + 1, np.floor(u.min(1)) - 1, np.ceil(u.max(1)) + 1
+    everything = np.array([0.0, shape[0] - 1.0, 0.0, shape[1] - 1.0])
+    return np.where(behind[:, None], everything, np.stack(tight, 1))
+
+
+_CORNERS = np.array([[(k >> axis) & 1 for axis in range(3)] for k in range(8)], bool)
+
+
+def _upright(pose: NDArray[np.float64]) -> bool:
+    """Whether the detector's columns stand along +z and its rows are horizontal."""
+    e_u, e_v = pose[6:9], pose[9:]
+    slant = max(abs(e_v[0]), abs(e_v[1])) / np.linalg.norm(e_v), abs(e_u[2]) / np.linalg.norm(e_u)
+    return bool(e_v[2] > 0 and max(slant) < 1e-14)
 
 
 def _inflate(prims: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -160,16 +191,18 @@ def transmit(
     *,
     subrays: int = 34,
     extra: NDArray[np.float32] | None = None,
+    background: NDArray[np.float32] | None = None,
     out: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Measure one view without noise: signal and second moment relative to the open field, each [v, u].
 
     The signal is Σ w1·exp(−Σ μ·L) averaged over the pixel; the variance of one photon-noise draw is the
-    second moment over the photons of an open pixel. `extra` [v, u] is a length (mm) in the last
-    material. `out` = (signal, second moment, spans) updates only those columns of given images.
+    second moment over the photons of an open pixel. The label volume is sampled along the central ray, solids
+    and what they replace along every sub-ray. `extra` [v, u] is a length (mm) in the last material;
+    `background` what `Tracer.background` returned for this view, if known. `out` = (signal, second moment,
+    spans) updates only those columns of given images.
     """
-    shape = geometry.n_detector
-    pose = geometry.pose_array()[view]
+    shape, pose = geometry.n_detector, geometry.pose(view)
     if out is None:
         # summed in the kernel's order, so that a skipped ray equals a traced one to the last bit
         m1, m2 = (np.full(shape, np.cumsum(w, dtype=np.float32)[-1]) for w in (response.w1, response.w2))
@@ -178,11 +211,12 @@ def transmit(
         m1, m2, spans = out
     most = subrays if len(tracer.prims) else 1
     raytrace_cpu.transmit_view(
-        tracer.bricks,
+        tracer.bricks[:5],
         _solids(tracer, pose, shape),
         pose,
-        work_order(shape[0]),
+        work_order(-(-shape[0] // raytrace_cpu.STRIP)),
         spans,
+        tracer.background(geometry, view) if background is None else background,
         np.zeros((0, 0), np.float32) if extra is None else extra,
         (response.mu, response.w1, response.w2),
         (response.edge_mu, EDGE_THRESHOLD, most),
@@ -192,13 +226,21 @@ def transmit(
     return m1, m2
 
 
-def path_lengths(tracer: Tracer, geometry: Geometry, view: int) -> NDArray[np.float32]:
-    """Path length (mm) in every material along the central rays of one view: [material, v, u]."""
-    shape = geometry.n_detector
-    pose = geometry.pose_array()[view]
-    lengths = np.zeros((len(tracer.materials), *shape), np.float32)
+def path_lengths(
+    tracer: Tracer, geometry: Geometry, view: int, background: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
+    """Path length (mm) in every material along the central rays of one view: [material, v, u].
+
+    `background` is what `Tracer.background` returned for this view, if known.
+    """
+    if background is None:
+        background = tracer.background(geometry, view)
+    if len(tracer.prims) == 0:
+        return background.copy()
+    shape, pose = geometry.n_detector, geometry.pose(view)
+    lengths = np.zeros_like(background)
     solids = _solids(tracer, pose, shape)
-    raytrace_cpu.trace_view(tracer.bricks, solids, pose, work_order(shape[0]), tracer.spans(pose, shape), lengths)
+    raytrace_cpu.replace_view(tracer.bricks[:5], solids, pose, work_order(shape[0]), background, lengths)
     return lengths
 
 

@@ -89,39 +89,58 @@ class _Simulator:
         self.pattern = pixel_pattern(self.geometry.n_detector, noise=scanner.noise, scene_id=plan.stream_id)
         self.metal = np.array([any(s.metal and s.material == m for s in body.solids) for m in self.tracer.materials])
         self.names = {o.name for o in plan.outputs}
+        self.lengths = np.zeros((len(self.tracer.materials), *self.geometry.n_detector), np.float32)
 
     def view(self, k: int) -> dict[str, NDArray]:
         """Everything the plan wants of view k."""
-        subrays = self.plan.settings.subrays
-        m1, m2 = transmit(self.tracer, self.geometry, k, self.response, subrays=subrays, extra=self.beam.layer)
-        out = self._measured(m1, m2, k, "")
+        self.tracer.background(self.geometry, k, self.lengths)  # serves the scan, its twin and the path lengths
+        m1, m2 = self._transmit(self.tracer, k)
+        out = self._measured(m1, m2, k)
         if "metal_free/counts" in self.names:
-            pose, shape = self.geometry.pose_array()[k], self.geometry.n_detector
+            shape = self.geometry.n_detector
             # only pixels in the metal's shadow can differ
-            spans = row_spans(self.tracer.shadows(pose, shape)[self.tracer.metal], shape)
+            spans = row_spans(self.tracer.shadows(self.geometry.pose(k), shape)[self.tracer.metal], shape)
             if not self.plan.settings.skip:
                 spans = np.tile(np.array([0, shape[1]]), (shape[0], 1))
-            twin = (m1.copy(), m2.copy(), spans)
-            transmit(self.bare, self.geometry, k, self.response, subrays=subrays, extra=self.beam.layer, out=twin)
-            out |= self._measured(twin[0], twin[1], k, "metal_free/")
+            twin = self._transmit(self.bare, k, (m1.copy(), m2.copy(), spans))
+            drawn = self._measured(*twin, k, (out["counts"].copy(), spans))
+            out |= {f"metal_free/{name}": image for name, image in drawn.items()}
         return out | self._paths(k)
 
-    def _measured(self, m1: Image, m2: Image, k: int, prefix: str) -> dict[str, NDArray]:
-        """Add scatter, then draw the counts; with the noise-free images that were asked for."""
+    def _transmit(self, tracer: Tracer, k: int, out: tuple[Image, Image, NDArray] | None = None) -> tuple[Image, Image]:
+        return transmit(
+            tracer,
+            self.geometry,
+            k,
+            self.response,
+            subrays=self.plan.settings.subrays,
+            extra=self.beam.layer,
+            background=self.lengths,
+            out=out,
+        )
+
+    def _measured(
+        self, m1: Image, m2: Image, k: int, known: tuple[NDArray, NDArray[np.int64]] | None = None
+    ) -> dict[str, NDArray]:
+        """Add scatter, then draw the counts; with the noise-free images that were asked for.
+
+        `known` = (counts, spans) are counts to be drawn again in those columns only.
+        """
         out: dict[str, NDArray] = {}
-        if prefix + "scatter_free" in self.names:
-            out[prefix + "scatter_free"] = -np.log(m1 / self.beam.open1)
+        if "scatter_free" in self.names:
+            out["scatter_free"] = -np.log(m1 / self.beam.open1)
         s = self.plan.scatter_fraction
         if s:
             # scattered photons carry the open field's spectrum
             m1, m2 = m1 + np.float32(s), m2 + np.float32(s * self.plan.rule.w2.sum())
-        if prefix + "noise_free" in self.names:
-            out[prefix + "noise_free"] = -np.log(m1 / self.beam.open1)
+        if "noise_free" in self.names:
+            out["noise_free"] = -np.log(m1 / self.beam.open1)
         if self.beam.gain is not None:
             m1, m2 = m1 * self.beam.gain, m2 * self.beam.gain
         key = stream_key(self.plan.stream_id, "view", k)
         noise, i0 = self.scanner.noise, self.scanner.i0
-        out[prefix + "counts"] = detect(m1, m2, noise=noise, i0=i0, key=key, pattern=self.pattern)
+        counts, spans = known or (None, None)
+        out["counts"] = detect(m1, m2, noise=noise, i0=i0, key=key, pattern=self.pattern, out=counts, spans=spans)
         return out
 
     def _paths(self, k: int) -> dict[str, NDArray]:
@@ -130,11 +149,13 @@ class _Simulator:
         energies = self.plan.truth.mono_kev
         if not wanted and not energies:
             return {}
-        lengths = path_lengths(self.tracer, self.geometry, k)[: len(self.plan.materials)]
+        lengths = path_lengths(self.tracer, self.geometry, k, self.lengths)[: len(self.plan.materials)]
         metal = lengths[self.metal[: len(lengths)]].sum(0)
         all_paths = {"trace": (metal > 0).astype(np.uint8), "metal_path": metal, "paths": lengths[1:]}
         out: dict[str, NDArray] = {name: all_paths[name] for name in wanted}
-        twin = path_lengths(self.bare, self.geometry, k) if "metal_free/counts" in self.names and energies else None
+        twin = None
+        if "metal_free/counts" in self.names and energies:
+            twin = path_lengths(self.bare, self.geometry, k, self.lengths)
         for energy in energies:
             mu = np.array([0.0, *(attenuation(m, np.array([energy]))[0] for m in self.plan.materials[1:])])
             out[f"mono_{energy:g}kev"] = np.tensordot(mu, lengths, 1).astype(np.float32)

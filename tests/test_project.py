@@ -1,7 +1,9 @@
 """The ray tracer against its float64 twin, closed forms, and itself with every skip turned off."""
 
+import dataclasses
 import math
 
+import msgspec
 import numba
 import numpy as np
 import pytest
@@ -51,10 +53,7 @@ INSERTS = (
 
 def reference_lengths(tracer, geometry, view):
     lengths = np.zeros((len(tracer.materials), *geometry.n_detector))
-    shape, pose = geometry.n_detector, geometry.pose_array()[view]
-    everywhere = np.tile(np.array([0, shape[1]]), (shape[0], 1))
-    solids = project._solids(tracer, pose, shape)
-    raytrace_reference.trace_view(tracer.bricks, solids, pose, work_order(shape[0]), everywhere, lengths)
+    raytrace_reference.trace_view(tracer.bricks, tracer.prims, geometry.pose_array()[view], lengths)
     return lengths
 
 
@@ -69,6 +68,42 @@ def test_path_lengths_equal_the_reference(solids, dense):
         got, want = path_lengths(tracer, g, view), reference_lengths(tracer, g, view)
         np.testing.assert_allclose(got, want, atol=4e-6)
         assert want[1].max() > 1
+
+
+def tilted(g, degrees):
+    """Return the geometry with every detector turned in its plane, which no longer stands upright."""
+    cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    poses = g.pose_array().reshape(-1, 4, 3)
+    e_u, e_v = poses[:, 2].copy(), poses[:, 3].copy()
+    poses[:, 2], poses[:, 3] = cos * e_u + sin * e_v, cos * e_v - sin * e_u
+    rows = tuple(tuple(float(x) for x in row) for row in poses.reshape(-1, 12))
+    return msgspec.structs.replace(g, poses=rows)
+
+
+def test_a_tilted_detector_is_traced_through_bricks_to_the_same_accuracy():
+    tracer, g = Tracer.of(blobs(solids=INSERTS)), tilted(geometry(off_detector=(1.3, -2.0), start_deg=11.0), 7.0)
+    for view in range(g.n_views):
+        got, want = path_lengths(tracer, g, view), reference_lengths(tracer, g, view)
+        np.testing.assert_allclose(got, want, atol=4e-6)
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_columns_and_bricks_cross_the_same_lengths(inside):
+    rng = np.random.default_rng(5)
+    labels = rng.integers(0, 3, (37, 29, 33)).astype(np.uint8)
+    tracer = Tracer.of(
+        Phantom(labels=labels, materials=MATERIALS, d_voxel=(1.1, 0.9, 1.3), off_origin=(3.0, 0.0, -1.0))
+    )
+    assert tracer.columns is not None
+    g = geometry(n_detector=(45, 51), pixel=2.1, start_deg=1.0, off_detector=(7.0, 3.0))
+    if inside:  # a source in the volume, a detector that cuts it, the steepest cone
+        g = msgspec.structs.replace(g, dso=9.0, dsd=21.0)
+    through_bricks = dataclasses.replace(tracer, columns=None)
+    for view in range(g.n_views):
+        got, want = tracer.background(g, view), through_bricks.background(g, view)
+        # float32 output of lengths up to 50 mm
+        np.testing.assert_allclose(got, want, atol=8e-6)
+        assert np.array_equal(got == 0, want == 0) and want[1].max() > 10
 
 
 def test_a_large_uniform_region_is_crossed_exactly():
@@ -134,15 +169,15 @@ def test_intensities_equal_the_reference():
     for view in range(2):
         pose = g.pose_array()[view]
         arguments = (
-            tracer.bricks, project._solids(tracer, pose, shape), pose, work_order(shape[0]), everywhere, extra,
-            (r.mu, r.w1, r.w2), (r.edge_mu, project.EDGE_THRESHOLD, 21),
+            tracer.bricks[:5], project._solids(tracer, pose, shape), pose, work_order(1), everywhere,
+            tracer.background(g, view), extra, (r.mu, r.w1, r.w2), (r.edge_mu, project.EDGE_THRESHOLD, 21),
         )  # fmt: skip
         got, want = np.zeros((2, *shape), np.float32), np.zeros((2, *shape))
         raytrace_cpu.transmit_view(*arguments, got[0], got[1])
         raytrace_reference.transmit_view(*arguments, want[0], want[1])
         # float32 optical thickness up to 40 has an error of 4e-6 absolute, the exponential 4e-7 relative
         np.testing.assert_allclose(got, want, rtol=1e-5)
-        assert want[0].min() < 0.05 < 0.5 < want[0].max()
+        assert want[0].min() < 0.1 < 0.5 < want[0].max()
 
 
 def test_the_exponential_is_accurate_to_its_bound():

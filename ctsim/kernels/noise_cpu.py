@@ -169,8 +169,8 @@ def _row_words(key, first, words):
 
 
 @njit(parallel=True, cache=True)
-def detect(m1, m2, pattern, i0, electronic, gain, dark, full, key, out, bad):
-    """Draw the counts of one view.
+def detect(m1, m2, pattern, spans, i0, electronic, gain, dark, full, key, out, bad):
+    """Draw the counts of one view in columns spans[v] = (from, to) of its rows.
 
     `m1`, `m2` [v, u] are mean and second moment relative to the open field; `pattern` float32 [v, u] multiplies the
     photons' signal (size 0: one everywhere; a pixel of 0 is dead and reads `dark`). out = dark + gain·signal,
@@ -180,11 +180,12 @@ def detect(m1, m2, pattern, i0, electronic, gain, dark, full, key, out, bad):
     key = np.uint64(key)
     electronic = electronic / i0
     for v in prange(n_v):
-        words = np.empty((2, n_u), np.uint64)
+        begin, end = spans[v, 0], spans[v, 1]
+        words = np.empty((2, end - begin), np.uint64)
         first = np.uint64(v) * np.uint64(n_u)
-        _row_words(key, first, words)
+        _row_words(key, first + np.uint64(begin), words)
         wrong = False
-        for u in range(n_u):
+        for u in range(begin, end):
             mean = float(m1[v, u])
             second = float(m2[v, u])
             signal = 0.0
@@ -192,7 +193,7 @@ def detect(m1, m2, pattern, i0, electronic, gain, dark, full, key, out, bad):
             if mean > 0.0 and second > 0.0:
                 photons = i0 * mean * (mean / second)
             if 0.0 < photons <= _MOST:
-                hi, lo = words[0, u], words[1, u]
+                hi, lo = words[0, u - begin], words[1, u - begin]
                 k = _poisson(photons, hi >> _32, hi & _LOW, lo >> _32, first + np.uint64(u), key)
                 signal = k * (second / (mean * i0))
             elif not (mean == 0.0 and 0.0 <= second < np.inf):
@@ -201,7 +202,7 @@ def detect(m1, m2, pattern, i0, electronic, gain, dark, full, key, out, bad):
             factor = 1.0 if pattern.size == 0 else float(pattern[v, u])
             if factor > 0.0:
                 if electronic > 0.0:
-                    value += gain * (signal * factor + electronic * normal(words[1, u] & _LOW))
+                    value += gain * (signal * factor + electronic * normal(words[1, u - begin] & _LOW))
                 else:
                     value += gain * signal * factor
             if full > 0.0:

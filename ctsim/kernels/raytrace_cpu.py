@@ -1,134 +1,24 @@
-"""One traversal of the label volume gives every material's path length; intensities are fused per row.
+"""Solids and energies on top of the label volume's path lengths, fused per detector row.
 
-Rays run from the source to the pixel. Solids are intersected exactly and replace the background along
-their intervals; between them the ray walks the bricks of the label volume (see `ctsim.bricks`). Pixels
-that the edge of a solid crosses are measured by several rays and averaged in *intensity*, as a detector
-does. Rows are independent, so results are bitwise equal for any number of threads. What runs once a ray is
-inlined: a call would count references of its arrays atomically, which costs more than the ray.
+What a pixel's central ray crosses in the label volume is given (`columns_cpu`, `bricks_cpu`). Solids are
+intersected exactly and replace the volume along their intervals. Pixels that the edge of a solid crosses are
+measured by several rays and averaged in *intensity*, as a detector does; what differs between those rays is
+the solids and what they replace. Rows are done in strips, so that neighbours share their pixels' corners; a
+strip depends on no other, so results are bitwise equal for any number of threads. What runs once a ray is inlined:
+a call would count references of its arrays atomically, which costs more than the ray.
 """
-
-import math
 
 import numpy as np
 from numba import njit, prange
 
-from ctsim.bricks import MIXED, SIDE
+from ctsim.kernels.bricks_cpu import aim, walk
 from ctsim.kernels.exp_cpu import exp_minus
 from ctsim.kernels.solids_cpu import intersect
 
-CODE_BITS = np.uint16(255)
-CELLS = SIDE**3
-SHIFT = SIDE.bit_length() - 1
-FIXED = 2.0**40  # ray parameter as an integer in 2⁻⁴⁰ mm inside a mixed brick
-FARTHEST = 1e6  # mm; no ray is longer, and crossings of a parallel plane lie beyond
-TINY = 1e-12  # a direction cosine below this counts as parallel to the axis
+STRIP = 8  # rows done one after the other: they compute 9 rows of pixel corners instead of 16
 GOLDEN = 0.6180339887498949
 MOST_TIMES = 16  # a primitive thinner than a pixel gets at most this many times the usual sub-rays
 FAST = {"contract", "reassoc", "nsz", "arcp"}
-
-
-@njit(inline="always", error_model="numpy")
-def _walk(code, slot, pool, density, grid, ray, t_from, t_to, lengths):
-    """Add the background's path lengths between t_from and t_to (mm along the ray) to `lengths`."""
-    # positions in voxels; the ray parameter stays in mm
-    ox, oy, oz = (ray[0] - grid[6]) * grid[3], (ray[1] - grid[7]) * grid[4], (ray[2] - grid[8]) * grid[5]
-    dx, dy, dz = ray[3] * grid[3], ray[4] * grid[4], ray[5] * grid[5]
-    dx = TINY if abs(dx) < TINY else dx
-    dy = TINY if abs(dy) < TINY else dy
-    dz = TINY if abs(dz) < TINY else dz
-    ix, iy, iz = 1.0 / dx, 1.0 / dy, 1.0 / dz
-    ux, uy, uz = 1 if dx > 0 else 0, 1 if dy > 0 else 0, 1 if dz > 0 else 0
-    x0, x1, y0, y1, z0, z1 = -ox * ix, (grid[0] - ox) * ix, -oy * iy, (grid[1] - oy) * iy, -oz * iz, (grid[2] - oz) * iz
-    t = max(max(t_from, x0 if ux else x1), max(y0 if uy else y1, z0 if uz else z1))
-    end = min(min(t_to, x1 if ux else x0), min(y1 if uy else y0, z1 if uz else z0))
-    if not t < end:
-        return
-    octant = ux + 2 * uy + 4 * uz
-    _, mz, my, mx = code.shape
-    sx, sy, sz = 2 * ux - 1, 2 * uy - 1, 2 * uz - 1
-    step_x = np.int64(min(abs(ix), FARTHEST) * FIXED)
-    step_y = np.int64(min(abs(iy), FARTHEST) * FIXED)
-    step_z = np.int64(min(abs(iz), FARTHEST) * FIXED)
-    scale = 1.0 / SIDE
-    bx = min(max(int((ox + dx * t) * scale), 0), mx - 1)
-    by = min(max(int((oy + dy * t) * scale), 0), my - 1)
-    bz = min(max(int((oz + dz * t) * scale), 0), mz - 1)
-    while True:
-        entry = code[octant, bz, by, bx]
-        label = entry & CODE_BITS
-        if label != MIXED:
-            # the same label fills the cube of `reach` bricks ahead; `more` is its far end from here
-            more = int(entry >> np.uint16(8)) - 1
-            tx = ((bx + ux + sx * more) * SIDE - ox) * ix
-            ty = ((by + uy + sy * more) * SIDE - oy) * iy
-            tz = ((bz + uz + sz * more) * SIDE - oz) * iz
-            leave = min(tx, min(ty, tz))
-            if leave >= end:
-                lengths[label] += end - t
-                return
-            if leave > t:
-                lengths[label] += leave - t
-                t = leave
-            if more == 0:
-                bx += sx if tx == leave else 0
-                by += sy if ty == leave else 0
-                bz += sz if tz == leave else 0
-            else:
-                ex, ey, ez = bx + sx * more, by + sy * more, bz + sz * more
-                px, py, pz = int((ox + dx * t) * scale), int((oy + dy * t) * scale), int((oz + dz * t) * scale)
-                bx = ex + sx if tx == leave else min(max(px, min(bx, ex)), max(bx, ex))
-                by = ey + sy if ty == leave else min(max(py, min(by, ey)), max(by, ey))
-                bz = ez + sz if tz == leave else min(max(pz, min(bz, ez)), max(bz, ez))
-        else:
-            base = np.int64(slot[bz, by, bx]) * CELLS
-            x = min(max(int(ox + dx * t) - bx * SIDE, 0), SIDE - 1)
-            y = min(max(int(oy + dy * t) - by * SIDE, 0), SIDE - 1)
-            z = min(max(int(oz + dz * t) - bz * SIDE, 0), SIDE - 1)
-            # fixed point: the chain of one step is half as long in integers as in floating point
-            cx = np.int64(min((bx * SIDE + x + ux - ox) * ix, FARTHEST) * FIXED)
-            cy = np.int64(min((by * SIDE + y + uy - oy) * iy, FARTHEST) * FIXED)
-            cz = np.int64(min((bz * SIDE + z + uz - oz) * iz, FARTHEST) * FIXED)
-            at, stop = np.int64(t * FIXED), np.int64(end * FIXED)
-            cell = base + (z * SIDE + y) * SIDE + x
-            while True:
-                leave = min(cx, min(cy, cz))
-                step = max(min(leave, stop) - at, 0)
-                at = max(at, leave)
-                if density.size > 0:
-                    lengths[pool[cell]] += step * density[cell] * (1.0 / FIXED)
-                else:
-                    lengths[pool[cell]] += step * (1.0 / FIXED)
-                # no branch tells the axes apart: a wrong guess costs more than the additions
-                gx, gy, gz = -np.int64(cx == leave), -np.int64(cy == leave), -np.int64(cz == leave)
-                x += sx & gx
-                y += sy & gy
-                z += sz & gz
-                cx += step_x & gx
-                cy += step_y & gy
-                cz += step_z & gz
-                if (x | y | z) & ~(SIDE - 1):
-                    break
-                cell += (sx & gx) + (sy * SIDE & gy) + (sz * SIDE * SIDE & gz)
-            t = at * (1.0 / FIXED)
-            if at >= stop:
-                return
-            bx += x >> SHIFT
-            by += y >> SHIFT
-            bz += z >> SHIFT
-        if bx < 0 or by < 0 or bz < 0 or bx >= mx or by >= my or bz >= mz:
-            return
-
-
-@njit(inline="always", error_model="numpy")
-def _aim(pose, u, v, ray):
-    """Fill `ray` with the source, the unit direction to detector position (u, v), and the distance."""
-    dx = pose[3] + u * pose[6] + v * pose[9] - pose[0]
-    dy = pose[4] + u * pose[7] + v * pose[10] - pose[1]
-    dz = pose[5] + u * pose[8] + v * pose[11] - pose[2]
-    length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    ray[0], ray[1], ray[2] = pose[0], pose[1], pose[2]
-    ray[3], ray[4], ray[5] = dx / length, dy / length, dz / length
-    ray[6] = length
 
 
 @njit(inline="always", error_model="numpy")
@@ -147,8 +37,11 @@ def _collect(prims, rects, active, u, ray, pair, hits):
 
 
 @njit(inline="always", error_model="numpy")
-def _add_lengths(code, slot, pool, density, grid, ray, hits, n, lengths):
-    """Add one ray's path length in every material: solids in paint order over the background."""
+def _paint(volume, ray, hits, n, covered, painted):
+    """Set one ray's path lengths in the solids, in paint order, and in the volume where they replace it."""
+    code, slot, pool, density, grid = volume
+    covered[:] = 0.0
+    painted[:] = 0.0
     t = 0.0
     while t < ray[6]:
         # the topmost interval that covers t decides, until it ends or one painted later begins
@@ -162,10 +55,25 @@ def _add_lengths(code, slot, pool, density, grid, ray, hits, n, lengths):
             if t < hits[i, 0] < until:
                 until = hits[i, 0]
         if top >= 0:
-            lengths[int(hits[top, 2])] += until - t
-        else:
-            _walk(code, slot, pool, density, grid, ray, t, until, lengths)
+            painted[int(hits[top, 2])] += until - t
+            walk(code, slot, pool, density, grid, ray, t, until, covered)
         t = until
+
+
+@njit(inline="always", error_model="numpy")
+def _add_solids(volume, prims, rects, active, u, ray, scratch, background, at, lengths, column):
+    """Write one ray's path lengths into lengths[:, column]: `background`[:, at] but for the solids; count intervals."""
+    pair, hits, covered, painted = scratch
+    n = _collect(prims, rects, active, u, ray, pair, hits)
+    if n == 0:
+        for m in range(1, lengths.shape[0]):
+            lengths[m, column] = background[m, at]
+        return 0
+    _paint(volume, ray, hits, n, covered, painted)
+    for m in range(1, lengths.shape[0]):
+        # a sub-ray can meet more of a thin structure than the pixel's central ray
+        lengths[m, column] = max(background[m, at] - covered[m], 0.0) + painted[m]
+    return n
 
 
 @njit(inline="always", error_model="numpy")
@@ -208,21 +116,6 @@ def _active(rects, v):
     return out[:n]
 
 
-@njit(cache=True, error_model="numpy")
-def _corners(prims, rects, active, pose, v, shift, edge_mu, out):
-    """Fill `out` [2, u + 1] with the solids' thickness at the pixel corners below and above row v."""
-    ray, pair, hits = np.empty(7), np.empty(4), np.empty((2 * active.size, 3))
-    for side in range(2):
-        for u in range(out.shape[1]):
-            out[side, u] = 0.0
-        for p in active:
-            for u in range(max(int(rects[p, 2]), 0), min(int(rects[p, 3]) + 2, out.shape[1])):
-                if out[side, u] == 0.0:
-                    _aim(pose, u - 0.5 - shift[1], v + side - 0.5 - shift[0], ray)
-                    n = _collect(prims, rects, active, u - 0.5, ray, pair, hits)
-                    out[side, u] = _thickness(hits, n, edge_mu) + 1e-300  # marks the corner as done
-
-
 @njit(inline="always", error_model="numpy")
 def _grazes(fat, rects, active, u, ray, pair):
     """Return how many times the usual sub-rays a primitive needs that can hide between a pixel's corners."""
@@ -234,105 +127,166 @@ def _grazes(fat, rects, active, u, ray, pair):
     return times
 
 
-@njit(inline="always", error_model="numpy")
-def _add_row(grid_arrays, prims, rects, active, u, ray, scratch, layer, lengths, column):
-    """Write one ray's path lengths into column `column` of `lengths` [material, ray]; return its intervals."""
-    code, slot, pool, density, grid = grid_arrays
-    pair, hits, row = scratch
-    n = _collect(prims, rects, active, u, ray, pair, hits)
-    row[:] = 0.0
-    _add_lengths(code, slot, pool, density, grid, ray, hits, n, row)
-    row[-1] += layer
-    for m in range(1, row.size):
-        lengths[m, column] = row[m]
-    return n
+@njit(cache=True, error_model="numpy")
+def _near(rects, active, n_u):
+    """Mark the columns that the shadows of the active primitives may reach."""
+    out = np.zeros(n_u + 1, np.bool_)
+    for p in active:
+        out[max(int(rects[p, 2]), 0) : max(min(int(rects[p, 3]) + 2, n_u + 1), 0)] = True
+    return out
 
 
 @njit(cache=True, error_model="numpy")
-def _measure_row(bricks, solids, pose, v, span, extra, rule, edge, m1, m2):
-    """Measure columns span[0]…span[1] of row v: central rays first, then the pixels on an edge again."""
-    code, slot, pool, density, grid, _ = bricks
-    arrays = (code, slot, pool, density, grid)
-    prims, fat, rects = solids
-    mu, w1, w2 = rule
-    edge_mu, threshold, most = edge
-    n_v, n_u = m1.shape
-    shift = ((n_v - 1) / 2, (n_u - 1) / 2)
+def _corners(prims, rects, active, near, pose, v, edge_mu, out):
+    """Fill `out` [u + 1] with the solids' thickness at the pixel corners at height v (from the detector's centre)."""
+    ray, pair, hits = np.empty(7), np.empty(4), np.empty((2 * active.size, 3))
+    middle = (out.size - 2) / 2
+    for u in range(out.size):
+        out[u] = 0.0
+        if near[u]:
+            aim(pose, u - 0.5 - middle, v, ray)
+            n = _collect(prims, rects, active, u - 0.5, ray, pair, hits)
+            out[u] = _thickness(hits, n, edge_mu)
+
+
+@njit(cache=True, error_model="numpy")
+def _trim(background, span, near):
+    """Leave out the columns at both ends of a row in which nothing is met."""
     first, last = span[0], span[1]
-    size = max(last - first, most * MOST_TIMES)
-    lengths = np.zeros((mu.shape[0], size), np.float32)
+    while first < last and not near[first] and not background[1:, first].any():
+        first += 1
+    while first < last and not near[last - 1] and not background[1:, last - 1].any():
+        last -= 1
+    return first, last
+
+
+@njit(cache=True, error_model="numpy")
+def _centres(volume, solids, pose, v, columns, background, lengths, centre):
+    """Fill `lengths` [material, column] with the central rays of a row and `centre` [u] with the solids' thickness."""
+    prims, rects, active, near, edge_mu = solids
+    first, last, n_v = columns
+    n_m, n_u = background.shape
+    for m in range(1, n_m):
+        lengths[m, : last - first] = background[m, first:last]
+    ray, scratch = np.empty(7), (np.empty(4), np.empty((2 * active.size + 1, 3)), np.empty(n_m), np.empty(n_m))
+    for u in range(first, last):
+        if near[u]:
+            aim(pose, u - (n_u - 1) / 2, v - (n_v - 1) / 2, ray)
+            n = _add_solids(volume, prims, rects, active, u, ray, scratch, background, u, lengths, u - first)
+            centre[u] = _thickness(scratch[1], n, edge_mu)
+
+
+@njit(cache=True, error_model="numpy")
+def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, extra, m1, m2):
+    """Measure again, by several rays each, the pixels of a row that the edge of a solid crosses."""
+    prims, fat, rects, active, near = solids
+    mu, w1, w2 = rule
+    _, threshold, most = edge
+    first, last, n_v = columns
+    n_m, n_u = background.shape
+    size = most * MOST_TIMES
+    lengths = np.zeros((n_m, size), np.float32)
     tau, s1, s2 = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    active = _active(rects, v)
-    ray, pair, hits = np.empty(7), np.empty(4), np.empty((2 * active.size + 1, 3))
-    scratch = (pair, hits, np.zeros(mu.shape[0]))
-    centre, corners = np.zeros(n_u), np.zeros((2, n_u + 1))
+    ray, scratch = np.empty(7), (np.empty(4), np.empty((2 * active.size + 1, 3)), np.empty(n_m), np.empty(n_m))
+    thin = (fat[active, 0] >= 0).any()
     for u in range(first, last):
-        _aim(pose, u - shift[1], v - shift[0], ray)
-        layer = extra[v, u] if extra.size else 0.0
-        n = _add_row(arrays, prims, rects, active, u, ray, scratch, layer, lengths, u - first)
-        centre[u] = _thickness(hits, n, edge_mu)
-    _signal(lengths, last - first, mu, w1, w2, tau, s1, s2)
-    for u in range(first, last):
-        m1[v, u], m2[v, u] = s1[u - first], s2[u - first]
-    if active.size == 0 or most < 2:
-        return
-    _corners(prims, rects, active, pose, v, shift, edge_mu, corners)
-    for u in range(first, last):
-        a, b, c, d = corners[0, u], corners[0, u + 1], corners[1, u], corners[1, u + 1]
-        change = max(max(max(a, b), max(c, d)), centre[u]) - min(min(min(a, b), min(c, d)), centre[u])
-        _aim(pose, u - shift[1], v - shift[0], ray)
-        times = _grazes(fat, rects, active, u, ray, pair)
-        if times == 0 and change <= threshold:
+        if not near[u]:
             continue
-        count = most * times if times else int(min(float(most), 4.0 + 4.0 * change))
-        layer = extra[v, u] if extra.size else 0.0
+        times = 0
+        if thin:
+            aim(pose, u - (n_u - 1) / 2, v - (n_v - 1) / 2, ray)
+            times = _grazes(fat, rects, active, u, ray, scratch[0])
+        if times == 0 and changes[u] <= threshold:
+            continue
+        count = most * times if times else int(min(float(most), 4.0 + 4.0 * changes[u]))
         for i in range(count):
             # a golden-section lattice has `count` distinct positions along u and along v
             du, dv = (i + 0.5) / count - 0.5, (i * GOLDEN + 0.5) % 1.0 - 0.5
-            _aim(pose, u + du - shift[1], v + dv - shift[0], ray)
-            _add_row(arrays, prims, rects, active, u + du, ray, scratch, layer, lengths, i)
+            aim(pose, u + du - (n_u - 1) / 2, v + dv - (n_v - 1) / 2, ray)
+            _add_solids(volume, prims, rects, active, u + du, ray, scratch, background, u, lengths, i)
+        if extra.size:
+            lengths[n_m - 1, :count] += extra[u]
         _signal(lengths, count, mu, w1, w2, tau, s1, s2)
         mean1, mean2 = 0.0, 0.0
         for i in range(count):
             mean1 += s1[i]
             mean2 += s2[i]
-        m1[v, u], m2[v, u] = mean1 / count, mean2 / count
-
-
-@njit(parallel=True, cache=True, error_model="numpy")
-def transmit_view(bricks, solids, pose, order, spans, extra, rule, edge, m1, m2):
-    """Measure one view: mean signal `m1` and second moment `m2` [v, u] relative to the open field.
-
-    `solids` is (prims, fat, rects): primitive rows; their inflated twins, with kind −1 where not thin and
-    how many times the usual sub-rays in the material's place; and their shadows (v from, to, u from, to).
-    `pose` [12]; `order` [row] is the order of work; only columns spans[row] = (from, to) are touched.
-    `extra` [v, u] is a length (mm) in the last material that every ray crosses, or empty. `rule` is
-    (mu [material, node] 1/mm, w1 [node], w2 [node]); `edge` is (edge_mu [material], threshold in optical
-    thickness, most sub-rays a pixel).
-    """
-    for index in prange(order.size):
-        v = order[index]
-        if spans[v, 1] > spans[v, 0]:
-            _measure_row(bricks, solids, pose, v, spans[v], extra, rule, edge, m1, m2)
+        m1[u], m2[u] = mean1 / count, mean2 / count
 
 
 @njit(cache=True, error_model="numpy")
-def _trace_row(bricks, solids, pose, v, span, lengths):
-    code, slot, pool, density, grid, _ = bricks
-    prims, _, rects = solids
-    n_materials, n_v, n_u = lengths.shape
+def _measure_row(volume, solids, pose, v, span, background, extra, rule, edge, corners, m1, m2):
+    """Measure columns span[0]…span[1] of row v; `corners` [2, u + 1] are those below and above once it is done."""
+    prims, fat, rects = solids
+    mu, w1, w2 = rule
+    n_m, n_v, n_u = background.shape
     active = _active(rects, v)
-    ray, scratch = np.empty(7), (np.empty(4), np.empty((2 * active.size + 1, 3)), np.zeros(n_materials))
-    arrays = (code, slot, pool, density, grid)
-    for u in range(span[0], span[1]):
-        _aim(pose, u - (n_u - 1) / 2, v - (n_v - 1) / 2, ray)
-        _add_row(arrays, prims, rects, active, u, ray, scratch, 0.0, lengths[:, v], u)
+    near = _near(rects, active, n_u)
+    edges = active.size > 0 and edge[2] > 1
+    if edges:
+        corners[0] = corners[1]
+        _corners(prims, rects, active, near, pose, v + 0.5 - (n_v - 1) / 2, edge[0], corners[1])
+    else:
+        corners[1] = 0.0
+    row, layer = background[:, v], extra[v] if extra.size else extra.ravel()
+    first, last = (span[0], span[1]) if extra.size else _trim(row, span, near)
+    if first >= last:
+        return
+    size, columns = last - first, (first, last, n_v)
+    lengths, centre = np.zeros((n_m, size), np.float32), np.zeros(n_u)
+    tau, s1, s2 = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
+    _centres(volume, (prims, rects, active, near, edge[0]), pose, v, columns, row, lengths, centre)
+    if extra.size:
+        lengths[n_m - 1] += layer[first:last]
+    _signal(lengths, size, mu, w1, w2, tau, s1, s2)
+    m1[v, first:last], m2[v, first:last] = s1, s2
+    if edges:
+        for u in range(first, last):
+            a, b, c, d = corners[0, u], corners[0, u + 1], corners[1, u], corners[1, u + 1]
+            centre[u] = max(max(max(a, b), max(c, d)), centre[u]) - min(min(min(a, b), min(c, d)), centre[u])
+        parts = (prims, fat, rects, active, near)
+        _edges(volume, parts, pose, v, columns, row, rule, edge, centre, layer, m1[v], m2[v])
+
+
+@njit(cache=True, error_model="numpy")
+def _measure_strip(volume, solids, pose, first, spans, background, extra, rule, edge, m1, m2):
+    n_v, n_u = m1.shape
+    corners = np.zeros((2, n_u + 1))
+    active = _active(solids[2], first)
+    if active.size > 0 and edge[2] > 1:
+        near = _near(solids[2], active, n_u)
+        _corners(solids[0], solids[2], active, near, pose, first - 0.5 - (n_v - 1) / 2, edge[0], corners[1])
+    for v in range(first, min(first + STRIP, n_v)):
+        _measure_row(volume, solids, pose, v, spans[v], background, extra, rule, edge, corners, m1, m2)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def trace_view(bricks, solids, pose, order, spans, lengths):
-    """Fill `lengths` [material, v, u] (mm) along the rays to the pixel centres of one view."""
+def transmit_view(volume, solids, pose, order, spans, background, extra, rule, edge, m1, m2):
+    """Measure one view: mean signal `m1` and second moment `m2` [v, u] relative to the open field.
+
+    `volume` is (code, slot, pool, density, grid) of `ctsim.bricks.Bricks` and `background` [material, v, u]
+    (mm, float32) what the central rays cross in it. `solids` is (prims, fat, rects): primitive rows; their
+    inflated twins, with kind −1 where not thin and how many times the usual sub-rays in the material's place; and
+    their shadows (v from, to, u from, to). `pose` [12]; `order` [strip] is the order of work; only columns
+    spans[row] = (from, to) are touched. `extra` [v, u] is a length (mm) in the last material that every ray
+    crosses, or empty. `rule` is (mu [material, node] 1/mm, w1 [node], w2 [node]); `edge` is (edge_mu
+    [material], threshold in optical thickness, most sub-rays a pixel).
+    """
     for index in prange(order.size):
-        v = order[index]
-        if spans[v, 1] > spans[v, 0]:
-            _trace_row(bricks, solids, pose, v, spans[v], lengths)
+        _measure_strip(volume, solids, pose, order[index] * STRIP, spans, background, extra, rule, edge, m1, m2)
+
+
+@njit(cache=True, error_model="numpy")
+def _replace_row(volume, solids, pose, v, background, lengths):
+    prims, _, rects = solids
+    _, n_v, n_u = background.shape
+    active = _active(rects, v)
+    parts = (prims, rects, active, _near(rects, active, n_u), np.zeros(lengths.shape[0]))
+    _centres(volume, parts, pose, v, (0, n_u, n_v), background[:, v], lengths[:, v], np.zeros(n_u))
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def replace_view(volume, solids, pose, order, background, lengths):
+    """Fill `lengths` [material, v, u] (mm) of the central rays: `background`, but for the solids."""
+    for index in prange(order.size):
+        _replace_row(volume, solids, pose, order[index], background, lengths)

@@ -1,7 +1,8 @@
 """The ray tracer in float64 for reading: every plane crossing is listed, sorted and looked up.
 
-Same functions and arguments as `raytrace_cpu`. Nothing is skipped, and the position of every piece of a
-ray is found from its midpoint.
+`transmit_view` takes what `raytrace_cpu.transmit_view` does, `trace_view` is the twin of `bricks_cpu`,
+`columns_cpu` and `raytrace_cpu.replace_view` together. Nothing is skipped, and the position of every piece of
+a ray is found from its midpoint.
 """
 
 import itertools
@@ -17,20 +18,21 @@ GOLDEN = 0.6180339887498949
 
 def _label_volume(bricks):
     """Undo the bricks: labels and density, [z, y, x]."""
-    _, mz, my, mx = bricks.code.shape
+    code, slots, pool, dense, grid = bricks[:5]
+    _, mz, my, mx = code.shape
     labels = np.zeros((mz, my, mx, SIDE, SIDE, SIDE), np.uint8)
     density = np.ones(labels.shape)
     for z, y, x in np.ndindex(mz, my, mx):
-        slot = bricks.slot[z, y, x]
+        slot = slots[z, y, x]
         cells = slice(slot * SIDE**3, (slot + 1) * SIDE**3)
         if slot < 0:
-            labels[z, y, x] = bricks.code[0, z, y, x] & 255
+            labels[z, y, x] = code[0, z, y, x] & 255
             continue
-        labels[z, y, x] = bricks.pool[cells].reshape(SIDE, SIDE, SIDE)
-        if bricks.density.size:
-            density[z, y, x] = bricks.density[cells].reshape(SIDE, SIDE, SIDE)
+        labels[z, y, x] = pool[cells].reshape(SIDE, SIDE, SIDE)
+        if dense.size:
+            density[z, y, x] = dense[cells].reshape(SIDE, SIDE, SIDE)
     full = (mz * SIDE, my * SIDE, mx * SIDE)
-    nx, ny, nz = bricks.grid[:3].astype(int)
+    nx, ny, nz = grid[:3].astype(int)
     labels = labels.transpose(0, 3, 1, 4, 2, 5).reshape(full)[:nz, :ny, :nx]
     return labels, density.transpose(0, 3, 1, 4, 2, 5).reshape(full)[:nz, :ny, :nx]
 
@@ -49,7 +51,7 @@ def _intervals(prim, source, direction, pairs):
 
 
 def _lengths(volume, grid, prims, ray, n_materials):
-    """Path length in every material along one ray."""
+    """Path length in every material along one ray: in the open volume, in the volume under solids, in solids."""
     labels, density = volume
     source, direction, distance = ray
     n, per_mm, low = grid[:3], grid[3:6], grid[6:]
@@ -63,17 +65,16 @@ def _lengths(volume, grid, prims, ray, n_materials):
         found = _intervals(prim, source, direction, pairs)
         cuts += list(pairs[: 2 * found])
     cuts = np.unique(np.clip(cuts, 0.0, distance))
-    lengths = np.zeros(n_materials)
+    lengths = np.zeros((3, n_materials))
     for t0, t1 in itertools.pairwise(cuts):
         point = source + direction * (t0 + t1) / 2
         covering = [prim for prim in prims if inside(prim, *point)]
         if covering:
-            lengths[int(covering[-1][1])] += t1 - t0
-            continue
+            lengths[2, int(covering[-1][1])] += t1 - t0
         x, y, z = np.floor((point - low) * per_mm).astype(int)
         if 0 <= x < n[0] and 0 <= y < n[1] and 0 <= z < n[2]:
-            lengths[labels[z, y, x]] += (t1 - t0) * density[z, y, x]
-    lengths[0] = 0.0
+            lengths[1 if covering else 0, labels[z, y, x]] += (t1 - t0) * density[z, y, x]
+    lengths[:, 0] = 0.0
     return lengths
 
 
@@ -104,12 +105,12 @@ def _n_subrays(solids, pose, u, v, edge):
     return min(most, 4 + int(4 * change)) if change > threshold else 1
 
 
-def transmit_view(bricks, solids, pose, order, spans, extra, rule, edge, m1, m2):
+def transmit_view(bricks, solids, pose, order, spans, background, extra, rule, edge, m1, m2):
     """Measure one view: mean signal `m1` and second moment `m2` [v, u] relative to the open field."""
-    volume = _label_volume(bricks)
+    volume, strip = _label_volume(bricks), -(-len(m1) // len(order))
     mu, w1, w2 = (np.asarray(a, np.float64) for a in rule)
     n_v, n_u = m1.shape
-    for row in order:
+    for row in (k * strip + i for k in order for i in range(strip) if k * strip + i < n_v):
         for column in range(*spans[row]):
             u, v = column - (n_u - 1) / 2, row - (n_v - 1) / 2
             n = _n_subrays(solids, pose, u, v, edge)
@@ -117,7 +118,8 @@ def transmit_view(bricks, solids, pose, order, spans, extra, rule, edge, m1, m2)
             for i in range(n):
                 du = (i + 0.5) / n - 0.5 if n > 1 else 0.0
                 dv = math.fmod(i * GOLDEN + 0.5, 1.0) - 0.5
-                lengths = _lengths(volume, bricks.grid, solids[0], _ray(pose, u + du, v + dv), len(mu))
+                _, under, solid = _lengths(volume, bricks[4], solids[0], _ray(pose, u + du, v + dv), len(mu))
+                lengths = np.maximum(background[:, row, column] - under, 0) + solid
                 if extra.size:
                     lengths[-1] += extra[row, column]
                 passed = np.exp(-np.minimum(lengths @ mu, 80.0))
@@ -126,11 +128,12 @@ def transmit_view(bricks, solids, pose, order, spans, extra, rule, edge, m1, m2)
             m1[row, column], m2[row, column] = total1 / n, total2 / n
 
 
-def trace_view(bricks, solids, pose, order, spans, lengths):
+def trace_view(bricks, prims, pose, lengths):
     """Fill `lengths` [material, v, u] (mm) along the rays to the pixel centres of one view."""
     volume = _label_volume(bricks)
     n_materials, n_v, n_u = lengths.shape
-    for row in order:
-        for column in range(*spans[row]):
+    for row in range(n_v):
+        for column in range(n_u):
             ray = _ray(pose, column - (n_u - 1) / 2, row - (n_v - 1) / 2)
-            lengths[:, row, column] = _lengths(volume, bricks.grid, solids[0], ray, n_materials)
+            open_volume, _, solid = _lengths(volume, bricks[4], prims, ray, n_materials)
+            lengths[:, row, column] = open_volume + solid
