@@ -34,8 +34,8 @@ class Detector(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def __post_init__(self) -> None:
         if self.kind not in _SLAB:
             raise InputError(f"detector: kind must be one of {', '.join(_SLAB)}, got {self.kind!r}")
-        if not (math.isfinite(self.thickness) and 0 < self.thickness <= 100):
-            raise InputError(f"detector: thickness must be within (0, 100] mm, got {self.thickness}")
+        if not 1e-6 <= self.thickness <= 100:  # the square of what a thinner slab absorbs may underflow
+            raise InputError(f"detector: thickness must be within [1e-6, 100] mm, got {self.thickness}")
         if not (math.isfinite(self.threshold) and self.threshold >= 0):
             raise InputError(f"detector: threshold must be at least 0 keV, got {self.threshold}")
 

@@ -97,18 +97,17 @@ def detect(
     i0: float,
     key: np.uint64,
     pattern: NDArray[np.float32] | None = None,
-    out: NDArray[Any] | None = None,
-    spans: NDArray[np.int64] | None = None,
+    known: tuple[NDArray[Any], NDArray[np.int64]] | None = None,
 ) -> NDArray[Any]:
-    """Draw what the detector writes in one view, [v, u] of type `noise.dtype`, into `out` if given.
+    """Draw what the detector writes in one view, [v, u] of type `noise.dtype`.
 
     `m1` is the mean signal relative to the open field, scatter included, and `m2` the second moment Σ w2·e^(−τ):
     without electronics the relative signal has variance m2/i0. One draw has that mean, that variance and nearly
     the compound Poisson's skewness: g·Poisson(i0·m1²/m2), g = m2/(m1·i0). `key` names the view's stream
-    (`rng.stream_key`); `pattern` comes from `pixel_pattern`. With `spans` [v, 2] only columns from…to of each row are
-    drawn and the rest of `out` stands, but models "tigre" and "none" always fill all. Model "none" draws nothing.
-    Model "tigre" takes p relative to the view's largest p before the draw (TIGRE: the largest of the whole scan),
-    ignoring m2 and pattern.
+    (`rng.stream_key`); `pattern` comes from `pixel_pattern`. `known` = (counts, spans) are counts to be drawn
+    again, in place, in columns spans[v] = (from, to) only; models "tigre" and "none" fill all. Model "none" draws
+    nothing. Model "tigre" takes p relative to the view's largest p before the draw (TIGRE: the largest of the whole
+    scan), ignoring m2 and pattern.
 
     Raises InputError on moments that are negative, not finite, or m2 = 0 where m1 > 0.
     """
@@ -118,18 +117,17 @@ def detect(
         raise InputError(f"i0 must be within (0, 1e12] photons, got {i0}")
     if pattern is not None and pattern.shape != m1.shape:
         raise InputError(f"pattern has shape {pattern.shape}, the view {m1.shape}")
-    if out is None:
-        out = np.empty(m1.shape, noise.dtype)
-    elif out.shape != m1.shape or out.dtype != noise.dtype:
-        raise InputError(f"out must be {np.dtype(noise.dtype)} {m1.shape}, got {out.dtype} {out.shape}")
+    if known is None:
+        known = np.empty(m1.shape, noise.dtype), np.tile(np.array([0, m1.shape[1]]), (m1.shape[0], 1))
+    out, spans = known
+    if out.shape != m1.shape or out.dtype != noise.dtype:
+        raise InputError(f"counts must be {np.dtype(noise.dtype)} {m1.shape}, got {out.dtype} {out.shape}")
     if m1.dtype != np.float32 or m2.dtype != np.float32:
         m1, m2 = m1.astype(np.float64, copy=False), m2.astype(np.float64, copy=False)
     if noise.model == "compound":
         bad = np.zeros(m1.shape[0], np.uint8)
         gains = _NO_PATTERN if pattern is None else pattern.astype(np.float32, copy=False)
         scale = (float(i0), noise.electronic, noise.gain(i0), noise.dark, float(noise.full_scale))
-        if spans is None:
-            spans = np.tile(np.array([0, m1.shape[1]]), (m1.shape[0], 1))
         noise_cpu.detect(m1, m2, gains, spans, *scale, np.uint64(key), out, bad)
         if bad.any():
             raise InputError(f"detector row {int(bad.argmax())}: m1 and m2 must be finite and m2 > 0 where m1 > 0")
@@ -164,8 +162,8 @@ def flat_field(
     if noise.n_flats == 0 or noise.model != "compound":
         gains = m1 if pattern is None else m1 * pattern
         return (noise.dark + noise.gain(i0) * gains).astype(np.float32)
-    total, counts = np.zeros(m1.shape), np.empty(m1.shape, noise.dtype)
+    total = np.zeros(m1.shape)
     for k in range(noise.n_flats):
         key = rng.stream_key(scene_id, "flat", k)
-        total += detect(m1, m2, noise=noise, i0=i0, key=key, pattern=pattern, out=counts)
+        total += detect(m1, m2, noise=noise, i0=i0, key=key, pattern=pattern)
     return (total / noise.n_flats).astype(np.float32)

@@ -190,7 +190,6 @@ def transmit(
     response: Response,
     *,
     subrays: int = 34,
-    extra: NDArray[np.float32] | None = None,
     background: NDArray[np.float32] | None = None,
     out: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -198,15 +197,15 @@ def transmit(
 
     The signal is Σ w1·exp(−Σ μ·L) averaged over the pixel; the variance of one photon-noise draw is the
     second moment over the photons of an open pixel. The label volume is sampled along the central ray, solids
-    and what they replace along every sub-ray. `extra` [v, u] is a length (mm) in the last material;
-    `background` what `Tracer.background` returned for this view, if known. `out` = (signal, second moment,
-    spans) updates only those columns of given images.
+    and what they replace along every sub-ray. `background` is what `Tracer.background` returned for this view,
+    if known, plus what else the rays cross. `out` = (signal, second moment, spans) updates only those columns
+    of given images.
     """
     shape, pose = geometry.n_detector, geometry.pose(view)
     if out is None:
         # summed in the kernel's order, so that a skipped ray equals a traced one to the last bit
         m1, m2 = (np.full(shape, np.cumsum(w, dtype=np.float32)[-1]) for w in (response.w1, response.w2))
-        spans = tracer.spans(pose, shape) if extra is None else np.tile(np.array([0, shape[1]]), (shape[0], 1))
+        spans = np.tile(np.array([0, shape[1]]), (shape[0], 1))
     else:
         m1, m2, spans = out
     most = subrays if len(tracer.prims) else 1
@@ -217,7 +216,6 @@ def transmit(
         work_order(-(-shape[0] // raytrace_cpu.STRIP)),
         spans,
         tracer.background(geometry, view) if background is None else background,
-        np.zeros((0, 0), np.float32) if extra is None else extra,
         (response.mu, response.w1, response.w2),
         (response.edge_mu, EDGE_THRESHOLD, most),
         m1,

@@ -94,6 +94,8 @@ class _Simulator:
     def view(self, k: int) -> dict[str, NDArray]:
         """Everything the plan wants of view k."""
         self.tracer.background(self.geometry, k, self.lengths)  # serves the scan, its twin and the path lengths
+        if self.beam.layer is not None:
+            self.lengths[-1] += self.beam.layer
         m1, m2 = self._transmit(self.tracer, k)
         out = self._measured(m1, m2, k)
         if "metal_free/counts" in self.names:
@@ -114,7 +116,6 @@ class _Simulator:
             k,
             self.response,
             subrays=self.plan.settings.subrays,
-            extra=self.beam.layer,
             background=self.lengths,
             out=out,
         )
@@ -139,8 +140,7 @@ class _Simulator:
             m1, m2 = m1 * self.beam.gain, m2 * self.beam.gain
         key = stream_key(self.plan.stream_id, "view", k)
         noise, i0 = self.scanner.noise, self.scanner.i0
-        counts, spans = known or (None, None)
-        out["counts"] = detect(m1, m2, noise=noise, i0=i0, key=key, pattern=self.pattern, out=counts, spans=spans)
+        out["counts"] = detect(m1, m2, noise=noise, i0=i0, key=key, pattern=self.pattern, known=known)
         return out
 
     def _paths(self, k: int) -> dict[str, NDArray]:

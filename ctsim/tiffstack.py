@@ -23,7 +23,7 @@ def create_stack(path: Path, shape: tuple[int, ...], dtype: str, pixel: tuple[fl
 
     `pixel` is (v, u) in mm. The space is reserved now, so that a full disk shows before hours of work.
     """
-    offset = _write(path, shape, dtype, (1.0, *pixel), None, axes="TYX" if len(shape) == 3 else _AXES[len(shape)])
+    offset = _write(path, shape, dtype, (1.0, *pixel), axes="TYX" if len(shape) == 3 else _AXES[len(shape)])
     handle = os.open(path, os.O_RDWR)
     try:
         os.posix_fallocate(handle, 0, os.fstat(handle).st_size)
@@ -38,7 +38,13 @@ def create_stack(path: Path, shape: tuple[int, ...], dtype: str, pixel: tuple[fl
 def write_image(path: Path, array: NDArray[Any], spacing: tuple[float, ...]) -> int:
     """Write a volume [z, y, x] or an image [v, u] with its spacing in mm; return the data's offset."""
     array = np.ascontiguousarray(array)
-    return _write(path, array.shape, array.dtype.name, spacing, array, axes=_AXES[array.ndim])
+    offset = _write(path, array.shape, array.dtype.name, spacing, axes=_AXES[array.ndim])
+    handle = os.open(path, os.O_RDWR)
+    try:
+        write_all(handle, array, offset)  # unlike NumPy's tofile, it says why a disk refuses
+    finally:
+        os.close(handle)
+    return offset
 
 
 def write_all(handle: int, array: NDArray[Any], offset: int) -> None:
@@ -54,9 +60,8 @@ def map_array(path: Path, shape: tuple[int, ...], dtype: str, offset: int) -> ND
     return np.memmap(path, np.dtype(dtype).newbyteorder("<"), "c", offset, shape).view(np.ndarray)
 
 
-def _write(
-    path: Path, shape: tuple[int, ...], dtype: str, spacing: tuple[float, ...], data: NDArray[Any] | None, *, axes: str
-) -> int:
+def _write(path: Path, shape: tuple[int, ...], dtype: str, spacing: tuple[float, ...], *, axes: str) -> int:
+    """Write a file of the right size, its pixels zero; return the offset of its data."""
     import tifffile  # 0.1 s that planning and reading do without
 
     size = math.prod(shape) * np.dtype(dtype).itemsize
@@ -68,9 +73,9 @@ def _write(
         if not plain:
             metadata |= {"unit": "mm"} | ({"spacing": spacing[0]} if axes == "ZYX" else {})
         file.write(
-            data,
-            shape=None if data is not None else shape,
-            dtype=None if data is not None else dtype,
+            None,
+            shape=shape,
+            dtype=dtype,
             photometric="minisblack",
             resolution=resolution,
             resolutionunit="CENTIMETER" if plain else "NONE",

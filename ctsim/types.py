@@ -78,6 +78,12 @@ class Scanner(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     noise: Noise = Noise()
     scatter: Scatter = Scatter()
 
+    def __post_init__(self) -> None:
+        if self.detector.kind == "counting" and self.detector.threshold >= self.tube.kvp:
+            raise InputError(
+                f"detector.threshold must be below tube.kvp = {self.tube.kvp} keV, got {self.detector.threshold}"
+            )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scan:

@@ -364,7 +364,7 @@ def test_wrong_shapes_and_types_are_refused():
         detect(m, m[:4], noise=Noise(), i0=1e4, key=KEY)
     with pytest.raises(InputError, match="pattern"):
         detect(m, m, noise=Noise(), i0=1e4, key=KEY, pattern=constant(1.0, (7, 5)))
-    with pytest.raises(InputError, match="out must be"):
-        detect(m, m, noise=Noise(), i0=1e4, key=KEY, out=np.empty((5, 7), np.float32))
+    with pytest.raises(InputError, match="counts must be"):
+        detect(m, m, noise=Noise(), i0=1e4, key=KEY, known=(np.empty((5, 7), np.float32), np.zeros((5, 2), np.int64)))
     with pytest.raises(InputError, match="i0"):
         detect(m, m, noise=Noise(), i0=0.0, key=KEY)

@@ -167,10 +167,11 @@ def test_intensities_equal_the_reference():
     everywhere = np.tile(np.array([0, shape[1]]), (shape[0], 1))
     extra = np.random.default_rng(0).uniform(0, 1, shape).astype(np.float32)
     for view in range(2):
-        pose = g.pose_array()[view]
+        pose, background = g.pose_array()[view], tracer.background(g, view)
+        background[-1] += extra
         arguments = (
             tracer.bricks[:5], project._solids(tracer, pose, shape), pose, work_order(1), everywhere,
-            tracer.background(g, view), extra, (r.mu, r.w1, r.w2), (r.edge_mu, project.EDGE_THRESHOLD, 21),
+            background, (r.mu, r.w1, r.w2), (r.edge_mu, project.EDGE_THRESHOLD, 21),
         )  # fmt: skip
         got, want = np.zeros((2, *shape), np.float32), np.zeros((2, *shape))
         raytrace_cpu.transmit_view(*arguments, got[0], got[1])

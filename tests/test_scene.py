@@ -1,15 +1,20 @@
-"""Scene files: read, refused with a path, round trip, stable identity, impossible geometry by name."""
+"""Scene files: read, refused with a path, round trip, stable identity; whatever is read can be simulated."""
 
+import copy
+import functools
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctsim.errors import InputError
+from ctsim.plan import make_plan
 from ctsim.settings import Truth
+from ctsim.simulate import simulate_views
 from phantoms.recipes import NAMES
 from phantoms.scanners import MACHINES, ScannerSettings, preset
 from phantoms.scene import Scene, build, load_suite, parse_suite, scene_id, scene_to_toml, stream_id
@@ -126,28 +131,137 @@ def test_presets_cover_the_object_and_refuse_what_is_too_large(name: str) -> Non
         preset(name, 90, (96, 96), (64, 64, 64), 400.0)
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
-@given(
-    recipe=st.sampled_from(NAMES),
-    n=st.tuples(*[st.integers(1, 20)] * 3),
-    size=st.floats(-1, 300),
-    metal=st.sampled_from(["none", "Fe", "Ti", "Al", "CoCr", "NaI@3.67", "nonsense"]),
-    inserts=st.integers(-1, 18),
-    seed=st.integers(0, 2**63 - 1),
-    machine=st.sampled_from(["skyscan1273", "dental", "c-arm"]),
+def table(needed: dict, **optional) -> st.SearchStrategy[dict]:
+    return st.fixed_dictionaries(needed, optional=optional)
+
+
+SHEETS = st.lists(table({"material": st.sampled_from(["Al", "Cu", "W"]), "thickness": st.floats(0, 3)}), max_size=2)
+# thin enough for 20 kVp that some of the open field is left in float32
+BOWTIE = table(
+    {"center": st.floats(0, 2), "edge": st.floats(0, 40), "half_angle_deg": st.floats(0.1, 89)},
+    material=st.sampled_from(["Al", "PMMA"]),
 )
-def test_random_scenes_build_or_are_refused_by_input_error(recipe, n, size, metal, inserts, seed, machine) -> None:
-    text = (
-        f'name = "x"\nseed = {seed}\nscanner = {{ preset = "{machine}" }}\nphantom = {{ recipe = "{recipe}", '
-        f'n_voxel = {list(n)}, size = {size!r}, metal = "{metal}", n_inserts = {inserts} }}'
-    )
+HEEL = {"heel": st.booleans(), "anode_deg": st.floats(1, 40)}
+TUBE = st.one_of(
+    table({"kvp": st.floats(20, 300)}, filters=SHEETS, bowtie=BOWTIE, **HEEL),
+    table({"kvp": st.floats(10, 500), "model": st.just("finkelshtein-pavlova")}, filters=SHEETS, **HEEL),
+    table({"kvp": st.floats(2, 500), "model": st.just("mono")}, **HEEL),
+)
+NOISE = table(
+    {},
+    model=st.sampled_from(["compound", "tigre", "none"]),
+    electronic=st.sampled_from([0.0, 5.0, 1e6]),
+    adc_bits=st.just("null") | st.integers(4, 16),
+    adc_fill=st.floats(0.5, 1),
+    pedestal=st.floats(0, 0.4),
+    fixed_pattern=st.floats(0, 0.3),
+    dead_fraction=st.floats(0, 0.9),
+    n_flats=st.integers(0, 3),
+)
+SCANNER = table(
+    {"n_detector": st.tuples(*[st.integers(4, 12)] * 2), "n_views": st.integers(1, 3), "tube": TUBE, "noise": NOISE},
+    preset=st.sampled_from(list(MACHINES)),
+    n_voxel=st.tuples(*[st.integers(1, 8)] * 3),
+    detector=table(
+        {"kind": st.sampled_from(["gos", "csi", "ideal", "counting"])},
+        thickness=st.floats(1e-6, 100),
+        threshold=st.floats(0, 120),
+    ),
+    scatter=st.just({}) | table({"level": st.just(1)}, fraction=st.floats(0, 9.99)),
+    i0=st.sampled_from([1e-3, 1.0, 1e5, 1e12]),
+    start_deg=st.floats(-1e3, 1e3),
+    arc_deg=st.floats(1, 360),
+    off_detector=st.tuples(st.floats(-9, 9), st.floats(-9, 9)),
+    off_origin=st.tuples(*[st.floats(-20, 20)] * 3),
+)
+PHANTOM = table(
+    {"recipe": st.sampled_from(NAMES), "n_voxel": st.tuples(*[st.integers(8, 16)] * 3)},
+    metal=st.sampled_from(["none", "Fe", "Ti", "Al", "CoCr", "Au", "NaI@3.67"]),
+    n_inserts=st.integers(0, 16),
+    size=st.floats(0.01, 63),  # what every preset's panel covers
+)
+SETTINGS = table({}, tolerance=st.floats(1e-7, 0.1), subrays=st.integers(1, 256), skip=st.booleans())
+FLAGS = {k: st.booleans() for k in ("twin", "noise_free", "scatter_free", "trace", "metal_path", "paths")}
+TRUTH = table({}, mono_kev=st.lists(st.floats(1, 800), max_size=2), **FLAGS)
+NAN, INF = float("nan"), float("inf")
+# by path in the file: values of which each must be refused with the last part of the path in the message
+ABSURD = {
+    "seed": [-1, 0.5],
+    "name": ["", "a/b"],
+    "phantom.size": [NAN, 0.0, -1.0, 2001.0, INF],
+    "phantom.n_voxel": [[0, 8, 8], [8, 8], [8, 8, 4096]],
+    "phantom.n_inserts": [-1, 17],
+    "phantom.insert_mm": [NAN, 0.0, 40.0],
+    "scanner.n_views": [0, 1.5],
+    "scanner.n_detector": [[0, 4], [4]],
+    "scanner.field_mm": [NAN, 0.0, INF],
+    "scanner.arc_deg": [NAN, 0.0, 361.0],
+    "scanner.start_deg": [NAN, INF],
+    "scanner.off_detector": [[NAN, 0.0]],
+    "scanner.off_origin": [[0.0, INF, 0.0]],
+    "scanner.i0": [NAN, 0.0, INF],
+    "scanner.tube.kvp": [NAN, 0.0, 501.0],
+    "scanner.tube.anode_deg": [NAN, 0.0, 91.0],
+    "scanner.tube.filters": [[{"material": "Al", "thickness": t}] for t in (NAN, -1.0)],
+    "scanner.tube.bowtie": [{"center": 0.0, "edge": NAN, "half_angle_deg": 9.0}],
+    "scanner.detector.thickness": [NAN, 0.0, 5e-324, 101.0],
+    "scanner.detector.threshold": [NAN, -1.0],
+    "scanner.noise.electronic": [NAN, -1.0, 1e7],
+    "scanner.noise.adc_bits": [3, 17],
+    "scanner.noise.pedestal": [NAN, 1.0],
+    "scanner.noise.dead_fraction": [NAN, 1.0],
+    "scanner.scatter.level": [2],
+    "scanner.scatter.fraction": [NAN, -1.0, 10.0],
+    "simulation.tolerance": [NAN, 0.0],
+    "simulation.subrays": [0, 257],
+    "truth.mono_kev": [[NAN], [0.0]],
+}
+ABSURDITIES = [(path, value) for path, values in ABSURD.items() for value in values]
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    plain=table(
+        {"name": st.just("x"), "phantom": PHANTOM, "scanner": SCANNER, "simulation": SETTINGS, "truth": TRUTH},
+        seed=st.integers(0, 2**63 - 1),
+        truncated=st.booleans(),
+    ),
+    spoilt=st.sampled_from(ABSURDITIES),
+)
+def test_random_scenes_simulate_or_are_refused_by_the_name_of_a_key(plain: dict, spoilt) -> None:
+    check_refusal(plain, *spoilt)
     try:
-        one = parse_suite(text, "x.toml")[0]
-        phantom = build(one)
+        one = parse_suite(tomli_w.dumps(plain), "x.toml")[0]
+        phantom, machine = build(one), one.resolve()
+        plan = make_plan(phantom, machine, one.simulation, one.truth, stream_id(one))
     except InputError as error:
-        assert str(error)
+        # an offset that cuts the object off, a threshold above all photons, sheets that let none through
+        assert any(key in str(error) for key in ("truncated", "threshold", "filters")) and "\n" not in str(error)
         return
     assert parse_suite(scene_to_toml(one)) == (one,)
-    assert phantom.labels.shape == n
-    again = build(one)
-    assert np.array_equal(phantom.labels, again.labels) and phantom.solids == again.solids
+    assert phantom.labels.shape == one.phantom.n_voxel
+    views = list(simulate_views(plan, phantom, machine))
+    assert [k for k, _ in views] == list(range(machine.geometry.n_views))
+    # without a pedestal electronic noise goes below zero; P does where scatter outweighs the object
+    signed = {"noise_free"} | ({"counts"} if machine.noise.electronic and not machine.noise.has_adc else set())
+    for _, images in views:
+        assert {name: (i.shape, i.dtype) for name, i in images.items()} == {
+            o.name: (o.shape, np.dtype(o.dtype)) for o in plan.outputs
+        }
+        for name, image in images.items():
+            assert np.isfinite(image).all(), name
+            assert name.split("/")[-1] in signed or image.min(initial=0) >= 0, name
+
+
+@pytest.mark.parametrize(("path", "value"), ABSURDITIES)
+def test_absurd_values_are_refused_by_the_name_of_their_key(path: str, value) -> None:
+    check_refusal({"name": "x", "phantom": {"recipe": "validation"}}, path, value)
+
+
+def check_refusal(plain: dict, path: str, value) -> None:
+    spoilt = copy.deepcopy(plain)
+    *tables, key = path.split(".")
+    functools.reduce(lambda t, k: t.setdefault(k, {}), tables, spoilt)[key] = value
+    with pytest.raises(InputError) as caught:
+        parse_suite(tomli_w.dumps(spoilt), "x.toml")
+    assert key in str(caught.value) and "\n" not in str(caught.value)

@@ -37,9 +37,8 @@ def _collect(prims, rects, active, u, ray, pair, hits):
 
 
 @njit(inline="always", error_model="numpy")
-def _paint(volume, ray, hits, n, covered, painted):
+def _paint(code, slot, pool, density, grid, ray, hits, n, covered, painted):
     """Set one ray's path lengths in the solids, in paint order, and in the volume where they replace it."""
-    code, slot, pool, density, grid = volume
     covered[:] = 0.0
     painted[:] = 0.0
     t = 0.0
@@ -61,18 +60,39 @@ def _paint(volume, ray, hits, n, covered, painted):
 
 
 @njit(inline="always", error_model="numpy")
-def _add_solids(volume, prims, rects, active, u, ray, scratch, background, at, lengths, column):
-    """Write one ray's path lengths into lengths[:, column]: `background`[:, at] but for the solids; count intervals."""
-    pair, hits, covered, painted = scratch
+def _add_solids(
+    code,
+    slot,
+    pool,
+    density,
+    grid,
+    prims,
+    rects,
+    active,
+    u,
+    ray,
+    pair,
+    hits,
+    covered,
+    painted,
+    row,
+    at,
+    lengths,
+    col,
+):
+    """Write one ray's path lengths into lengths[:, col]: `row`[:, at] but for the solids; count intervals.
+
+    The arguments are single arrays, since taking a tuple apart counts a reference for each.
+    """
     n = _collect(prims, rects, active, u, ray, pair, hits)
     if n == 0:
         for m in range(1, lengths.shape[0]):
-            lengths[m, column] = background[m, at]
+            lengths[m, col] = row[m, at]
         return 0
-    _paint(volume, ray, hits, n, covered, painted)
+    _paint(code, slot, pool, density, grid, ray, hits, n, covered, painted)
     for m in range(1, lengths.shape[0]):
         # a sub-ray can meet more of a thin structure than the pixel's central ray
-        lengths[m, column] = max(background[m, at] - covered[m], 0.0) + painted[m]
+        lengths[m, col] = max(row[m, at] - covered[m], 0.0) + painted[m]
     return n
 
 
@@ -149,13 +169,21 @@ def _corners(prims, rects, active, near, pose, v, edge_mu, out):
             out[u] = _thickness(hits, n, edge_mu)
 
 
+@njit(inline="always", error_model="numpy")
+def _is_open(background, u):
+    total = np.float32(0)
+    for m in range(1, background.shape[0]):
+        total += background[m, u]
+    return total == 0
+
+
 @njit(cache=True, error_model="numpy")
 def _trim(background, span, near):
     """Leave out the columns at both ends of a row in which nothing is met."""
     first, last = span[0], span[1]
-    while first < last and not near[first] and not background[1:, first].any():
+    while first < last and not near[first] and _is_open(background, first):
         first += 1
-    while first < last and not near[last - 1] and not background[1:, last - 1].any():
+    while first < last and not near[last - 1] and _is_open(background, last - 1):
         last -= 1
     return first, last
 
@@ -168,16 +196,21 @@ def _centres(volume, solids, pose, v, columns, background, lengths, centre):
     n_m, n_u = background.shape
     for m in range(1, n_m):
         lengths[m, : last - first] = background[m, first:last]
-    ray, scratch = np.empty(7), (np.empty(4), np.empty((2 * active.size + 1, 3)), np.empty(n_m), np.empty(n_m))
+    code, slot, pool, density, grid = volume
+    ray, pair, hits = np.empty(7), np.empty(4), np.empty((2 * active.size + 1, 3))
+    covered, painted = np.empty(n_m), np.empty(n_m)
     for u in range(first, last):
         if near[u]:
             aim(pose, u - (n_u - 1) / 2, v - (n_v - 1) / 2, ray)
-            n = _add_solids(volume, prims, rects, active, u, ray, scratch, background, u, lengths, u - first)
-            centre[u] = _thickness(scratch[1], n, edge_mu)
+            n = _add_solids(
+                code, slot, pool, density, grid, prims, rects, active, u, ray, pair, hits, covered, painted,
+                background, u, lengths, u - first,
+            )  # fmt: skip
+            centre[u] = _thickness(hits, n, edge_mu)
 
 
 @njit(cache=True, error_model="numpy")
-def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, extra, m1, m2):
+def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, m1, m2):
     """Measure again, by several rays each, the pixels of a row that the edge of a solid crosses."""
     prims, fat, rects, active, near = solids
     mu, w1, w2 = rule
@@ -187,7 +220,9 @@ def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, ex
     size = most * MOST_TIMES
     lengths = np.zeros((n_m, size), np.float32)
     tau, s1, s2 = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    ray, scratch = np.empty(7), (np.empty(4), np.empty((2 * active.size + 1, 3)), np.empty(n_m), np.empty(n_m))
+    code, slot, pool, density, grid = volume
+    ray, pair, hits = np.empty(7), np.empty(4), np.empty((2 * active.size + 1, 3))
+    covered, painted = np.empty(n_m), np.empty(n_m)
     thin = (fat[active, 0] >= 0).any()
     for u in range(first, last):
         if not near[u]:
@@ -195,7 +230,7 @@ def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, ex
         times = 0
         if thin:
             aim(pose, u - (n_u - 1) / 2, v - (n_v - 1) / 2, ray)
-            times = _grazes(fat, rects, active, u, ray, scratch[0])
+            times = _grazes(fat, rects, active, u, ray, pair)
         if times == 0 and changes[u] <= threshold:
             continue
         count = most * times if times else int(min(float(most), 4.0 + 4.0 * changes[u]))
@@ -203,9 +238,10 @@ def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, ex
             # a golden-section lattice has `count` distinct positions along u and along v
             du, dv = (i + 0.5) / count - 0.5, (i * GOLDEN + 0.5) % 1.0 - 0.5
             aim(pose, u + du - (n_u - 1) / 2, v + dv - (n_v - 1) / 2, ray)
-            _add_solids(volume, prims, rects, active, u + du, ray, scratch, background, u, lengths, i)
-        if extra.size:
-            lengths[n_m - 1, :count] += extra[u]
+            _add_solids(
+                code, slot, pool, density, grid, prims, rects, active, u + du, ray, pair, hits, covered, painted,
+                background, u, lengths, i,
+            )  # fmt: skip
         _signal(lengths, count, mu, w1, w2, tau, s1, s2)
         mean1, mean2 = 0.0, 0.0
         for i in range(count):
@@ -215,7 +251,7 @@ def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, ex
 
 
 @njit(cache=True, error_model="numpy")
-def _measure_row(volume, solids, pose, v, span, background, extra, rule, edge, corners, m1, m2):
+def _measure_row(volume, solids, pose, v, span, background, rule, edge, corners, m1, m2):
     """Measure columns span[0]…span[1] of row v; `corners` [2, u + 1] are those below and above once it is done."""
     prims, fat, rects = solids
     mu, w1, w2 = rule
@@ -228,16 +264,14 @@ def _measure_row(volume, solids, pose, v, span, background, extra, rule, edge, c
         _corners(prims, rects, active, near, pose, v + 0.5 - (n_v - 1) / 2, edge[0], corners[1])
     else:
         corners[1] = 0.0
-    row, layer = background[:, v], extra[v] if extra.size else extra.ravel()
-    first, last = (span[0], span[1]) if extra.size else _trim(row, span, near)
+    row = background[:, v]
+    first, last = _trim(row, span, near)
     if first >= last:
         return
     size, columns = last - first, (first, last, n_v)
     lengths, centre = np.zeros((n_m, size), np.float32), np.zeros(n_u)
     tau, s1, s2 = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
     _centres(volume, (prims, rects, active, near, edge[0]), pose, v, columns, row, lengths, centre)
-    if extra.size:
-        lengths[n_m - 1] += layer[first:last]
     _signal(lengths, size, mu, w1, w2, tau, s1, s2)
     m1[v, first:last], m2[v, first:last] = s1, s2
     if edges:
@@ -245,11 +279,11 @@ def _measure_row(volume, solids, pose, v, span, background, extra, rule, edge, c
             a, b, c, d = corners[0, u], corners[0, u + 1], corners[1, u], corners[1, u + 1]
             centre[u] = max(max(max(a, b), max(c, d)), centre[u]) - min(min(min(a, b), min(c, d)), centre[u])
         parts = (prims, fat, rects, active, near)
-        _edges(volume, parts, pose, v, columns, row, rule, edge, centre, layer, m1[v], m2[v])
+        _edges(volume, parts, pose, v, columns, row, rule, edge, centre, m1[v], m2[v])
 
 
 @njit(cache=True, error_model="numpy")
-def _measure_strip(volume, solids, pose, first, spans, background, extra, rule, edge, m1, m2):
+def _measure_strip(volume, solids, pose, first, spans, background, rule, edge, m1, m2):
     n_v, n_u = m1.shape
     corners = np.zeros((2, n_u + 1))
     active = _active(solids[2], first)
@@ -257,23 +291,22 @@ def _measure_strip(volume, solids, pose, first, spans, background, extra, rule, 
         near = _near(solids[2], active, n_u)
         _corners(solids[0], solids[2], active, near, pose, first - 0.5 - (n_v - 1) / 2, edge[0], corners[1])
     for v in range(first, min(first + STRIP, n_v)):
-        _measure_row(volume, solids, pose, v, spans[v], background, extra, rule, edge, corners, m1, m2)
+        _measure_row(volume, solids, pose, v, spans[v], background, rule, edge, corners, m1, m2)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def transmit_view(volume, solids, pose, order, spans, background, extra, rule, edge, m1, m2):
+def transmit_view(volume, solids, pose, order, spans, background, rule, edge, m1, m2):
     """Measure one view: mean signal `m1` and second moment `m2` [v, u] relative to the open field.
 
     `volume` is (code, slot, pool, density, grid) of `ctsim.bricks.Bricks` and `background` [material, v, u]
     (mm, float32) what the central rays cross in it. `solids` is (prims, fat, rects): primitive rows; their
     inflated twins, with kind −1 where not thin and how many times the usual sub-rays in the material's place; and
     their shadows (v from, to, u from, to). `pose` [12]; `order` [strip] is the order of work; only columns
-    spans[row] = (from, to) are touched. `extra` [v, u] is a length (mm) in the last material that every ray
-    crosses, or empty. `rule` is (mu [material, node] 1/mm, w1 [node], w2 [node]); `edge` is (edge_mu
-    [material], threshold in optical thickness, most sub-rays a pixel).
+    spans[row] = (from, to) are touched. `rule` is (mu [material, node] 1/mm, w1 [node], w2 [node]); `edge` is
+    (edge_mu [material], threshold in optical thickness, most sub-rays a pixel).
     """
     for index in prange(order.size):
-        _measure_strip(volume, solids, pose, order[index] * STRIP, spans, background, extra, rule, edge, m1, m2)
+        _measure_strip(volume, solids, pose, order[index] * STRIP, spans, background, rule, edge, m1, m2)
 
 
 @njit(cache=True, error_model="numpy")

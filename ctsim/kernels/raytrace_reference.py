@@ -105,7 +105,7 @@ def _n_subrays(solids, pose, u, v, edge):
     return min(most, 4 + int(4 * change)) if change > threshold else 1
 
 
-def transmit_view(bricks, solids, pose, order, spans, background, extra, rule, edge, m1, m2):
+def transmit_view(bricks, solids, pose, order, spans, background, rule, edge, m1, m2):
     """Measure one view: mean signal `m1` and second moment `m2` [v, u] relative to the open field."""
     volume, strip = _label_volume(bricks), -(-len(m1) // len(order))
     mu, w1, w2 = (np.asarray(a, np.float64) for a in rule)
@@ -120,8 +120,6 @@ def transmit_view(bricks, solids, pose, order, spans, background, extra, rule, e
                 dv = math.fmod(i * GOLDEN + 0.5, 1.0) - 0.5
                 _, under, solid = _lengths(volume, bricks[4], solids[0], _ray(pose, u + du, v + dv), len(mu))
                 lengths = np.maximum(background[:, row, column] - under, 0) + solid
-                if extra.size:
-                    lengths[-1] += extra[row, column]
                 passed = np.exp(-np.minimum(lengths @ mu, 80.0))
                 total1 += w1 @ passed
                 total2 += w2 @ passed
