@@ -259,6 +259,9 @@ class SceneWriter:
         return path
 
     def _full(self) -> InputError:
+        if self._files:
+            with contextlib.suppress(OSError):
+                self._checkpoint()  # the views that did find room
         return InputError(
             f"{self.data_dir}: the disk is full; scene {self.name!r} keeps its first {self._safe} of {self.n_views} "
             "views and goes on from there when it is made again"
