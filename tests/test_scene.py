@@ -74,6 +74,10 @@ def test_more_truth_keeps_the_noise() -> None:
         (MINIMAL + "scanner = { geometry = { dso = 1.0 } }", ["scanner.geometry"]),
         (MINIMAL + "scanner = { n_views = 0 }", ["scanner.n_views"]),
         (MINIMAL + 'scanner = { preset = "mri" }', ["scanner.preset", "mri"]),
+        (
+            MINIMAL + 'scanner = { detector = { kind = "counting", threshold = 90 } }',
+            ["detector.threshold", "kvp = 90"],
+        ),
     ],
 )
 def test_bad_files_are_refused_by_file_key_and_expectation(text: str, words: list[str]) -> None:
