@@ -187,7 +187,7 @@ def make_scene(
             writer.put(view, arrays)
         info = dict(scan_info(plan, phantom, scanner))
         writer.write_image("flat", info.pop("flat"), geometry.d_detector)
-        for name, volume in truth_volumes(plan, phantom, scanner).items():
+        for name, volume in truth_volumes(plan, phantom, scanner):
             writer.write_image(name, volume, geometry.d_voxel)
         writer.write_text("scene.toml", scene_to_toml(scene))
         writer.write_text("scan.json", _json(info))

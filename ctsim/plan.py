@@ -1,10 +1,9 @@
 """What a scene needs, what it does not, and what that costs: decided once, printed, then obeyed.
 
-A short survey traces a coarse detector in a few views. It tells which materials are met and how thick
-they are, hence how many energies reach the tolerance, and how fast this machine traces this scene.
+A short survey (`ctsim.survey`) tells how thick the materials are that are met, hence how many energies
+reach the tolerance, how long a view takes on this machine and how good the edges of the inserts are.
 """
 
-import time
 from dataclasses import dataclass
 
 import msgspec
@@ -15,19 +14,18 @@ from numpy.typing import NDArray
 from ctsim.detector import response
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.materials import attenuation
-from ctsim.project import Tracer, path_lengths
+from ctsim.project import Response, Tracer
 from ctsim.quadrature import EnergyRule, energy_rule, full_rule
 from ctsim.scatter import open_fraction
 from ctsim.settings import Simulation, Truth
 from ctsim.spectrum import Spectrum, spectrum
+from ctsim.survey import survey, trial
 from ctsim.types import Phantom, Scanner
 
-SURVEY_VIEWS, SURVEY_PIXELS = 8, 48
 THICKNESS_MARGIN = 1.1  # a coarse survey can miss the thickest ray
-NODE_SECONDS, NOISE_SECONDS, WRITE_SECONDS = 1.2e-9, 45e-9, 1e-9  # per ray and node, draw, byte; one core
+NOISE_SECONDS, WRITE_SECONDS, VOLUME_SECONDS = 40e-9, 1e-9, 1e-9  # a draw and core, a byte, a voxel of a reference
+PLANNING_BYTES = 45_000_000  # of the search for energies
 COLUMNS = ("rays", "does", "skips (reason)", "error", "time", "disk")
-SUBRAY_COST = 1.0  # extra traced rays per ray in a scene with inserts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,8 +50,10 @@ class Output:
 class Plan:
     """The work for one scan. `seconds` is an estimate for this machine, the only entry that differs between runs.
 
-    `materials` are those that are met, air first; `error` bounds |ΔP| of the energy quadrature;
-    `l0` is the median water-equivalent path of the body in mm.
+    `materials` are those that are met, air first. In P = −ln(signal/open), `error` bounds what the energy
+    quadrature does and `edge_error` is the largest found at the edge of an insert (see `ctsim.survey`); `l0` is
+    the median water-equivalent path of the body in mm. `memory_bytes` estimates the arrays; Python and its
+    libraries take a quarter of a gigabyte more.
     """
 
     stream_id: str
@@ -66,6 +66,7 @@ class Plan:
     spectrum: Spectrum
     l0: float
     scatter_fraction: float
+    edge_error: float
     n_rays: int
     seconds: float
     flops: float
@@ -93,6 +94,7 @@ class Plan:
             "energies_kev": [float(e) for e in self.rule.energies],
             "weights": [float(w) for w in self.rule.w1],
             "quadrature_error": float(self.error),
+            "edge_error": self.edge_error,
             "l0_mm": self.l0,
             "scatter_fraction": self.scatter_fraction,
             "rays": self.n_rays,
@@ -107,7 +109,8 @@ class Plan:
         does = ", ".join(s.name + (f" ({s.reason})" if s.reason else "") for s in self.stages if s.runs)
         skips = ", ".join(f"{s.name} ({s.reason})" for s in self.stages if not s.runs)
         rays, size = f"{self.n_rays / 1e6:.1f} M", f"{self.disk_bytes / 1e6:.0f} MB"
-        return rays, does, skips, f"{self.error:.0e}", f"{self.seconds:.0f} s", size
+        error = f"{self.error:.0e}" + (f", edges {self.edge_error:.0e}" if self.edge_error else "")
+        return rays, does, skips, error, f"{self.seconds:.0f} s", size
 
     def text(self) -> str:
         """Return the plan as lines of text."""
@@ -119,28 +122,17 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
     present = present_materials(phantom) if simulation.skip else phantom.materials
     if len(present) == 1 and not phantom.solids:
         raise InputError("the scene is empty: its labels are all air and it has no solids")
-    source = spectrum(scanner.tube)
-    survey = _survey(phantom, scanner.geometry)
+    source, tracer = spectrum(scanner.tube), Tracer.of(phantom)
+    found = survey(tracer, scanner.geometry)
     a1, _ = response(scanner.detector, source.energies)
     mean_energy = float(np.average(source.energies, weights=source.weights * a1))
-    thickest = {m: THICKNESS_MARGIN * float(np.max(survey.lengths[k])) for k, m in enumerate(phantom.materials)}
-    bowtie = scanner.tube.bowtie
-    if bowtie is not None:
-        thickest[bowtie.material] = thickest.get(bowtie.material, 0.0) + max(bowtie.center, bowtie.edge)
-    met = [m for m in thickest if m != "air"]
-    if simulation.skip:
-        lengths = [thickest[m] for m in met]
-        rule = energy_rule(source, scanner.detector, met, lengths, simulation.tolerance)
-    else:
-        rule = full_rule(source, scanner.detector)
+    rule = _rule(phantom, scanner, simulation, source, found.lengths)
+    twin = _has_twin(phantom, truth)
+    tried = trial(tracer, scanner.geometry, Response.of(rule, tracer.materials), subrays=simulation.subrays, twin=twin)
     outputs = _outputs(phantom, scanner, truth, present)
-    fraction = open_fraction(scanner.scatter, scanner.geometry)
-    n_rays = int(np.prod(scanner.geometry.shape))
-    pixels = float(n_rays)
-    per_ray = survey.seconds * (1 + SUBRAY_COST * bool(phantom.solids)) + NODE_SECONDS * len(rule.energies)
-    draws = pixels * (2 if _has_twin(phantom, truth) else 1) * (scanner.noise.model != "none")
-    disk = _disk_bytes(outputs, scanner.geometry, _has_twin(phantom, truth))
-    seconds = (pixels * per_ray + draws * NOISE_SECONDS) / numba.get_num_threads() + disk * WRITE_SECONDS
+    n_rays, n_voxels = int(np.prod(scanner.geometry.shape)), int(np.prod(scanner.geometry.n_voxel))
+    draws = n_rays * (2 if twin else 1) * (scanner.noise.model != "none")
+    disk = _disk_bytes(outputs, scanner.geometry, twin)
     return Plan(
         stream_id=stream_id,
         settings=simulation,
@@ -150,14 +142,32 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
         materials=present,
         rule=rule,
         spectrum=source,
-        l0=_median_path(survey, phantom, mean_energy),
-        scatter_fraction=fraction,
+        l0=found.median_path(phantom.materials, mean_energy),
+        scatter_fraction=open_fraction(scanner.scatter, scanner.geometry),
+        edge_error=tried.edge_error,
         n_rays=n_rays,
-        seconds=seconds,
-        flops=pixels * len(rule.energies) * (2 * len(present) + 16),
+        seconds=scanner.geometry.n_views * tried.seconds
+        + draws * NOISE_SECONDS / numba.get_num_threads()
+        + n_voxels * (2 if twin else 1) * VOLUME_SECONDS
+        + disk * WRITE_SECONDS,
+        flops=float(n_rays) * len(rule.energies) * (2 * len(present) + 16),
         disk_bytes=disk,
-        memory_bytes=int(3 * phantom.labels.size + 60 * np.prod(scanner.geometry.n_detector)),
+        memory_bytes=_memory_bytes(phantom, scanner.geometry),
     )
+
+
+def _rule(
+    phantom: Phantom, scanner: Scanner, simulation: Simulation, source: Spectrum, lengths: NDArray[np.float32]
+) -> EnergyRule:
+    """Return the energies for the thickest rays of the survey, `lengths` [material, view, v, u]."""
+    if not simulation.skip:
+        return full_rule(source, scanner.detector)
+    thickest = {m: THICKNESS_MARGIN * float(np.max(lengths[k])) for k, m in enumerate(phantom.materials)}
+    bowtie = scanner.tube.bowtie
+    if bowtie is not None:
+        thickest[bowtie.material] = thickest.get(bowtie.material, 0.0) + max(bowtie.center, bowtie.edge)
+    met = [m for m in thickest if m != "air"]
+    return energy_rule(source, scanner.detector, met, [thickest[m] for m in met], simulation.tolerance)
 
 
 def present_materials(phantom: Phantom) -> tuple[str, ...]:
@@ -165,49 +175,6 @@ def present_materials(phantom: Phantom) -> tuple[str, ...]:
     used = set(np.flatnonzero(np.bincount(phantom.labels.ravel(), minlength=len(phantom.materials))))
     solid = {s.material for s in phantom.solids}
     return tuple(m for k, m in enumerate(phantom.materials) if k == 0 or k in used or m in solid)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Survey:
-    """Path lengths [material, view, v, u] of coarse views and the seconds one ray took on one core."""
-
-    lengths: NDArray[np.float32]
-    body: NDArray[np.float32]
-    seconds: float
-
-
-def _survey(phantom: Phantom, geometry: Geometry) -> _Survey:
-    n = tuple(min(SURVEY_PIXELS, k) for k in geometry.n_detector)
-    v, u = (d * k / m for d, k, m in zip(geometry.d_detector, geometry.n_detector, n, strict=True))
-    views = np.unique(np.linspace(0, geometry.n_views - 1, min(SURVEY_VIEWS, geometry.n_views)).round().astype(int))
-    poses = geometry.pose_array()[views]
-    poses[:, 6:9] *= u / geometry.d_detector[1]
-    poses[:, 9:] *= v / geometry.d_detector[0]
-    coarse = msgspec.structs.replace(
-        geometry,
-        n_detector=n,
-        d_detector=(v, u),
-        n_views=len(views),
-        angles_deg=None,
-        poses=tuple(tuple(float(x) for x in row) for row in poses),
-    )
-    tracer = Tracer.of(phantom)
-    bare = tracer.without_metal()
-    path_lengths(tracer, coarse, 0)  # compile
-    start = time.perf_counter()
-    lengths = np.stack([path_lengths(tracer, coarse, k) for k in range(len(views))], 1)
-    seconds = (time.perf_counter() - start) * numba.get_num_threads() / lengths[0].size
-    body = np.stack([path_lengths(bare, coarse, k) for k in range(len(views))], 1) if tracer.metal.any() else lengths
-    return _Survey(lengths=lengths, body=body, seconds=seconds)
-
-
-def _median_path(survey: _Survey, phantom: Phantom, energy: float) -> float:
-    """Median water-equivalent path (mm) of the rays that meet the metal-free body, at the mean detected energy."""
-    at = np.array([energy])
-    mu = np.array([0.0, *(float(attenuation(m, at)[0]) for m in phantom.materials[1:])])
-    tau = np.tensordot(mu, survey.body, 1)
-    met = tau[tau > 0]
-    return float(np.median(met) / attenuation("water", at)[0]) if met.size else 0.0
 
 
 def _has_twin(phantom: Phantom, truth: Truth) -> bool:
@@ -239,6 +206,16 @@ def _disk_bytes(outputs: tuple[Output, ...], geometry: Geometry, twin: bool) -> 
     stacks = sum(int(np.prod(o.shape)) * np.dtype(o.dtype).itemsize for o in outputs) * geometry.n_views
     volumes = int(np.prod(geometry.n_voxel)) * (10 + (9 if twin else 0))
     return stacks + volumes + 4 * int(np.prod(geometry.n_detector))
+
+
+def _memory_bytes(phantom: Phantom, geometry: Geometry) -> int:
+    """Peak of the arrays held: those of planning and of a view, or those of the reference volumes."""
+    view = (8 * len(phantom.materials) + 60) * int(np.prod(geometry.n_detector))
+    radii = [p.radius / min(geometry.d_voxel) for s in phantom.solids for p in s.primitives]
+    n_voxels = int(np.prod(geometry.n_voxel))
+    sampled = min(n_voxels, int(sum(4.2 * r**3 for r in radii)))  # voxels that solids may fill in part
+    volumes = 19 * n_voxels + 24 * sampled
+    return phantom.labels.size + max(PLANNING_BYTES + 3 * phantom.labels.size + view, volumes)
 
 
 def _stages(

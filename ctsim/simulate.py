@@ -192,8 +192,8 @@ def flat_image(plan: Plan, scanner: Scanner) -> Image:
     )
 
 
-def truth_volumes(plan: Plan, phantom: Phantom, scanner: Scanner) -> dict[str, NDArray]:
-    """Return labels, metal mask and reference volumes on the reconstruction grid, and the twin's references.
+def truth_volumes(plan: Plan, phantom: Phantom, scanner: Scanner) -> Iterator[tuple[str, NDArray]]:
+    """Yield (name, volume) on the reconstruction grid: labels, metal mask, references, and the twin's references.
 
     `reference_50kev` is μ at 50 keV, `reference_effective` Σ ω(E) μ(E) behind the scene's median
     water-equivalent path, both float32 [z, y, x] in 1/mm.
@@ -203,18 +203,12 @@ def truth_volumes(plan: Plan, phantom: Phantom, scanner: Scanner) -> dict[str, N
     effective = _reference_mu(plan.materials, energies, omega)
     at_50 = _reference_mu(plan.materials, np.array([REFERENCE_KEV]), np.ones(1))
     body = compact(phantom, plan.materials)
-    out: dict[str, NDArray] = {
-        "labels": label_volume(body, geometry),
-        "metal": metal_mask(body, geometry),
-        "reference_effective": attenuation_volume(body, geometry, effective),
-        "reference_50kev": attenuation_volume(body, geometry, at_50),
-    }
-    if plan.runs("metal-free twin"):
-        bare = body.without_metal()
-        out["metal_free/labels"] = label_volume(bare, geometry)
-        out["metal_free/reference_effective"] = attenuation_volume(bare, geometry, effective)
-        out["metal_free/reference_50kev"] = attenuation_volume(bare, geometry, at_50)
-    return out
+    scans = [("", body)] + ([("metal_free/", body.without_metal())] if plan.runs("metal-free twin") else [])
+    yield "metal", metal_mask(body, geometry)
+    for prefix, content in scans:
+        yield prefix + "labels", label_volume(content, geometry)
+        yield prefix + "reference_effective", attenuation_volume(content, geometry, effective)
+        yield prefix + "reference_50kev", attenuation_volume(content, geometry, at_50)
 
 
 def _reference_mu(materials: tuple[str, ...], energies: NDArray, omega: NDArray) -> Mapping[str, float]:

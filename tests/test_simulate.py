@@ -148,7 +148,7 @@ def test_bow_tie_and_heel_cancel_in_the_flat_field():
 def test_references_hold_the_attenuation_of_their_materials():
     body, machine = phantom(), scanner()
     plan = make_plan(body, machine, Simulation(), Truth(), "scene")
-    volumes = truth_volumes(plan, body, machine)
+    volumes = dict(truth_volumes(plan, body, machine))
     assert volumes["reference_50kev"].shape == GEOMETRY.n_voxel
     fe = attenuation("Fe", np.array([50.0]))[0]
     # a 3 mm voxel in the middle of a rod of 3 mm radius is full of iron

@@ -18,6 +18,7 @@ from ctsim.kernels.solids_cpu import intersect
 STRIP = 8  # rows done one after the other: they compute 9 rows of pixel corners instead of 16
 GOLDEN = 0.6180339887498949
 MOST_TIMES = 16  # a primitive thinner than a pixel gets at most this many times the usual sub-rays
+ALL_SUBRAYS = 8.5  # a pixel across which the solids' optical thickness changes by 7.5 gets all, others a share
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
@@ -233,7 +234,7 @@ def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, m1
             times = _grazes(fat, rects, active, u, ray, pair)
         if times == 0 and changes[u] <= threshold:
             continue
-        count = most * times if times else int(min(float(most), 4.0 + 4.0 * changes[u]))
+        count = most * times if times else max(2, int(most * min(1.0, (1.0 + changes[u]) / ALL_SUBRAYS)))
         for i in range(count):
             # a golden-section lattice has `count` distinct positions along u and along v
             du, dv = (i + 0.5) / count - 0.5, (i * GOLDEN + 0.5) % 1.0 - 0.5

@@ -102,7 +102,7 @@ def _n_subrays(solids, pose, u, v, edge):
     corners = [_ray(pose, u + du, v + dv) for du in (-0.5, 0.5) for dv in (-0.5, 0.5)]
     tau = [_thickness(prims, ray, edge_mu) for ray in (centre, *corners)]
     change = max(tau) - min(tau)
-    return min(most, 4 + int(4 * change)) if change > threshold else 1
+    return max(2, int(most * min(1.0, (1 + change) / 8.5))) if change > threshold else 1
 
 
 def transmit_view(bricks, solids, pose, order, spans, background, rule, edge, m1, m2):

@@ -1,0 +1,103 @@
+"""What a scene is like before it is simulated: how thick, how fast on this machine, how good at edges.
+
+A coarse detector in a few views tells which lengths the energies must serve; one view at full size is timed;
+and around the pixel that sub-rays change most their result is compared with a much finer detector.
+"""
+
+import time
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.geometry import Geometry
+from ctsim.materials import attenuation
+from ctsim.project import Response, Tracer, path_lengths, row_spans, transmit
+
+VIEWS, PIXELS = 8, 48
+WINDOW, FINER = 8, 16  # pixels along the window's side, finer pixels along a pixel's side
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Survey:
+    """Path lengths (mm) [material, view, v, u] of coarse views, of the whole phantom and of it without metal."""
+
+    lengths: NDArray[np.float32]
+    body: NDArray[np.float32]
+
+    def median_path(self, materials: tuple[str, ...], energy: float) -> float:
+        """Median water-equivalent path (mm), at `energy` (keV), of the rays that meet the metal-free body."""
+        at = np.array([energy])
+        mu = np.array([0.0, *(float(attenuation(m, at)[0]) for m in materials[1:])])
+        tau = np.tensordot(mu, self.body, 1)
+        met = tau[tau > 0]
+        return float(np.median(met) / attenuation("water", at)[0]) if met.size else 0.0
+
+
+def survey(tracer: Tracer, geometry: Geometry) -> Survey:
+    """Trace a coarse detector in a few views spread over the scan."""
+    n = tuple(min(PIXELS, k) for k in geometry.n_detector)
+    v, u = (k / m for k, m in zip(geometry.n_detector, n, strict=True))
+    views = np.unique(np.linspace(0, geometry.n_views - 1, min(VIEWS, geometry.n_views)).round().astype(int))
+    poses = geometry.pose_array()[views]
+    poses[:, 6:9] *= u
+    poses[:, 9:] *= v
+    coarse = _with_poses(geometry, poses, n)
+    bare = tracer.without_metal()
+    lengths = np.stack([path_lengths(tracer, coarse, k) for k in range(len(views))], 1)
+    body = np.stack([path_lengths(bare, coarse, k) for k in range(len(views))], 1) if tracer.metal.any() else lengths
+    return Survey(lengths=lengths, body=body)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """One view at full size: seconds without noise and writing, and the largest |ΔP| seen at an edge."""
+
+    seconds: float
+    edge_error: float
+
+
+def trial(tracer: Tracer, geometry: Geometry, response: Response, *, subrays: int, twin: bool) -> Trial:
+    """Measure one view, and its metal-free twin if there is to be one, as the simulator does."""
+    view, shape = geometry.n_views // 2, geometry.n_detector
+    spans = row_spans(tracer.shadows(geometry.pose(view), shape)[tracer.metal], shape)
+    background, m1, seconds = tracer.background(geometry, view), np.empty(0), 0.0
+    for _ in range(2):  # the first call compiles
+        start = time.perf_counter()
+        tracer.background(geometry, view, background)
+        m1, m2 = transmit(tracer, geometry, view, response, subrays=subrays, background=background)
+        if twin:
+            bare, out = tracer.without_metal(), (m1.copy(), m2.copy(), spans)
+            transmit(bare, geometry, view, response, subrays=subrays, background=background, out=out)
+        seconds = time.perf_counter() - start
+    error = _edge_error(tracer, geometry, view, response, m1, background) if subrays > 1 else 0.0
+    return Trial(seconds=seconds, edge_error=error)
+
+
+def _edge_error(
+    tracer: Tracer, geometry: Geometry, view: int, response: Response, m1: NDArray, background: NDArray
+) -> float:
+    """Largest |ΔP| between `m1` [v, u] and a 16-fold finer detector around the pixel that sub-rays change most."""
+    plain, _ = transmit(tracer, geometry, view, response, subrays=1, background=background)
+    change = np.abs(np.log(m1 / plain))
+    if change.max() == 0:
+        return 0.0
+    at = np.unravel_index(change.argmax(), change.shape)
+    n_v, n_u = (min(WINDOW, n) for n in m1.shape)
+    v, u = (int(np.clip(k - n // 2, 0, m - n)) for k, n, m in zip(at, (n_v, n_u), m1.shape, strict=True))
+    window = slice(v, v + n_v), slice(u, u + n_u)
+    pose = geometry.pose(view).copy()
+    pose[3:6] += (u + (n_u - m1.shape[1]) / 2) * pose[6:9] + (v + (n_v - m1.shape[0]) / 2) * pose[9:]
+    pose[6:] /= FINER
+    fine = _with_poses(geometry, pose[None], (n_v * FINER, n_u * FINER))
+    under = background[:, *window].repeat(FINER, 1).repeat(FINER, 2)
+    rays, _ = transmit(tracer, fine, 0, response, subrays=64, background=np.ascontiguousarray(under))
+    exact = rays.reshape(n_v, FINER, n_u, FINER).mean((1, 3), dtype=np.float64)
+    return float(np.abs(np.log(m1[window] / exact)).max())
+
+
+def _with_poses(geometry: Geometry, poses: NDArray[np.float64], n_detector: tuple[int, ...]) -> Geometry:
+    n_v, n_u = n_detector
+    rows = tuple(tuple(float(x) for x in row) for row in poses)
+    return msgspec.structs.replace(geometry, n_detector=(n_v, n_u), n_views=len(rows), angles_deg=None, poses=rows)
