@@ -12,19 +12,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim import shadow
 from ctsim.bricks import Bricks, make_bricks
 from ctsim.columns import Columns, make_columns
 from ctsim.geometry import Geometry
 from ctsim.kernels import bricks_cpu, columns_cpu, raytrace_cpu
 from ctsim.materials import attenuation
 from ctsim.quadrature import EnergyRule
-from ctsim.solids import BOUND, BOX, CAPSULE, ELLIPSOID, FRUSTUM, KIND, MATERIAL, PARAMS, TORUS, pack
+from ctsim.solids import pack
 from ctsim.types import Phantom
 
 # Over a pixel in which the thickness changes linearly by R the intensity mean differs from the central
 # ray by R²/24 in P, so R = 0.1 costs 4e-4, below the photon noise of 1e6 photons.
 EDGE_THRESHOLD = 0.1
-THIN = 1.5  # primitives thinner than this many pixels can hide between the corners of a pixel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,59 +68,17 @@ class Tracer:
             order = work_order(-(-shape[1] // columns_cpu.LANES))
             columns_cpu.fill_view(tuple(self.columns), self.bricks.grid, pose, order, out)
         else:
-            spans = self.spans(pose, shape)
+            low, high = self.bricks.box[:3], self.bricks.box[3:]
+            seen = shadow.cast(pose, shape, shadow.box_corners(low, high)[: int(low[0] <= high[0])])
+            spans = shadow.row_spans(seen if self.skip else shadow.everywhere(shape, 1), shape[1])
             bricks_cpu.fill_view(self.bricks[:5], pose, work_order(shape[0]), spans, out)
         return out
 
-    def shadows(self, pose: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
-        """Rectangle (v from, v to, u from, u to) that holds each primitive's shadow: [primitive, 4]."""
-        centres, radii = self.prims[:, BOUND][:, :3], self.prims[:, BOUND][:, 3:]
-        return _rectangles(pose, shape, centres - radii, centres + radii)
-
-    def spans(self, pose: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.int64]:
-        """Columns (from, to) of each row that the object can darken: [v, 2]."""
+    def shadows(self, pose: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.int64]:
+        """Columns (from, to) of each row in which each primitive is seen, as `ctsim.shadow.cast` has them."""
         if not self.skip:
-            return np.tile(np.array([0, shape[1]]), (shape[0], 1))
-        rects = self.shadows(pose, shape)
-        if self.bricks.box[0] <= self.bricks.box[3]:
-            low, high = self.bricks.box[None, :3], self.bricks.box[None, 3:]
-            rects = np.vstack([rects, _rectangles(pose, shape, low, high)])
-        return row_spans(rects, shape)
-
-
-def row_spans(rects: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.int64]:
-    """Smallest column interval (from, to) of each row that covers all rectangles touching it: [v, 2]."""
-    spans = np.zeros((shape[0], 2), np.int64)
-    spans[:, 0] = shape[1]
-    for v0, v1, u0, u1 in rects:
-        rows = slice(max(int(v0), 0), max(int(v1) + 1, 0))
-        spans[rows, 0] = np.minimum(spans[rows, 0], max(int(u0), 0))
-        spans[rows, 1] = np.maximum(spans[rows, 1], min(int(u1) + 1, shape[1]))
-    spans[spans[:, 1] <= spans[:, 0]] = 0
-    return spans
-
-
-def _rectangles(
-    pose: NDArray[np.float64], shape: tuple[int, int], low: NDArray[np.float64], high: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Shadows of the axis-parallel boxes low…high [box, 3] in pixels, [box, 4]; all pixels if behind the source.
-
-    There is one pixel of margin.
-    """
-    corners = np.where(_CORNERS, high[:, None], low[:, None])  # [box, 8, 3]
-    source, centre, e_u, e_v = pose.reshape(4, 3)
-    normal = np.cross(e_u, e_v)
-    reach = (corners - source) @ normal / ((centre - source) @ normal)
-    behind = reach.min(1) <= 1e-9
-    hit = source + (corners - source) / np.where(behind[:, None], 1.0, reach)[..., None] - centre
-    u = hit @ e_u / (e_u @ e_u) + (shape[1] - 1) / 2
-    v = hit @ e_v / (e_v @ e_v) + (shape[0] - 1) / 2
-    tight = np.floor(v.min(1)) - 1, np.ceil(v.max(1)) + 1, np.floor(u.min(1)) - 1, np.ceil(u.max(1)) + 1
-    everything = np.array([0.0, shape[0] - 1.0, 0.0, shape[1] - 1.0])
-    return np.where(behind[:, None], everything, np.stack(tight, 1))
-
-
-_CORNERS = np.array([[(k >> axis) & 1 for axis in range(3)] for k in range(8)], bool)
+            return shadow.everywhere(shape, len(self.prims))
+        return shadow.cast(pose, shape, shadow.primitive_corners(self.prims))
 
 
 def _upright(pose: NDArray[np.float64]) -> bool:
@@ -128,31 +86,6 @@ def _upright(pose: NDArray[np.float64]) -> bool:
     e_u, e_v = pose[6:9], pose[9:]
     slant = max(abs(e_v[0]), abs(e_v[1])) / np.linalg.norm(e_v), abs(e_u[2]) / np.linalg.norm(e_u)
     return bool(e_v[2] > 0 and max(slant) < 1e-14)
-
-
-def _inflate(prims: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Grow the primitives that can hide within a pixel by its half diagonal; mark the others with kind −1."""
-    source, centre, e_u, e_v = pose.reshape(4, 3)
-    fat = prims.copy()
-    pixel = np.hypot(np.linalg.norm(e_u), np.linalg.norm(e_v)) / np.linalg.norm(centre - source)
-    pixel = pixel * np.linalg.norm(prims[:, BOUND][:, :3] - source, axis=1)
-    kind, sizes = prims[:, KIND].astype(int), prims[:, PARAMS]
-    thinnest = np.where(np.isin(kind, (ELLIPSOID, BOX)), sizes[:, :3].min(1), sizes[:, 1])
-    radius = np.maximum(sizes[:, 1], sizes[:, 2])
-    thinnest = np.where(kind == FRUSTUM, np.minimum(sizes[:, 0], radius), thinnest)
-    fat[:, PARAMS] += _GROWING[kind] * pixel[:, None] / 2
-    fat[:, BOUND.stop - 1] += 2 * pixel
-    fat[2 * thinnest >= THIN * pixel, KIND] = -1
-    # spacing of n lattice points is 1/√n of a pixel
-    times = np.ceil(THIN * pixel / np.maximum(2 * thinnest, 1e-3 * pixel))
-    fat[:, MATERIAL] = np.minimum(times, raytrace_cpu.MOST_TIMES)
-    return fat
-
-
-# which of a primitive's four parameters are half thicknesses, by kind
-_GROWING = np.zeros((5, 4))
-_GROWING[[ELLIPSOID, FRUSTUM, BOX], :3] = 1
-_GROWING[[CAPSULE, TORUS], 1] = 1
 
 
 def work_order(n_rows: int) -> NDArray[np.int64]:
@@ -243,7 +176,4 @@ def path_lengths(
 
 
 def _solids(tracer: Tracer, pose: NDArray[np.float64], shape: tuple[int, int]) -> tuple[NDArray, NDArray, NDArray]:
-    rects = tracer.shadows(pose, shape)
-    if not tracer.skip:
-        rects[:] = (-1.0, shape[0], -1.0, shape[1])
-    return tracer.prims, _inflate(tracer.prims, pose), rects
+    return tracer.prims, shadow.inflate(tracer.prims, pose), tracer.shadows(pose, shape)

@@ -16,9 +16,10 @@ from ctsim.errors import InputError
 from ctsim.materials import attenuation
 from ctsim.noise import detect, flat_field, pixel_pattern
 from ctsim.plan import Plan
-from ctsim.project import Response, Tracer, path_lengths, row_spans, transmit
+from ctsim.project import Response, Tracer, path_lengths, transmit
 from ctsim.quadrature import effective_weights
 from ctsim.rng import stream_key
+from ctsim.shadow import row_spans
 from ctsim.spectrum import bowtie_thickness, heel_factor
 from ctsim.types import Phantom, Scanner
 from ctsim.voxelise import attenuation_volume, label_volume, metal_mask
@@ -101,9 +102,7 @@ class _Simulator:
         if "metal_free/counts" in self.names:
             shape = self.geometry.n_detector
             # only pixels in the metal's shadow can differ
-            spans = row_spans(self.tracer.shadows(self.geometry.pose(k), shape)[self.tracer.metal], shape)
-            if not self.plan.settings.skip:
-                spans = np.tile(np.array([0, shape[1]]), (shape[0], 1))
+            spans = row_spans(self.tracer.shadows(self.geometry.pose(k), shape)[:, self.tracer.metal], shape[1])
             twin = self._transmit(self.bare, k, (m1.copy(), m2.copy(), spans))
             drawn = self._measured(*twin, k, (out["counts"].copy(), spans))
             out |= {f"metal_free/{name}": image for name, image in drawn.items()}

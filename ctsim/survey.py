@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
-from ctsim.project import Response, Tracer, path_lengths, row_spans, transmit
+from ctsim.project import Response, Tracer, path_lengths, transmit
+from ctsim.shadow import row_spans
 
 VIEWS, PIXELS = 8, 48
 WINDOW, FINER = 8, 16  # pixels along the window's side, finer pixels along a pixel's side
@@ -61,7 +62,7 @@ class Trial:
 def trial(tracer: Tracer, geometry: Geometry, response: Response, *, subrays: int, twin: bool) -> Trial:
     """Measure one view, and its metal-free twin if there is to be one, as the simulator does."""
     view, shape = geometry.n_views // 2, geometry.n_detector
-    spans = row_spans(tracer.shadows(geometry.pose(view), shape)[tracer.metal], shape)
+    spans = row_spans(tracer.shadows(geometry.pose(view), shape)[:, tracer.metal], shape[1])
     background, m1, seconds = tracer.background(geometry, view), np.empty(0), 0.0
     for _ in range(2):  # the first call compiles
         start = time.perf_counter()

@@ -14,20 +14,20 @@ from numba import njit, prange
 from ctsim.kernels.bricks_cpu import aim, walk
 from ctsim.kernels.exp_cpu import exp_minus
 from ctsim.kernels.solids_cpu import intersect
+from ctsim.shadow import MOST_TIMES
 
 STRIP = 8  # rows done one after the other: they compute 9 rows of pixel corners instead of 16
 GOLDEN = 0.6180339887498949
-MOST_TIMES = 16  # a primitive thinner than a pixel gets at most this many times the usual sub-rays
 ALL_SUBRAYS = 8.5  # a pixel across which the solids' optical thickness changes by 7.5 gets all, others a share
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
 @njit(inline="always", error_model="numpy")
-def _collect(prims, rects, active, u, ray, pair, hits):
+def _collect(prims, shadow, active, u, ray, pair, hits):
     """List the intervals of the active primitives near column u as (enter, leave, material); return how many."""
     n = 0
     for p in active:
-        if u < rects[p, 2] or u > rects[p, 3]:
+        if u < shadow[p, 0] or u > shadow[p, 1]:
             continue
         for i in range(intersect(prims[p], ray[0], ray[1], ray[2], ray[3], ray[4], ray[5], pair)):
             enter, leave = max(pair[2 * i], 0.0), min(pair[2 * i + 1], ray[6])
@@ -68,7 +68,7 @@ def _add_solids(
     density,
     grid,
     prims,
-    rects,
+    shadow,
     active,
     u,
     ray,
@@ -85,7 +85,7 @@ def _add_solids(
 
     The arguments are single arrays, since taking a tuple apart counts a reference for each.
     """
-    n = _collect(prims, rects, active, u, ray, pair, hits)
+    n = _collect(prims, shadow, active, u, ray, pair, hits)
     if n == 0:
         for m in range(1, lengths.shape[0]):
             lengths[m, col] = row[m, at]
@@ -126,39 +126,39 @@ def _signal(lengths, n, mu, w1, w2, tau, s1, s2):
 
 
 @njit(cache=True, error_model="numpy")
-def _active(rects, v):
-    """Return the indices of the primitives whose shadow may reach row v."""
-    out = np.empty(rects.shape[0], np.int64)
+def _active(shadow):
+    """Return the indices of the primitives that are seen in a row."""
+    out = np.empty(shadow.shape[0], np.int64)
     n = 0
-    for p in range(rects.shape[0]):
-        if rects[p, 0] <= v <= rects[p, 1]:
+    for p in range(shadow.shape[0]):
+        if shadow[p, 0] <= shadow[p, 1]:
             out[n] = p
             n += 1
     return out[:n]
 
 
 @njit(inline="always", error_model="numpy")
-def _grazes(fat, rects, active, u, ray, pair):
+def _grazes(fat, shadow, active, u, ray, pair):
     """Return how many times the usual sub-rays a primitive needs that can hide between a pixel's corners."""
     times = 0
     for p in active:
-        near = fat[p, 0] >= 0 and rects[p, 2] <= u <= rects[p, 3]
+        near = fat[p, 0] >= 0 and shadow[p, 0] <= u <= shadow[p, 1]
         if near and intersect(fat[p], ray[0], ray[1], ray[2], ray[3], ray[4], ray[5], pair) > 0:
             times = max(times, int(fat[p, 1]))
     return times
 
 
 @njit(cache=True, error_model="numpy")
-def _near(rects, active, n_u):
+def _near(shadow, active, n_u):
     """Mark the columns that the shadows of the active primitives may reach."""
     out = np.zeros(n_u + 1, np.bool_)
     for p in active:
-        out[max(int(rects[p, 2]), 0) : max(min(int(rects[p, 3]) + 2, n_u + 1), 0)] = True
+        out[max(shadow[p, 0], 0) : shadow[p, 1] + 2] = True
     return out
 
 
 @njit(cache=True, error_model="numpy")
-def _corners(prims, rects, active, near, pose, v, edge_mu, out):
+def _corners(prims, shadow, active, near, pose, v, edge_mu, out):
     """Fill `out` [u + 1] with the solids' thickness at the pixel corners at height v (from the detector's centre)."""
     ray, pair, hits = np.empty(7), np.empty(4), np.empty((2 * active.size, 3))
     middle = (out.size - 2) / 2
@@ -166,7 +166,7 @@ def _corners(prims, rects, active, near, pose, v, edge_mu, out):
         out[u] = 0.0
         if near[u]:
             aim(pose, u - 0.5 - middle, v, ray)
-            n = _collect(prims, rects, active, u - 0.5, ray, pair, hits)
+            n = _collect(prims, shadow, active, u - 0.5, ray, pair, hits)
             out[u] = _thickness(hits, n, edge_mu)
 
 
@@ -192,7 +192,7 @@ def _trim(background, span, near):
 @njit(cache=True, error_model="numpy")
 def _centres(volume, solids, pose, v, columns, background, lengths, centre):
     """Fill `lengths` [material, column] with the central rays of a row and `centre` [u] with the solids' thickness."""
-    prims, rects, active, near, edge_mu = solids
+    prims, shadow, active, near, edge_mu = solids
     first, last, n_v = columns
     n_m, n_u = background.shape
     for m in range(1, n_m):
@@ -204,7 +204,7 @@ def _centres(volume, solids, pose, v, columns, background, lengths, centre):
         if near[u]:
             aim(pose, u - (n_u - 1) / 2, v - (n_v - 1) / 2, ray)
             n = _add_solids(
-                code, slot, pool, density, grid, prims, rects, active, u, ray, pair, hits, covered, painted,
+                code, slot, pool, density, grid, prims, shadow, active, u, ray, pair, hits, covered, painted,
                 background, u, lengths, u - first,
             )  # fmt: skip
             centre[u] = _thickness(hits, n, edge_mu)
@@ -213,7 +213,7 @@ def _centres(volume, solids, pose, v, columns, background, lengths, centre):
 @njit(cache=True, error_model="numpy")
 def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, m1, m2):
     """Measure again, by several rays each, the pixels of a row that the edge of a solid crosses."""
-    prims, fat, rects, active, near = solids
+    prims, fat, shadow, active, near = solids
     mu, w1, w2 = rule
     _, threshold, most = edge
     first, last, n_v = columns
@@ -231,7 +231,7 @@ def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, m1
         times = 0
         if thin:
             aim(pose, u - (n_u - 1) / 2, v - (n_v - 1) / 2, ray)
-            times = _grazes(fat, rects, active, u, ray, pair)
+            times = _grazes(fat, shadow, active, u, ray, pair)
         if times == 0 and changes[u] <= threshold:
             continue
         count = most * times if times else max(2, int(most * min(1.0, (1.0 + changes[u]) / ALL_SUBRAYS)))
@@ -240,7 +240,7 @@ def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, m1
             du, dv = (i + 0.5) / count - 0.5, (i * GOLDEN + 0.5) % 1.0 - 0.5
             aim(pose, u + du - (n_u - 1) / 2, v + dv - (n_v - 1) / 2, ray)
             _add_solids(
-                code, slot, pool, density, grid, prims, rects, active, u + du, ray, pair, hits, covered, painted,
+                code, slot, pool, density, grid, prims, shadow, active, u + du, ray, pair, hits, covered, painted,
                 background, u, lengths, i,
             )  # fmt: skip
         _signal(lengths, count, mu, w1, w2, tau, s1, s2)
@@ -254,15 +254,16 @@ def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, m1
 @njit(cache=True, error_model="numpy")
 def _measure_row(volume, solids, pose, v, span, background, rule, edge, corners, m1, m2):
     """Measure columns span[0]…span[1] of row v; `corners` [2, u + 1] are those below and above once it is done."""
-    prims, fat, rects = solids
+    prims, fat, shadows = solids
+    shadow = shadows[v]
     mu, w1, w2 = rule
     n_m, n_v, n_u = background.shape
-    active = _active(rects, v)
-    near = _near(rects, active, n_u)
+    active = _active(shadow)
+    near = _near(shadow, active, n_u)
     edges = active.size > 0 and edge[2] > 1
     if edges:
         corners[0] = corners[1]
-        _corners(prims, rects, active, near, pose, v + 0.5 - (n_v - 1) / 2, edge[0], corners[1])
+        _corners(prims, shadow, active, near, pose, v + 0.5 - (n_v - 1) / 2, edge[0], corners[1])
     else:
         corners[1] = 0.0
     row = background[:, v]
@@ -272,14 +273,14 @@ def _measure_row(volume, solids, pose, v, span, background, rule, edge, corners,
     size, columns = last - first, (first, last, n_v)
     lengths, centre = np.zeros((n_m, size), np.float32), np.zeros(n_u)
     tau, s1, s2 = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    _centres(volume, (prims, rects, active, near, edge[0]), pose, v, columns, row, lengths, centre)
+    _centres(volume, (prims, shadow, active, near, edge[0]), pose, v, columns, row, lengths, centre)
     _signal(lengths, size, mu, w1, w2, tau, s1, s2)
     m1[v, first:last], m2[v, first:last] = s1, s2
     if edges:
         for u in range(first, last):
             a, b, c, d = corners[0, u], corners[0, u + 1], corners[1, u], corners[1, u + 1]
             centre[u] = max(max(max(a, b), max(c, d)), centre[u]) - min(min(min(a, b), min(c, d)), centre[u])
-        parts = (prims, fat, rects, active, near)
+        parts = (prims, fat, shadow, active, near)
         _edges(volume, parts, pose, v, columns, row, rule, edge, centre, m1[v], m2[v])
 
 
@@ -287,10 +288,11 @@ def _measure_row(volume, solids, pose, v, span, background, rule, edge, corners,
 def _measure_strip(volume, solids, pose, first, spans, background, rule, edge, m1, m2):
     n_v, n_u = m1.shape
     corners = np.zeros((2, n_u + 1))
-    active = _active(solids[2], first)
+    shadow = solids[2][first]
+    active = _active(shadow)
     if active.size > 0 and edge[2] > 1:
-        near = _near(solids[2], active, n_u)
-        _corners(solids[0], solids[2], active, near, pose, first - 0.5 - (n_v - 1) / 2, edge[0], corners[1])
+        near = _near(shadow, active, n_u)
+        _corners(solids[0], shadow, active, near, pose, first - 0.5 - (n_v - 1) / 2, edge[0], corners[1])
     for v in range(first, min(first + STRIP, n_v)):
         _measure_row(volume, solids, pose, v, spans[v], background, rule, edge, corners, m1, m2)
 
@@ -300,11 +302,11 @@ def transmit_view(volume, solids, pose, order, spans, background, rule, edge, m1
     """Measure one view: mean signal `m1` and second moment `m2` [v, u] relative to the open field.
 
     `volume` is (code, slot, pool, density, grid) of `ctsim.bricks.Bricks` and `background` [material, v, u]
-    (mm, float32) what the central rays cross in it. `solids` is (prims, fat, rects): primitive rows; their
-    inflated twins, with kind −1 where not thin and how many times the usual sub-rays in the material's place; and
-    their shadows (v from, to, u from, to). `pose` [12]; `order` [strip] is the order of work; only columns
-    spans[row] = (from, to) are touched. `rule` is (mu [material, node] 1/mm, w1 [node], w2 [node]); `edge` is
-    (edge_mu [material], threshold in optical thickness, most sub-rays a pixel).
+    (mm, float32) what the central rays cross in it. `solids` is (prims, fat, shadows): primitive rows, their
+    inflated twins and the columns in which they are seen (`ctsim.shadow.inflate` and `cast`). `pose` [12];
+    `order` [strip] is the order of work; only columns spans[row] = (from, to) are touched. `rule` is
+    (mu [material, node] 1/mm, w1 [node], w2 [node]); `edge` is (edge_mu [material], threshold in optical
+    thickness, most sub-rays a pixel).
     """
     for index in prange(order.size):
         _measure_strip(volume, solids, pose, order[index] * STRIP, spans, background, rule, edge, m1, m2)
@@ -312,10 +314,11 @@ def transmit_view(volume, solids, pose, order, spans, background, rule, edge, m1
 
 @njit(cache=True, error_model="numpy")
 def _replace_row(volume, solids, pose, v, background, lengths):
-    prims, _, rects = solids
+    prims, _, shadows = solids
+    shadow = shadows[v]
     _, n_v, n_u = background.shape
-    active = _active(rects, v)
-    parts = (prims, rects, active, _near(rects, active, n_u), np.zeros(lengths.shape[0]))
+    active = _active(shadow)
+    parts = (prims, shadow, active, _near(shadow, active, n_u), np.zeros(lengths.shape[0]))
     _centres(volume, parts, pose, v, (0, n_u, n_v), background[:, v], lengths[:, v], np.zeros(n_u))
 
 

@@ -1,0 +1,117 @@
+"""Where a shadow falls on the detector: in every row, the columns that a part of the object can darken."""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ctsim.solids import BOUND, BOX, CAPSULE, ELLIPSOID, FRUSTUM, KIND, MATERIAL, MATRIX, PARAMS, TORUS
+
+THIN = 1.5  # primitives thinner than this many pixels can hide between the corners of a pixel
+MOST_TIMES = 16  # and get at most this many times the usual sub-rays
+_SIGNS = np.array([[2 * ((k >> axis) & 1) - 1 for axis in range(3)] for k in range(8)])
+
+
+def box_corners(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Corners of an axis-parallel box in mm: [1, 8, 3]."""
+    return np.where(_SIGNS > 0, high, low)[None]
+
+
+def primitive_corners(prims: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Corners of a box around each primitive, along its own axes, in mm: [primitive, 8, 3]."""
+    kind, (a, b, c) = prims[:, KIND].astype(int), prims[:, PARAMS].T[:3]
+    half = np.stack([a, b, c], 1)  # ellipsoid, box
+    across, along = np.zeros(len(prims)), np.zeros(len(prims))
+    for of, width, length in ((FRUSTUM, np.maximum(b, c), a), (CAPSULE, b, a + b), (TORUS, a + b, b)):
+        across, along = np.where(kind == of, width, across), np.where(kind == of, length, along)
+    upright = np.isin(kind, (FRUSTUM, CAPSULE, TORUS))
+    half[upright] = np.stack([across, across, along], 1)[upright]
+    rotation = prims[:, MATRIX].reshape(-1, 3, 3)
+    return prims[:, None, BOUND][..., :3] + (_SIGNS * half[:, None]) @ rotation
+
+
+def cast(pose: NDArray[np.float64], shape: tuple[int, int], corners: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Columns (from, to) of each row in which the hulls of `corners` [part, 8, 3] are seen: [v, part, 2].
+
+    Both ends are meant, there is one pixel of margin on every side (so −1…n_u at most), and from > to where nothing
+    is seen. A part that reaches behind the source is seen everywhere.
+    """
+    source, centre, e_u, e_v = pose.reshape(4, 3)
+    normal = np.cross(e_u, e_v)
+    reach = (corners - source) @ normal / ((centre - source) @ normal)
+    behind = (reach <= 1e-9).any(1)
+    hit = source + (corners - source) / np.where(behind[:, None], 1.0, reach)[..., None] - centre
+    u = hit @ e_u / (e_u @ e_u) + (shape[1] - 1) / 2
+    v = hit @ e_v / (e_v @ e_v) + (shape[0] - 1) / 2
+    out = np.empty((shape[0], len(corners), 2), np.int64)
+    _fill(u, v, behind, shape[1], out)
+    return out
+
+
+@njit(cache=True)
+def _fill(us, vs, behind, n_u, out):
+    """Join the shadows' corners in pairs: the outermost of these lines in a row are the hull's border."""
+    n_v = out.shape[0]
+    for p in range(us.shape[0]):
+        out[:, p, 0], out[:, p, 1] = n_u, -1
+        if behind[p]:
+            out[:, p, 0], out[:, p, 1] = -1, n_u
+            continue
+        for i in range(us.shape[1]):
+            for j in range(us.shape[1]):
+                u0, v0, u1, v1 = us[p, i], vs[p, i], us[p, j], vs[p, j]
+                if v0 > v1 or i == j:
+                    continue
+                slope = (u1 - u0) / (v1 - v0) if v1 > v0 else 0.0
+                for v in range(int(min(max(v0 - 1.0, 0.0), n_v)), int(min(max(v1 + 2.0, 0.0), n_v))):
+                    # the part of the line within a row of the margin
+                    low, high = min(max(v - 1.0, v0), v1), max(min(v + 1.0, v1), v0)
+                    a, b = u0 + slope * (low - v0), u0 + slope * (high - v0)
+                    if v1 == v0:
+                        b = u1
+                    left, right = min(max(min(a, b), -9.0), n_u + 9.0), min(max(max(a, b), -9.0), n_u + 9.0)
+                    out[v, p, 0] = min(out[v, p, 0], max(int(np.floor(left)) - 1, -1))
+                    out[v, p, 1] = max(out[v, p, 1], min(int(np.ceil(right)) + 1, n_u))
+        for v in range(n_v):
+            if out[v, p, 1] < 0 or out[v, p, 0] > n_u - 1:  # beside the detector
+                out[v, p, 0], out[v, p, 1] = n_u, -1
+
+
+def everywhere(shape: tuple[int, int], n_parts: int) -> NDArray[np.int64]:
+    """Return what `cast` does for parts that are seen in every pixel."""
+    return np.tile(np.array([-1, shape[1]]), (shape[0], n_parts, 1))
+
+
+def row_spans(shadows: NDArray[np.int64], n_u: int) -> NDArray[np.int64]:
+    """Columns (from, to), the latter left out, that hold all parts of [v, part, 2] in each row: [v, 2]."""
+    low, high = shadows[..., 0].min(1, initial=n_u), shadows[..., 1].max(1, initial=-1)
+    out = np.stack([np.maximum(low, 0), np.minimum(high + 1, n_u)], 1)
+    out[out[:, 0] >= out[:, 1]] = 0
+    return out
+
+
+def inflate(prims: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Grow the primitives that can hide within a pixel by its half diagonal; mark the others with kind −1.
+
+    The material's place holds how many times the usual sub-rays such a primitive needs.
+    """
+    source, centre, e_u, e_v = pose.reshape(4, 3)
+    fat = prims.copy()
+    pixel = np.hypot(np.linalg.norm(e_u), np.linalg.norm(e_v)) / np.linalg.norm(centre - source)
+    pixel = pixel * np.linalg.norm(prims[:, BOUND][:, :3] - source, axis=1)
+    kind, sizes = prims[:, KIND].astype(int), prims[:, PARAMS]
+    thinnest = np.where(np.isin(kind, (ELLIPSOID, BOX)), sizes[:, :3].min(1), sizes[:, 1])
+    radius = np.maximum(sizes[:, 1], sizes[:, 2])
+    thinnest = np.where(kind == FRUSTUM, np.minimum(sizes[:, 0], radius), thinnest)
+    fat[:, PARAMS] += _GROWING[kind] * pixel[:, None] / 2
+    fat[:, BOUND.stop - 1] += 2 * pixel
+    fat[2 * thinnest >= THIN * pixel, KIND] = -1
+    # spacing of n lattice points is 1/√n of a pixel
+    times = np.ceil(THIN * pixel / np.maximum(2 * thinnest, 1e-3 * pixel))
+    fat[:, MATERIAL] = np.minimum(times, MOST_TIMES)
+    return fat
+
+
+# which of a primitive's four parameters are half thicknesses, by kind
+_GROWING = np.zeros((5, 4))
+_GROWING[[ELLIPSOID, FRUSTUM, BOX], :3] = 1
+_GROWING[[CAPSULE, TORUS], 1] = 1
