@@ -129,8 +129,8 @@ def transmit(
     """Measure one view without noise: signal and second moment relative to the open field, each [v, u].
 
     The signal is Σ w1·exp(−Σ μ·L) averaged over the pixel; the variance of one photon-noise draw is the
-    second moment over the photons of an open pixel. The label volume is sampled along the central ray, solids
-    and what they replace along every sub-ray. `background` is what `Tracer.background` returned for this view,
+    second moment over the photons of an open pixel. The label volume is sampled along the central ray, the
+    solids along every sub-ray. `background` is what `Tracer.background` returned for this view,
     if known, plus what else the rays cross. `out` = (signal, second moment, spans) updates only those columns
     of given images.
     """

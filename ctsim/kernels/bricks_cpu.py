@@ -20,8 +20,11 @@ TINY = 1e-12  # a direction cosine below this counts as parallel to the axis
 
 
 @njit(inline="always", error_model="numpy")
-def walk(code, slot, pool, density, grid, ray, t_from, t_to, lengths):
-    """Add the background's path lengths between t_from and t_to (mm along the ray) to `lengths`."""
+def walk(code, slot, pool, density, grid, ray, t_from, t_to, pieces):
+    """List what a ray crosses between t_from and t_to (mm along it) as pieces (end, label, density); return how many.
+
+    The first piece is air and ends where the volume begins. `pieces` has room for nx + ny + nz + 8 of them.
+    """
     # positions in voxels; the ray parameter stays in mm
     ox, oy, oz = (ray[0] - grid[6]) * grid[3], (ray[1] - grid[7]) * grid[4], (ray[2] - grid[8]) * grid[5]
     dx, dy, dz = ray[3] * grid[3], ray[4] * grid[4], ray[5] * grid[5]
@@ -34,7 +37,10 @@ def walk(code, slot, pool, density, grid, ray, t_from, t_to, lengths):
     t = max(max(t_from, x0 if ux else x1), max(y0 if uy else y1, z0 if uz else z1))
     end = min(min(t_to, x1 if ux else x0), min(y1 if uy else y0, z1 if uz else z0))
     if not t < end:
-        return
+        return 0
+    dense = density.size > 0
+    n, last = 0, 0
+    pieces[0, 0], pieces[0, 1], pieces[0, 2] = t, 0.0, 1.0
     octant = ux + 2 * uy + 4 * uz
     _, mz, my, mx = code.shape
     sx, sy, sz = 2 * ux - 1, 2 * uy - 1, 2 * uz - 1
@@ -55,11 +61,12 @@ def walk(code, slot, pool, density, grid, ray, t_from, t_to, lengths):
             ty = ((by + uy + sy * more) * SIDE - oy) * iy
             tz = ((bz + uz + sz * more) * SIDE - oz) * iz
             leave = min(tx, min(ty, tz))
-            if leave >= end:
-                lengths[label] += end - t
-                return
             if leave > t:
-                lengths[label] += leave - t
+                n += int(label != last or dense)
+                last = label
+                pieces[n, 0], pieces[n, 1], pieces[n, 2] = min(leave, end), label, 1.0
+                if leave >= end:
+                    return n + 1
                 t = leave
             if more == 0:
                 bx += sx if tx == leave else 0
@@ -84,12 +91,12 @@ def walk(code, slot, pool, density, grid, ray, t_from, t_to, lengths):
             cell = base + (z * SIDE + y) * SIDE + x
             while True:
                 leave = min(cx, min(cy, cz))
-                step = max(min(leave, stop) - at, 0)
                 at = max(at, leave)
-                if density.size > 0:
-                    lengths[pool[cell]] += step * density[cell] * (1.0 / FIXED)
-                else:
-                    lengths[pool[cell]] += step * (1.0 / FIXED)
+                label = pool[cell]
+                n += int(label != last or dense)
+                last = label
+                pieces[n, 0], pieces[n, 1] = min(at, stop) * (1.0 / FIXED), label
+                pieces[n, 2] = density[cell] if dense else 1.0
                 # no branch tells the axes apart: a wrong guess costs more than the additions
                 gx, gy, gz = -np.int64(cx == leave), -np.int64(cy == leave), -np.int64(cz == leave)
                 x += sx & gx
@@ -103,12 +110,23 @@ def walk(code, slot, pool, density, grid, ray, t_from, t_to, lengths):
                 cell += (sx & gx) + (sy * SIDE & gy) + (sz * SIDE * SIDE & gz)
             t = at * (1.0 / FIXED)
             if at >= stop:
-                return
+                return n + 1
             bx += x >> SHIFT
             by += y >> SHIFT
             bz += z >> SHIFT
         if bx < 0 or by < 0 or bz < 0 or bx >= mx or by >= my or bz >= mz:
-            return
+            return n + 1
+
+
+@njit(inline="always", error_model="numpy")
+def add_pieces(pieces, n, t_from, t_to, lengths):
+    """Add to `lengths` [material] what n pieces of `walk` hold between t_from and t_to."""
+    t = t_from
+    for k in range(n):
+        end = min(pieces[k, 0], t_to)
+        if end > t:
+            lengths[int(pieces[k, 1])] += (end - t) * pieces[k, 2]
+            t = end
 
 
 @njit(inline="always", error_model="numpy")
@@ -128,11 +146,12 @@ def _fill_row(volume, pose, v, span, lengths):
     code, slot, pool, density, grid = volume
     n_m, n_v, n_u = lengths.shape
     ray, row = np.empty(7), np.empty(n_m)
+    pieces = np.empty((int(grid[:3].sum()) + 8, 3))
     lengths[1:, v] = 0
     for u in range(span[0], span[1]):
         aim(pose, u - (n_u - 1) / 2, v - (n_v - 1) / 2, ray)
         row[:] = 0.0
-        walk(code, slot, pool, density, grid, ray, 0.0, ray[6], row)
+        add_pieces(pieces, walk(code, slot, pool, density, grid, ray, 0.0, ray[6], pieces), 0.0, ray[6], row)
         for m in range(1, n_m):
             lengths[m, v, u] = row[m]
 

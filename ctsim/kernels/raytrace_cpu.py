@@ -3,15 +3,16 @@
 What a pixel's central ray crosses in the label volume is given (`columns_cpu`, `bricks_cpu`). Solids are
 intersected exactly and replace the volume along their intervals. Pixels that the edge of a solid crosses are
 measured by several rays and averaged in *intensity*, as a detector does; what differs between those rays is
-the solids and what they replace. Rows are done in strips, so that neighbours share their pixels' corners; a
-strip depends on no other, so results are bitwise equal for any number of threads. What runs once a ray is inlined:
-a call would count references of its arrays atomically, which costs more than the ray.
+the solids, while the volume is always that of the central ray. Rows are done in strips, so that neighbours
+share their pixels' corners; a strip depends on no other, so results are bitwise equal for any number of
+threads. What runs once a ray is inlined: a call would count references of its arrays atomically, which costs
+more than the ray.
 """
 
 import numpy as np
 from numba import njit, prange
 
-from ctsim.kernels.bricks_cpu import aim, walk
+from ctsim.kernels.bricks_cpu import add_pieces, aim, walk
 from ctsim.kernels.exp_cpu import exp_minus
 from ctsim.kernels.solids_cpu import intersect
 from ctsim.shadow import MOST_TIMES
@@ -38,14 +39,16 @@ def _collect(prims, shadow, active, u, ray, pair, hits):
 
 
 @njit(inline="always", error_model="numpy")
-def _paint(code, slot, pool, density, grid, ray, hits, n, covered, painted):
-    """Set one ray's path lengths in the solids, in paint order, and in the volume where they replace it."""
+def _paint(hits, n, pieces, n_pieces, covered, painted):
+    """Set a ray's path lengths in the n solids hit, in paint order, and in the volume's pieces that they replace."""
     covered[:] = 0.0
     painted[:] = 0.0
-    t = 0.0
-    while t < ray[6]:
+    t, far = hits[0, 0], hits[0, 1]
+    for i in range(1, n):
+        t, far = min(t, hits[i, 0]), max(far, hits[i, 1])
+    while t < far:
         # the topmost interval that covers t decides, until it ends or one painted later begins
-        top, until = -1, ray[6]
+        top, until = -1, far
         for i in range(n):
             if hits[i, 0] <= t < hits[i, 1]:
                 top = i
@@ -56,45 +59,8 @@ def _paint(code, slot, pool, density, grid, ray, hits, n, covered, painted):
                 until = hits[i, 0]
         if top >= 0:
             painted[int(hits[top, 2])] += until - t
-            walk(code, slot, pool, density, grid, ray, t, until, covered)
+            add_pieces(pieces, n_pieces, t, until, covered)
         t = until
-
-
-@njit(inline="always", error_model="numpy")
-def _add_solids(
-    code,
-    slot,
-    pool,
-    density,
-    grid,
-    prims,
-    shadow,
-    active,
-    u,
-    ray,
-    pair,
-    hits,
-    covered,
-    painted,
-    row,
-    at,
-    lengths,
-    col,
-):
-    """Write one ray's path lengths into lengths[:, col]: `row`[:, at] but for the solids; count intervals.
-
-    The arguments are single arrays, since taking a tuple apart counts a reference for each.
-    """
-    n = _collect(prims, shadow, active, u, ray, pair, hits)
-    if n == 0:
-        for m in range(1, lengths.shape[0]):
-            lengths[m, col] = row[m, at]
-        return 0
-    _paint(code, slot, pool, density, grid, ray, hits, n, covered, painted)
-    for m in range(1, lengths.shape[0]):
-        # a sub-ray can meet more of a thin structure than the pixel's central ray
-        lengths[m, col] = max(row[m, at] - covered[m], 0.0) + painted[m]
-    return n
 
 
 @njit(inline="always", error_model="numpy")
@@ -199,31 +165,37 @@ def _centres(volume, solids, pose, v, columns, background, lengths, centre):
         lengths[m, : last - first] = background[m, first:last]
     code, slot, pool, density, grid = volume
     ray, pair, hits = np.empty(7), np.empty(4), np.empty((2 * active.size + 1, 3))
-    covered, painted = np.empty(n_m), np.empty(n_m)
+    covered, painted, pieces = np.empty(n_m), np.empty(n_m), np.empty((int(grid[:3].sum()) + 8, 3))
     for u in range(first, last):
-        if near[u]:
-            aim(pose, u - (n_u - 1) / 2, v - (n_v - 1) / 2, ray)
-            n = _add_solids(
-                code, slot, pool, density, grid, prims, shadow, active, u, ray, pair, hits, covered, painted,
-                background, u, lengths, u - first,
-            )  # fmt: skip
-            centre[u] = _thickness(hits, n, edge_mu)
+        if not near[u]:
+            continue
+        aim(pose, u - (n_u - 1) / 2, v - (n_v - 1) / 2, ray)
+        n = _collect(prims, shadow, active, u, ray, pair, hits)
+        centre[u] = _thickness(hits, n, edge_mu)
+        if n > 0:
+            t, far = hits[:n, 0].min(), hits[:n, 1].max()
+            _paint(hits, n, pieces, walk(code, slot, pool, density, grid, ray, t, far, pieces), covered, painted)
+            for m in range(1, n_m):
+                lengths[m, u - first] = max(background[m, u] - covered[m], 0.0) + painted[m]
 
 
 @njit(cache=True, error_model="numpy")
 def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, m1, m2):
-    """Measure again, by several rays each, the pixels of a row that the edge of a solid crosses."""
+    """Measure again, by several rays each, the pixels of a row that the edge of a solid crosses.
+
+    What the solids replace is taken from the pixel's central ray, as is the rest of the volume.
+    """
     prims, fat, shadow, active, near = solids
     mu, w1, w2 = rule
     _, threshold, most = edge
     first, last, n_v = columns
     n_m, n_u = background.shape
     size = most * MOST_TIMES
-    lengths = np.zeros((n_m, size), np.float32)
+    lengths, hits = np.zeros((n_m, size), np.float32), np.empty((size, 2 * active.size + 1, 3))
     tau, s1, s2 = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
     code, slot, pool, density, grid = volume
-    ray, pair, hits = np.empty(7), np.empty(4), np.empty((2 * active.size + 1, 3))
-    covered, painted = np.empty(n_m), np.empty(n_m)
+    ray, pair, found = np.empty(7), np.empty(4), np.empty(size, np.int64)
+    covered, painted, pieces = np.empty(n_m), np.empty(n_m), np.empty((int(grid[:3].sum()) + 8, 3))
     thin = (fat[active, 0] >= 0).any()
     for u in range(first, last):
         if not near[u]:
@@ -235,20 +207,25 @@ def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, m1
         if times == 0 and changes[u] <= threshold:
             continue
         count = most * times if times else max(2, int(most * min(1.0, (1.0 + changes[u]) / ALL_SUBRAYS)))
+        t, far = np.inf, -np.inf
         for i in range(count):
             # a golden-section lattice has `count` distinct positions along u and along v
             du, dv = (i + 0.5) / count - 0.5, (i * GOLDEN + 0.5) % 1.0 - 0.5
             aim(pose, u + du - (n_u - 1) / 2, v + dv - (n_v - 1) / 2, ray)
-            _add_solids(
-                code, slot, pool, density, grid, prims, shadow, active, u + du, ray, pair, hits, covered, painted,
-                background, u, lengths, i,
-            )  # fmt: skip
-        _signal(lengths, count, mu, w1, w2, tau, s1, s2)
-        mean1, mean2 = 0.0, 0.0
+            found[i] = _collect(prims, shadow, active, u + du, ray, pair, hits[i])
+            for k in range(found[i]):
+                t, far = min(t, hits[i, k, 0]), max(far, hits[i, k, 1])
+        aim(pose, u - (n_u - 1) / 2, v - (n_v - 1) / 2, ray)
+        n_pieces = walk(code, slot, pool, density, grid, ray, t, far, pieces) if t < far else 0
         for i in range(count):
-            mean1 += s1[i]
-            mean2 += s2[i]
-        m1[u], m2[u] = mean1 / count, mean2 / count
+            if found[i]:
+                _paint(hits[i], found[i], pieces, n_pieces, covered, painted)
+                for m in range(1, n_m):
+                    lengths[m, i] = max(background[m, u] - covered[m], 0.0) + painted[m]
+            else:
+                lengths[1:, i] = background[1:, u]
+        _signal(lengths, count, mu, w1, w2, tau, s1, s2)
+        m1[u], m2[u] = s1[:count].mean(), s2[:count].mean()
 
 
 @njit(cache=True, error_model="numpy")

@@ -50,16 +50,20 @@ def _intervals(prim, source, direction, pairs):
     return intersect(prim, ox, oy, oz, dx, dy, dz, pairs)
 
 
-def _lengths(volume, grid, prims, ray, n_materials):
-    """Path length in every material along one ray: in the open volume, in the volume under solids, in solids."""
+def _lengths(volume, grid, prims, ray, n_materials, central=None):
+    """Path length in every material along one ray: in the open volume, in the volume under solids, in solids.
+
+    The volume is met along the ray `central`, if given, instead.
+    """
     labels, density = volume
     source, direction, distance = ray
+    along = (central or ray)[1]
     n, per_mm, low = grid[:3], grid[3:6], grid[6:]
     cuts = [0.0, distance]
     for axis in range(3):
-        if abs(direction[axis]) > 1e-12:
+        if abs(along[axis]) > 1e-12:
             planes = low[axis] + np.arange(int(n[axis]) + 1) / per_mm[axis]
-            cuts += list((planes - source[axis]) / direction[axis])
+            cuts += list((planes - source[axis]) / along[axis])
     for prim in prims:
         pairs = np.empty(4)
         found = _intervals(prim, source, direction, pairs)
@@ -67,11 +71,10 @@ def _lengths(volume, grid, prims, ray, n_materials):
     cuts = np.unique(np.clip(cuts, 0.0, distance))
     lengths = np.zeros((3, n_materials))
     for t0, t1 in itertools.pairwise(cuts):
-        point = source + direction * (t0 + t1) / 2
-        covering = [prim for prim in prims if inside(prim, *point)]
+        covering = [prim for prim in prims if inside(prim, *(source + direction * (t0 + t1) / 2))]
         if covering:
             lengths[2, int(covering[-1][1])] += t1 - t0
-        x, y, z = np.floor((point - low) * per_mm).astype(int)
+        x, y, z = np.floor((source + along * (t0 + t1) / 2 - low) * per_mm).astype(int)
         if 0 <= x < n[0] and 0 <= y < n[1] and 0 <= z < n[2]:
             lengths[1 if covering else 0, labels[z, y, x]] += (t1 - t0) * density[z, y, x]
     lengths[:, 0] = 0.0
@@ -118,7 +121,8 @@ def transmit_view(bricks, solids, pose, order, spans, background, rule, edge, m1
             for i in range(n):
                 du = (i + 0.5) / n - 0.5 if n > 1 else 0.0
                 dv = math.fmod(i * GOLDEN + 0.5, 1.0) - 0.5
-                _, under, solid = _lengths(volume, bricks[4], solids[0], _ray(pose, u + du, v + dv), len(mu))
+                ray, central = _ray(pose, u + du, v + dv), _ray(pose, u, v)
+                _, under, solid = _lengths(volume, bricks[4], solids[0], ray, len(mu), central)
                 lengths = np.maximum(background[:, row, column] - under, 0) + solid
                 passed = np.exp(-np.minimum(lengths @ mu, 80.0))
                 total1 += w1 @ passed
