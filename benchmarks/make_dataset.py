@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from ctsim.types import Phantom, Scanner
     from phantoms.scene import Scene
 
-HEAD = ("scene", "rays", "does", "skips (reason)", "error", "time", "disk")
 _SPARE = 64 * 2**20  # bytes left free for the file system's own needs
 
 
@@ -124,36 +123,32 @@ def _dry_run(scenes: "tuple[Scene, ...]", options: Options) -> int:
     from ctsim.writer import is_complete
     from phantoms.scene import scene_id
 
-    rows, seconds, size = [], 0.0, 0
+    seconds, size = 0.0, 0
     for scene in scenes:
         if options.out and not options.force and is_complete(options.out, scene.name, scene_id(scene)):
-            rows.append((scene.name, "", "nothing", "all (already complete)", "", "0 s", ""))
+            sys.stdout.write(f"{scene.name}: already complete\n")
             continue
         plan, *_ = _plan(scene)
-        rows.append((scene.name, *plan.table_row()))
+        sys.stdout.write(f"{scene.name}\n{plan.text()}\n")
         seconds, size = seconds + plan.seconds, size + plan.disk_bytes
-    rows.append(("total", "", "", "", "", human_time(seconds), human_bytes(size)))
-    sys.stdout.write(table(HEAD, rows))
+    sys.stdout.write(f"total: {human_time(seconds)}, {human_bytes(size)} on disk\n")
     return 0
 
 
 def _make(scenes: "tuple[Scene, ...]", out: Path, force: bool) -> int:
     from ctsim.writer import is_complete
-    from phantoms.scene import scene_id
+    from phantoms.scene import build, scene_id
 
     # what is in the way shows before the first hour is spent, not after it
     todo = [s for s in scenes if force or not is_complete(out, s.name, scene_id(s))]
     for scene in scenes:
         if scene not in todo:
             _say(f"{scene.name}: already complete")
-    planned = {scene.name: _plan(scene) for scene in todo[:1]}
-    need = planned[todo[0].name][0].disk_bytes if todo else 0
-    for scene in todo[1:]:
-        need += _plan(scene)[0].disk_bytes
-    _check_space(out, need)
+    plans = {scene.name: _plan(scene)[0] for scene in todo}  # all phantoms could be more than memory holds
+    _check_space(out, sum(plan.disk_bytes for plan in plans.values()))
     for number, scene in enumerate(todo, 1):
-        plan, phantom, scanner = planned.pop(scene.name, None) or _plan(scene)
-        make_scene(scene, plan, (phantom, scanner), out, force=force, title=f"{number}/{len(todo)} {scene.name}")
+        parts, title = (build(scene), scene.resolve()), f"{number}/{len(todo)} {scene.name}"
+        make_scene(scene, plans[scene.name], parts, out, force=force, title=title)
     return 0
 
 
@@ -214,20 +209,6 @@ def spectrum_csv(scanner: "Scanner") -> str:
     signal = signal / signal.sum()
     rows = zip(tube.energies, tube.weights, signal, strict=True)
     return "energy_kev,photon_fraction,signal_fraction\n" + "".join(f"{e:.4f},{w:.8g},{s:.8g}\n" for e, w, s in rows)
-
-
-def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    """Lay out a table in columns, the first three and the skips to the left, numbers to the right."""
-    cells = [head, *rows]
-    widths = [max(len(str(row[k])) for row in cells) for k in range(len(head))]
-    left = {"scene", "does", "skips (reason)"}
-    lines = (
-        "  ".join(
-            str(c).ljust(w) if h in left else str(c).rjust(w) for c, w, h in zip(row, widths, head, strict=True)
-        ).rstrip()
-        for row in cells
-    )
-    return "\n".join(lines) + "\n"
 
 
 def human_bytes(size: float) -> str:

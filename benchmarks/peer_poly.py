@@ -18,7 +18,7 @@ from ctsim.settings import Simulation, Truth
 from ctsim.spectrum import spectrum
 from ctsim.types import Phantom, Scanner
 from ctsim.voxelise import fractions
-from phantoms.bodies import upright
+from phantoms.shapes import cylinder
 
 BINS = 80
 FINER = 16  # rays along each side of a pixel in the oracle
@@ -28,10 +28,10 @@ CHECKED = 2  # views that the oracle measures
 def poly_scene(n: int) -> Phantom:
     """Return the scene of case 5, all analytic: water cylinder, bone rod, two iron rods."""
     solids = (
-        upright("water", "water", (0.0, 0.0, 0.0), (25.0, 27.0)),
-        upright("bone", "cortical_bone", (11.0, 6.0, 0.0), (5.0, 24.0)),
-        upright("iron 1", "Fe", (-9.0, 9.0, 0.0), (2.5, 22.0), metal=True),
-        upright("iron 2", "Fe", (-4.0, -13.0, 0.0), (2.0, 22.0), metal=True),
+        cylinder("water", "water", (25.0, 54.0), metal=False),
+        cylinder("bone", "cortical_bone", (5.0, 48.0), centre=(11.0, 6.0, 0.0), metal=False),
+        cylinder("iron 1", "Fe", (2.5, 44.0), centre=(-9.0, 9.0, 0.0)),
+        cylinder("iron 2", "Fe", (2.0, 44.0), centre=(-4.0, -13.0, 0.0)),
     )
     names = ("air", "water", "cortical_bone", "Fe")
     return Phantom(

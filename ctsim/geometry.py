@@ -17,6 +17,7 @@ from ctsim.errors import InputError
 
 Triple = tuple[float, float, float]
 Pair = tuple[float, float]
+FARTHEST = 1e6  # mm, and degrees: nothing of a scanner is larger
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
@@ -47,6 +48,8 @@ class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         for name in ("dso", "dsd", "d_voxel", "d_detector", "off_origin", "off_detector", "start_deg", "arc_deg"):
             if not np.all(np.isfinite(getattr(self, name))):
                 raise InputError(f"{name} must be finite, got {getattr(self, name)}")
+            if np.max(np.abs(getattr(self, name))) > FARTHEST:
+                raise InputError(f"{name} must be within ±{FARTHEST:.0e}, got {getattr(self, name)}")
         for name in ("n_voxel", "n_detector", "n_views"):
             if np.min(getattr(self, name)) < 1:
                 raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")

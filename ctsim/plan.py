@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ctsim.detector import response
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.materials import attenuation
 from ctsim.project import Response, Tracer
 from ctsim.quadrature import EnergyRule, energy_rule, full_rule
 from ctsim.scatter import open_fraction
@@ -25,7 +26,6 @@ from ctsim.types import Phantom, Scanner
 THICKNESS_MARGIN = 1.1  # a coarse survey can miss the thickest ray
 NOISE_SECONDS, WRITE_SECONDS, VOLUME_SECONDS = 40e-9, 1e-9, 1e-9  # a draw and core, a byte, a voxel of a reference
 PLANNING_BYTES = 45_000_000  # of the search for energies
-COLUMNS = ("rays", "does", "skips (reason)", "error", "time", "disk")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,17 +104,22 @@ class Plan:
             "seconds": self.seconds,
         }
 
-    def table_row(self) -> tuple[str, ...]:
-        """Return the cells of a dry run's row, see `COLUMNS`."""
-        does = ", ".join(s.name + (f" ({s.reason})" if s.reason else "") for s in self.stages if s.runs)
-        skips = ", ".join(f"{s.name} ({s.reason})" for s in self.stages if not s.runs)
-        rays, size = f"{self.n_rays / 1e6:.1f} M", f"{self.disk_bytes / 1e6:.0f} MB"
-        error = f"{self.error:.0e}" + (f", edges {self.edge_error:.0e}" if self.edge_error else "")
-        return rays, does, skips, error, f"{self.seconds:.0f} s", size
-
     def text(self) -> str:
-        """Return the plan as lines of text."""
-        return "\n".join(f"{key:15s} {value}" for key, value in zip(COLUMNS, self.table_row(), strict=True))
+        """Return the plan for people: what is done, what is skipped and why, error, and what it takes."""
+        does = "; ".join(s.name + (f" ({s.reason})" if s.reason else "") for s in self.stages if s.runs)
+        skipped: dict[str, list[str]] = {}
+        for stage in self.stages:
+            if not stage.runs:
+                skipped.setdefault(stage.reason, []).append(stage.name)
+        edges = f", {self.edge_error:.0e} (worst edge pixel)" if self.edge_error else ""
+        lines = {
+            "does": does,
+            "skips": "; ".join(f"{reason}: {', '.join(names)}" for reason, names in skipped.items()),
+            "error": f"{self.error:.0e} (energies){edges}",
+            "takes": f"{self.seconds:.2g} s, {self.disk_bytes / 1e9:.2g} GB on disk, {self.memory_bytes / 1e9:.2g} GB "
+            f"of memory, {self.n_rays / 1e6:.3g} M rays, {self.flops / 1e9:.2g} Gflop",
+        }
+        return "\n".join(f"  {key:7s} {value}" for key, value in lines.items() if value)
 
 
 def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth: Truth, stream_id: str) -> Plan:
@@ -125,8 +130,11 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
     source, tracer = spectrum(scanner.tube), Tracer.of(phantom)
     found = survey(tracer, scanner.geometry)
     a1, _ = response(scanner.detector, source.energies)
+    if not (source.weights * a1).any():
+        raise InputError("detector: no photon of the tube's spectrum is detected; check threshold, thickness and kvp")
     mean_energy = float(np.average(source.energies, weights=source.weights * a1))
     rule = _rule(phantom, scanner, simulation, source, found.lengths)
+    _check_bowtie(scanner, rule)
     twin = _has_twin(phantom, truth)
     tried = trial(tracer, scanner.geometry, Response.of(rule, tracer.materials), subrays=simulation.subrays, twin=twin)
     outputs = _outputs(phantom, scanner, truth, present)
@@ -168,6 +176,16 @@ def _rule(
         thickest[bowtie.material] = thickest.get(bowtie.material, 0.0) + max(bowtie.center, bowtie.edge)
     met = [m for m in thickest if m != "air"]
     return energy_rule(source, scanner.detector, met, [thickest[m] for m in met], simulation.tolerance)
+
+
+def _check_bowtie(scanner: Scanner, rule: EnergyRule) -> None:
+    bowtie = scanner.tube.bowtie
+    if bowtie is None:
+        return
+    # rays slant through it; nothing may vanish in float32, which ends at 1e-38
+    thickest = 2 * max(bowtie.center, bowtie.edge)
+    if np.exp(-attenuation(bowtie.material, rule.energies) * thickest) @ rule.w1 < 1e-30:
+        raise InputError(f"tube.bowtie: {thickest / 2} mm of {bowtie.material} let nothing through")
 
 
 def present_materials(phantom: Phantom) -> tuple[str, ...]:

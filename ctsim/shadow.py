@@ -38,7 +38,7 @@ def cast(pose: NDArray[np.float64], shape: tuple[int, int], corners: NDArray[np.
     source, centre, e_u, e_v = pose.reshape(4, 3)
     normal = np.cross(e_u, e_v)
     reach = (corners - source) @ normal / ((centre - source) @ normal)
-    behind = (reach <= 1e-9).any(1)
+    behind: NDArray[np.bool_] = np.any(reach <= 1e-9, axis=1)
     hit = source + (corners - source) / np.where(behind[:, None], 1.0, reach)[..., None] - centre
     u = hit @ e_u / (e_u @ e_u) + (shape[1] - 1) / 2
     v = hit @ e_v / (e_v @ e_v) + (shape[0] - 1) / 2

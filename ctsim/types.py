@@ -74,7 +74,7 @@ class Scanner(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     geometry: Geometry
     tube: Tube = Tube()
     detector: Detector = Detector()
-    i0: Annotated[float, msgspec.Meta(gt=0, le=1e12)] = 1e5
+    i0: Annotated[float, msgspec.Meta(ge=1, le=1e12)] = 1e5
     noise: Noise = Noise()
     scatter: Scatter = Scatter()
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from ctsim.errors import InputError
 from ctsim.geometry import Triple
-from ctsim.solids import FRUSTUM, Primitive, Solid, Vector
+from ctsim.solids import Solid
 from ctsim.types import Phantom
+from phantoms.shapes import cylinder
 
 REACH = 0.92
 """Every object stays within this share of its cube: radius and half height are REACH·size/2."""
@@ -50,7 +51,10 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         if self.metal != "none":
             from ctsim.materials import material
 
-            material(self.metal)
+            try:
+                material(self.metal)
+            except InputError as error:
+                raise InputError(f"metal: {error}") from None
 
     def within(self, key: str, low: float, high: float) -> None:
         """Raise `InputError` unless the setting `key` lies within [low, high]."""
@@ -90,17 +94,6 @@ def assemble(labels: np.ndarray, d_voxel: Triple, materials: Sequence[str], soli
     return Phantom(labels=labels, materials=tuple(names), d_voxel=d_voxel, solids=tuple(solids))
 
 
-def upright(name: str, material: str, centre: Vector, size: tuple[float, float], *, metal: bool = False) -> Solid:
-    """Return a cylinder along z; `size` is (radius, half height) in mm."""
-    radius, half = size
-    return Solid(
-        name=name,
-        material=material,
-        metal=metal,
-        primitives=(Primitive(kind=FRUSTUM, centre=centre, params=(half, radius, radius)),),
-    )
-
-
 class Validation(Recipe, frozen=True, kw_only=True, tag="validation"):
     """Three rods in a water cylinder of 55/60 of the cube; rods of 5, 6 and 8 mm at 60 mm."""
 
@@ -115,7 +108,7 @@ def validation(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Vali
     """
     unit = half_box(n, d_voxel)
     half = 0.9 * unit
-    solids = [upright("water", "water", (0.0, 0.0, 0.0), (55 / 60 * unit, half))]
+    solids = [cylinder("water", "water", (55 / 60 * unit, 2 * half), metal=False)]
     turn = rng.uniform(0, 2 * math.pi)
     if params.metal != "none":
         count = 3 if params.n_inserts is None else params.n_inserts
@@ -123,7 +116,7 @@ def validation(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Vali
             angle = turn + 2 * math.pi * k / count
             diameter = params.insert_mm or (5.0, 6.0, 8.0)[k % 3] * unit / 30
             centre = (0.5 * unit * math.cos(angle), 0.5 * unit * math.sin(angle), 0.0)
-            solids.append(upright(f"rod{k}", params.metal, centre, (diameter / 2, 0.85 * unit), metal=True))
+            solids.append(cylinder(f"rod{k}", params.metal, (diameter / 2, 1.7 * unit), centre=centre))
     return assemble(np.zeros(n, np.uint8), d_voxel, ("air",), solids)
 
 
@@ -137,10 +130,11 @@ def metal_rods(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Meta
     """Draw a printed PLA cup with lid, water up to a level, and rods of unequal width standing in it."""
     unit = half_box(n, d_voxel)
     level = rng.uniform(0.60, 0.76)
+    middle = (0.0, 0.0, (level - 0.78) / 2 * unit)
     solids = [
-        upright("cup", "PLA", (0.0, 0.0, 0.0), (0.86 * unit, 0.9 * unit)),
-        upright("air space", "air", (0.0, 0.0, 0.02 * unit), (0.78 * unit, 0.80 * unit)),
-        upright("water", "water", (0.0, 0.0, (level - 0.78) / 2 * unit), (0.78 * unit, (level + 0.78) / 2 * unit)),
+        cylinder("cup", "PLA", (0.86 * unit, 1.8 * unit), metal=False),
+        cylinder("air space", "air", (0.78 * unit, 1.6 * unit), centre=(0.0, 0.0, 0.02 * unit), metal=False),
+        cylinder("water", "water", (0.78 * unit, (level + 0.78) * unit), centre=middle, metal=False),
     ]
     if params.metal != "none":
         total, turn = 4 if params.n_inserts is None else params.n_inserts, rng.uniform(0, 2 * math.pi)
@@ -149,5 +143,5 @@ def metal_rods(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Meta
             r = (0.46 + 0.06 * rng.uniform(-1, 1)) * unit
             width = params.insert_mm or (4.0, 6.0, 8.0, 5.0)[k % 4] * unit / 30
             centre = (r * math.cos(angle), r * math.sin(angle), -0.03 * unit)
-            solids.append(upright(f"rod{k}", params.metal, centre, (width / 2, 0.72 * unit), metal=True))
+            solids.append(cylinder(f"rod{k}", params.metal, (width / 2, 1.44 * unit), centre=centre))
     return assemble(np.zeros(n, np.uint8), d_voxel, ("air",), solids)

@@ -124,7 +124,7 @@ class ScannerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     detector: Detector | None = None
     noise: Noise | None = None
     scatter: Scatter | None = None
-    i0: Annotated[float, msgspec.Meta(gt=0, le=1e12)] | None = None
+    i0: Annotated[float, msgspec.Meta(ge=1, le=1e12)] | None = None
 
     def __post_init__(self) -> None:
         if self.field_mm is not None and not (math.isfinite(self.field_mm) and self.field_mm > 0):

@@ -171,12 +171,15 @@ def check_geometry(geometry: Geometry, size: float, truncated: bool) -> None:
         u = u + geometry.off_detector[1] / geometry.d_detector[1]
     seen = (u.min(1) < half_u) & (u.max(1) > -half_u) & (v.min(1) < half_v) & (v.max(1) > -half_v)
     if not seen.any():
-        raise InputError(f"the object ({size} mm) lies outside the cone of all views; expected it on the detector")
+        raise InputError(
+            f"phantom.size = {size} mm: the object lies outside the cone of all views; check dso, dsd and off_detector"
+        )
     outside = (np.abs(u) > half_u).any() or (np.abs(v) > half_v).any()
     if outside and not truncated:
         raise InputError(
-            f"the object ({size} mm) reaches out of the cone: its shadow needs {2 * np.abs(v).max():.0f} x "
-            f"{2 * np.abs(u).max():.0f} pixels (v, u) of {geometry.n_detector}; say truncated = true if this is meant"
+            f"phantom.size = {size} mm: the object reaches out of the cone: its shadow needs "
+            f"{2 * np.abs(v).max():.0f} x {2 * np.abs(u).max():.0f} pixels "
+            f"(v, u) of {geometry.n_detector}; say truncated = true if this is meant"
         )
 
 

@@ -13,7 +13,7 @@ from ctsim.project import Tracer, path_lengths
 from ctsim.quadrature import full_rule
 from ctsim.spectrum import spectrum
 from ctsim.types import Phantom
-from phantoms.bodies import upright
+from phantoms.shapes import cylinder
 
 # not a cube, nor square, nor centred, so that no two axes can be exchanged or turned round unseen
 GEOMETRY = Geometry(
@@ -79,7 +79,7 @@ def test_closed_form_chord_through_the_axis_is_the_diameter():
     geometry = Geometry(
         dso=200.0, dsd=320.0, n_voxel=(4, 4, 4), d_voxel=(1, 1, 1), n_detector=(5, 7), d_detector=(1.0, 1.0), n_views=1
     )
-    chord = peer_cases.upright_chord(geometry, 0, upright("rod", "Fe", (0.0, 0.0, 0.0), (6.0, 10.0)))
+    chord = peer_cases.upright_chord(geometry, 0, cylinder("rod", "Fe", (6.0, 20.0)))
     assert chord[2, 3] == pytest.approx(12.0, abs=1e-12)
     # a ray tilted by v/dsd is longer by 1/cos within the same diameter
     assert chord[3, 3] == pytest.approx(12.0 * np.hypot(1, 1 / 320), abs=1e-12)
@@ -87,8 +87,8 @@ def test_closed_form_chord_through_the_axis_is_the_diameter():
     distance = 200.0 * np.sin(np.arctan(3 / 320))
     assert chord[2, 6] == pytest.approx(2 * np.sqrt(36 - distance**2), abs=1e-9)
     # a ray that misses, and one that leaves through a cap
-    assert peer_cases.upright_chord(geometry, 0, upright("rod", "Fe", (0.0, 30.0, 0.0), (6.0, 10.0))).max() == 0
-    short = peer_cases.upright_chord(geometry, 0, upright("rod", "Fe", (0.0, 0.0, 0.0), (6.0, 0.5)))
+    assert peer_cases.upright_chord(geometry, 0, cylinder("rod", "Fe", (6.0, 20.0), centre=(0.0, 30.0, 0.0))).max() == 0
+    short = peer_cases.upright_chord(geometry, 0, cylinder("rod", "Fe", (6.0, 1.0)))
     steep = short[4, 3]
     # it enters the slab |z| < 0.5 at the wall (z = 2·194/320 > 0.5), so it never meets the short rod
     assert steep == 0

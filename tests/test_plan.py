@@ -30,7 +30,7 @@ def test_the_edge_error_is_found_where_inserts_are_and_falls_with_sub_rays():
     bare = parts[0].without_metal()
     no_solids = type(bare)(labels=np.ones((8, 8, 8), np.uint8), materials=bare.materials, d_voxel=(7.0,) * 3)
     assert plan((no_solids, parts[1])).edge_error == 0
-    assert "edges" in plan(parts).table_row()[3]
+    assert "worst edge pixel" in plan(parts).text() and "edge pixel" not in plan((no_solids, parts[1])).text()
 
 
 def test_the_memory_that_a_plan_names_is_what_simulating_takes():

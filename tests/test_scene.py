@@ -140,10 +140,9 @@ def table(needed: dict, **optional) -> st.SearchStrategy[dict]:
 
 
 SHEETS = st.lists(table({"material": st.sampled_from(["Al", "Cu", "W"]), "thickness": st.floats(0, 3)}), max_size=2)
-# thin enough for 20 kVp that some of the open field is left in float32
 BOWTIE = table(
-    {"center": st.floats(0, 2), "edge": st.floats(0, 40), "half_angle_deg": st.floats(0.1, 89)},
-    material=st.sampled_from(["Al", "PMMA"]),
+    {"center": st.floats(0, 5), "edge": st.floats(0, 60), "half_angle_deg": st.floats(0.1, 89)},
+    material=st.sampled_from(["Al", "PMMA", "Cu"]),
 )
 HEEL = {"heel": st.booleans(), "anode_deg": st.floats(1, 40)}
 TUBE = st.one_of(
@@ -172,7 +171,7 @@ SCANNER = table(
         threshold=st.floats(0, 120),
     ),
     scatter=st.just({}) | table({"level": st.just(1)}, fraction=st.floats(0, 9.99)),
-    i0=st.sampled_from([1e-3, 1.0, 1e5, 1e12]),
+    i0=st.sampled_from([1.0, 1e3, 1e5, 1e12]),
     start_deg=st.floats(-1e3, 1e3),
     arc_deg=st.floats(1, 360),
     off_detector=st.tuples(st.floats(-4, 4), st.floats(-4, 4)),  # some rays still meet the smallest object
@@ -192,6 +191,7 @@ NAN, INF = float("nan"), float("inf")
 ABSURD = {
     "seed": [-1, 0.5],
     "name": ["", "a/b"],
+    "phantom.metal": ["Xx", ""],
     "phantom.size": [NAN, 0.0, -1.0, 2001.0, INF],
     "phantom.n_voxel": [[0, 8, 8], [8, 8], [8, 8, 4096]],
     "phantom.n_inserts": [-1, 17],
@@ -201,9 +201,9 @@ ABSURD = {
     "scanner.field_mm": [NAN, 0.0, INF],
     "scanner.arc_deg": [NAN, 0.0, 361.0],
     "scanner.start_deg": [NAN, INF],
-    "scanner.off_detector": [[NAN, 0.0]],
+    "scanner.off_detector": [[NAN, 0.0], [0.0, 1e300]],
     "scanner.off_origin": [[0.0, INF, 0.0]],
-    "scanner.i0": [NAN, 0.0, INF],
+    "scanner.i0": [NAN, 0.0, 1e-300, INF],
     "scanner.tube.kvp": [NAN, 0.0, 501.0],
     "scanner.tube.anode_deg": [NAN, 0.0, 91.0],
     "scanner.tube.filters": [[{"material": "Al", "thickness": t}] for t in (NAN, -1.0)],
@@ -240,7 +240,8 @@ def test_random_scenes_simulate_or_are_refused_by_the_name_of_a_key(plain: dict,
         plan = make_plan(phantom, machine, one.simulation, one.truth, stream_id(one))
     except InputError as error:
         # an offset that cuts the object off, a threshold above all photons, sheets that let none through
-        assert any(key in str(error) for key in ("truncated", "threshold", "filters")) and "\n" not in str(error)
+        assert any(key in str(error) for key in ("truncated", "threshold", "filters", "bowtie"))
+        assert "\n" not in str(error)
         return
     assert parse_suite(scene_to_toml(one)) == (one,)
     assert phantom.labels.shape == one.phantom.n_voxel
