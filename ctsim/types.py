@@ -91,7 +91,8 @@ class Scan:
 
     `counts` [view, v, u] is what the detector wrote (uint16 where there is an ADC, else float32);
     `flat` [v, u] float32 is the open-field image and `dark` the pedestal, both in counts. `e_max` is
-    the highest photon energy (keV); `i0` the photons per open pixel and view.
+    the highest photon energy (keV); `i0` the photons per open pixel and view. `metal` [z, y, x], not 0 in metal,
+    is the true mask, there only for methods that declare to be given it.
     """
 
     geometry: Geometry
@@ -100,12 +101,15 @@ class Scan:
     dark: float = 0.0
     i0: float = 1e5
     e_max: float = 90.0
+    metal: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
         if tuple(self.counts.shape) != self.geometry.shape:
             raise InputError(f"counts have shape {tuple(self.counts.shape)}, the geometry says {self.geometry.shape}")
         if tuple(self.flat.shape) != self.geometry.n_detector:
             raise InputError(f"flat has shape {tuple(self.flat.shape)}, the detector {self.geometry.n_detector}")
+        if self.metal is not None and tuple(self.metal.shape) != self.geometry.n_voxel:
+            raise InputError(f"metal has shape {tuple(self.metal.shape)}, the volume {self.geometry.n_voxel}")
 
 
 class Status(enum.StrEnum):

@@ -73,8 +73,18 @@ def fdk(projections: torch.Tensor, geometry: Geometry, *, window: str = "ram-lak
     def read(views: slice) -> NDArray[np.float32]:
         return np.array(projections[views].detach().numpy(), np.float32)
 
-    weights = _orbit_weights(geometry)
-    return torch.from_numpy(_run(read, geometry, weights, window, cutoff))
+    return fdk_stream(read, geometry, window=window, cutoff=cutoff)
+
+
+def fdk_stream(
+    read: Callable[[slice], NDArray[np.float32]], geometry: Geometry, *, window: str = "ram-lak", cutoff: float = 1.0
+) -> torch.Tensor:
+    """Reconstruct line integrals that `read` hands out a few views at a time, [view, v, u] → [z, y, x] in 1/mm.
+
+    `read` gets a slice of views, in order, and returns an array that may be overwritten. Raises InputError when
+    the orbit is not circular or the window is unknown.
+    """
+    return torch.from_numpy(_run(read, geometry, _orbit_weights(geometry), window, cutoff))
 
 
 def _orbit_weights(geometry: Geometry) -> RayWeights:

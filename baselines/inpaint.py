@@ -1,0 +1,114 @@
+"""Filling a trace in a projection from what surrounds it. Images [v, u]."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+from numba import njit
+from numpy.typing import NDArray
+
+from ctsim.errors import InputError
+
+
+@dataclass(slots=True, kw_only=True)
+class Filled:
+    """What was filled: pixels, rows, gaps that touch the detector's edge, rows without any pixel left, and views."""
+
+    pixels: int = 0
+    rows: int = 0
+    edge_gaps: int = 0
+    full_rows: int = 0
+    views: int = 0
+
+    def details(self) -> dict[str, int]:
+        """Return the counts for a result's details."""
+        return {
+            "filled_pixels": self.pixels,
+            "filled_rows": self.rows,
+            "edge_gaps": self.edge_gaps,
+            "full_rows": self.full_rows,
+            "filled_views": self.views,
+        }
+
+
+FILLS = ("rows", "harmonic")
+
+
+def fill(image: NDArray[np.float32], trace: NDArray[np.bool_], how: str, filled: Filled) -> None:
+    """Fill the pixels of `trace` in one view, in place, and count what was done.
+
+    "rows" interpolates linearly along every detector row and holds the last value where a gap touches the
+    detector's edge; rows with no pixel left are filled harmonically from the rows around them. "harmonic" solves
+    Laplace's equation over the whole trace. A view without any pixel left stays as it is, its rows counted.
+
+    Raises
+    ------
+    InputError
+        When `how` is something else.
+    """
+    if how not in FILLS:
+        raise InputError(f"fill must be one of {', '.join(FILLS)}, got {how!r}")
+    if not trace.any():
+        return
+    rows = np.flatnonzero(trace.any(1))
+    full = trace.all(1)
+    filled.views += 1
+    filled.rows += len(rows)
+    filled.pixels += int(trace.sum())
+    filled.full_rows += int(full.sum())
+    filled.edge_gaps += int(trace[~full, 0].sum() + trace[~full, -1].sum())
+    if how == "harmonic":
+        harmonic(image, trace)
+        return
+    _rows(image, trace, rows)
+    if full.any():
+        harmonic(image, np.repeat(full[:, None], image.shape[1], 1))
+
+
+@njit(cache=True)
+def _rows(image, trace, rows):
+    n_u = image.shape[1]
+    for v in rows:
+        u = 0
+        while u < n_u:
+            if not trace[v, u]:
+                u += 1
+                continue
+            end = u
+            while end < n_u and trace[v, end]:
+                end += 1
+            if u > 0 or end < n_u:
+                left = image[v, u - 1] if u > 0 else image[v, end]
+                right = image[v, end] if end < n_u else image[v, u - 1]
+                for k in range(u, end):
+                    w = np.float32(k - u + 1) / np.float32(end - u + 1)
+                    image[v, k] = left + w * (right - left)
+            u = end
+
+
+def harmonic(image: NDArray[np.float32], unknown: NDArray[np.bool_]) -> None:
+    """Replace the unknown pixels by the solution of Laplace's equation, in place.
+
+    Known neighbours are Dirichlet values, the image's edge is a Neumann boundary. Nothing is done if nothing is known.
+    """
+    if unknown.all() or not unknown.any():
+        return
+    n_v, n_u = image.shape
+    number = np.full(image.shape, -1, np.int64)
+    number[unknown] = np.arange(unknown.sum())
+    v, u = np.nonzero(unknown)
+    degree, right = np.zeros(len(v)), np.zeros(len(v))
+    rows, columns = [], []
+    for dv, du in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        inside = (v + dv >= 0) & (v + dv < n_v) & (u + du >= 0) & (u + du < n_u)
+        to_v, to_u = v[inside] + dv, u[inside] + du
+        me, other = np.flatnonzero(inside), number[to_v, to_u]
+        degree += inside
+        known = other < 0
+        np.add.at(right, me[known], image[to_v[known], to_u[known]].astype(np.float64))
+        rows.append(me[~known])
+        columns.append(other[~known])
+    i, j = np.concatenate(rows), np.concatenate(columns)
+    matrix = scipy.sparse.coo_array((-np.ones(len(i)), (i, j)), (len(v), len(v))) + scipy.sparse.diags_array(degree)
+    image[unknown] = scipy.sparse.linalg.spsolve(matrix.tocsc(), right)

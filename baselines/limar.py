@@ -1,0 +1,87 @@
+"""Linear interpolation across the metal trace (LIMAR), in cone beam.
+
+Kalender, Hebel and Ebersberger, Radiology 164, 1987, doi:10.1148/radiology.164.2.3602406: the metal's shadow is
+cut out of the projections and bridged, the rest is reconstructed, the metal is put back.
+"""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from baselines.inpaint import FILLS, Filled, fill
+from baselines.metal import INSERTS, Metal, Trace, find_metal, reinsert
+from ctsim.errors import InputError
+from ctsim.types import Scan, Status, Volume
+from reconstruct.fdk import fdk_stream
+from reconstruct.fdk import reconstruct as fdk
+from reconstruct.log import line_integrals
+
+
+def reconstruct(
+    scan: Scan,
+    *,
+    device: str = "cpu",
+    mask: str = "oracle",
+    interpolation: str = "rows",
+    insert: str = "fdk",
+    dilation: int = 0,
+) -> Volume:
+    """Reconstruct `scan` with the metal trace interpolated.
+
+    `mask` is "oracle", "auto" or a TIFF file (`baselines.metal.find_metal`); `interpolation` "rows" or "harmonic"
+    (`baselines.inpaint.fill`); `insert` "fdk", "mean" or "none" (`baselines.metal.reinsert`); `dilation` widens the
+    trace by so many pixels. Without metal, or where the mask is not to be relied on, the result is FDK's to the last
+    bit and nothing is projected. Raises InputError as these do, and as FDK does.
+    """
+    check(interpolation, insert, dilation)
+    first = fdk(scan, device=device)
+    metal = find_metal(scan, first.values.numpy(), mask)
+    if first.status is not Status.OK or not metal.found:
+        return uncorrected(first, metal)
+    values, filled = interpolated(scan, Trace(metal, scan.geometry, dilation), interpolation)
+    reinsert(values, first.values.numpy(), metal, insert)
+    return finished(values, first, metal, {"view_updates": 2 * scan.geometry.n_views, **filled.details()})
+
+
+def check(interpolation: str, insert: str, dilation: int) -> None:
+    """Refuse settings before an hour is spent; raises InputError."""
+    if interpolation not in FILLS:
+        raise InputError(f"interpolation must be one of {', '.join(FILLS)}, got {interpolation!r}")
+    if insert not in INSERTS:
+        raise InputError(f"insert must be one of {', '.join(INSERTS)}, got {insert!r}")
+    if dilation < 0:
+        raise InputError(f"dilation must be 0 or more pixels, got {dilation}")
+
+
+def interpolated(scan: Scan, trace: Trace, how: str) -> tuple[torch.Tensor, Filled]:
+    """Return FDK of the projections with the trace interpolated, and what was filled."""
+    filled = Filled()
+
+    def read(views: slice) -> NDArray[np.float32]:
+        p = line_integrals(scan, views)[0].numpy()
+        for k, view in enumerate(range(views.start, views.stop)):
+            fill(p[k], trace.view(view), how, filled)
+        return p
+
+    return fdk_stream(read, scan.geometry), filled
+
+
+def uncorrected(first: Volume, metal: Metal) -> Volume:
+    """Return FDK's volume as it is, with what is known of the mask."""
+    return Volume(
+        values=first.values,
+        status=first.status,
+        reason=first.reason or metal.doubt,
+        details=first.details | metal.details() | {"corrected": False},
+    )
+
+
+def finished(values: torch.Tensor, first: Volume, metal: Metal, details: dict[str, object]) -> Volume:
+    """Wrap a corrected volume."""
+    finite = bool(torch.isfinite(values).all())
+    return Volume(
+        values=values,
+        status=Status.OK if finite else Status.NONFINITE,
+        reason="" if finite else "the reconstruction holds values that are not finite",
+        details=first.details | metal.details() | {"corrected": True} | details,
+    )
