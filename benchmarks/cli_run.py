@@ -24,7 +24,8 @@ class Arguments:
     """Run reconstruction methods over a dataset, score them, and write tables and pictures.
 
     What RESULTS already holds is not run again, unless the data, the method's parameters or its code
-    have changed or the run failed. `run-benchmark peers` compares with other libraries.
+    have changed or the run failed. `run-benchmark inspect` shows what a score's conventions are worth,
+    `run-benchmark peers` compares with other libraries.
     """
 
     data: tyro.conf.Positional[Path]
@@ -48,7 +49,7 @@ class Arguments:
     keep_volumes: bool = True
     """Keep reconstructions as TIFF stacks; pictures are drawn from them."""
     anchor: bool = True
-    """Reconstruct the metal-free twins by FDK too, for the anchored score."""
+    """Reconstruct the metal-free twins too, by every method: for the protocol artefact and the anchored score."""
     table: tyro.conf.FlagCreatePairsOff[bool] = False
     """Only render the tables from the records, computing nothing."""
 

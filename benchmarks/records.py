@@ -166,9 +166,10 @@ def read_all(results: Path) -> tuple[list[Record], list[Torn]]:
 def latest(records: list[Record]) -> list[Record]:
     """Keep what a table shows: the last record of each scene, seed, variant and method label.
 
-    Only the newest data of a scene and seed count: a scan that was made anew supersedes all that was
-    measured on the old one, and a method's new code supersedes its old.
+    Only this protocol version counts, and only the newest data of a scene and seed: a scan that was made
+    anew supersedes all that was measured on the old one, and a method's new code supersedes its old.
     """
+    records = [r for r in records if r.run.protocol == VERSION]
     newest = {(r.run.scene, r.run.seed): (r.run.scene_id, r.run.scan) for r in records}
     kept: dict[tuple[Any, ...], Record] = {}
     for record in records:
@@ -178,7 +179,23 @@ def latest(records: list[Record]) -> list[Record]:
     return list(kept.values())
 
 
+def outdated(records: list[Record]) -> str:
+    """Say in one sentence how many records are of other protocol versions and so in no table; "" if none is."""
+    others = [r.run.protocol for r in records if r.run.protocol != VERSION]
+    if not others:
+        return ""
+    versions = ", ".join(str(v) for v in sorted(set(others)))
+    return (
+        f"{len(others)} of {len(records)} records are of protocol version {versions} and left out: "
+        f"this is version {VERSION}, run the methods again"
+    )
+
+
+def last(records: list[Record]) -> dict[str, Record]:
+    """Return the last record of each identity."""
+    return {record.identity: record for record in records}
+
+
 def done(records: list[Record]) -> set[str]:
     """Return the identities that need no rerun: those whose last record is ok. Failures are never among them."""
-    last = {record.identity: record.status for record in records}
-    return {identity for identity, status in last.items() if status == OK}
+    return {identity for identity, record in last(records).items() if record.status == OK}

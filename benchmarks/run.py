@@ -5,12 +5,11 @@ A method that fails is a record with a status and a reason; the next run tries i
 only it.
 """
 
-import contextlib
 import dataclasses
 import datetime
 import logging
 import math
-import os
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,14 +17,15 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from benchmarks import records
+from benchmarks import artefact, records
 from benchmarks.host import commit, host, measured
 from benchmarks.isolate import Outcome, run_apart
+from benchmarks.judge import Judge, Twin
 from benchmarks.methods import Method
-from benchmarks.protocol import Stored, Truth, evaluate, truth_of
+from benchmarks.protocol import Stored
 from benchmarks.records import Cost, Record, Run
+from benchmarks.volumes import identity_of, read_volume, write_volume
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:
@@ -34,13 +34,11 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 STORE = "ctsim.store:open_scan"
-ANCHOR = "fdk"
-"""The method whose reconstruction of the metal-free twin is the zero of the anchored score."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """How to run: `seconds` limits one run and implies `isolate`; `anchor` runs FDK on the metal-free twins too.
+    """How to run: `seconds` limits one run and implies `isolate`; `anchor` runs on the metal-free twins too.
 
     `store` names the function that opens a scan's folder.
     """
@@ -74,11 +72,12 @@ class Task:
     @property
     def run(self) -> Run:
         """What determines the measurement."""
+        scene, seed = repetition(self.stored)
         return Run(
-            scene=self.stored.name,
+            scene=scene,
             scene_id=self.stored.scene_id,
             scan=self.stored.content_hash,
-            seed=int(self.stored.info.get("seed", 0)),
+            seed=seed,
             method=self.method.target,
             params=self.method.params,
             mask=self.method.mask,
@@ -94,6 +93,18 @@ class Task:
         return f"{self.stored.name}{twin}__{label}.tif"
 
 
+def repetition(stored: Stored) -> tuple[str, int]:
+    """Return the scene's name and its seed; make-dataset names the repetitions of a scene NAME-sSEED."""
+    try:
+        recipe = tomllib.loads((stored.folder / "scene.toml").read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        recipe = {}
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{stored.folder / 'scene.toml'}: damaged ({error})") from None
+    seed = int(recipe.get("seed", stored.info.get("seed", 0)))
+    return stored.name.removesuffix(f"-s{seed}"), seed
+
+
 def variant_of(stored: Stored, variant: str) -> Stored:
     """Return the scan itself or its twin without metal."""
     found = stored if variant == "metal" else stored.metal_free
@@ -103,21 +114,40 @@ def variant_of(stored: Stored, variant: str) -> Stored:
 
 
 def tasks(scans: list[Stored], methods: list[Method], options: Options) -> list[Task]:
-    """List every run: all methods on all scans, and FDK on the metal-free twins where asked."""
+    """List every run: all methods on all scans, each on the metal-free twin first where asked and there is one."""
     found = []
     for stored in scans:
-        found += [Task(stored=stored, variant="metal", method=m) for m in methods]
-        if options.anchor and stored.metal_free is not None:
-            found += [Task(stored=stored, variant="metal_free", method=m) for m in methods if m.label == ANCHOR]
+        variants = ("metal_free", "metal") if options.anchor and stored.metal_free is not None else ("metal",)
+        found += [Task(stored=stored, variant=v, method=m) for m in methods for v in variants]
     return found
 
 
 def pending(listed: list[Task], results: Path, force: bool) -> list[Task]:
-    """Keep the tasks that have no ok record, all of them with `force`; a kept volume is not asked for."""
+    """Keep the tasks that have no ok record, all of them with `force`; a scan's kept volume is not asked for.
+
+    A scan that was scored without its twin's volume is run again where the twin is among the tasks. A
+    twin is run again where its scan is to be run and the twin's volume was not kept.
+    """
     if force:
         return listed
-    known = records.done(records.read_all(results)[0])
-    return [task for task in listed if task.run.identity not in known]
+    found = records.read_all(results)[0]
+    known = records.done(found)
+    alone = {identity for identity, record in records.last(found).items() if artefact.lacks_twin(record.scores)}
+    twins = {(id(task.stored), task.method.label): task for task in listed if task.variant == "metal_free"}
+    left = []
+    for task in (t for t in listed if t.variant == "metal"):
+        twin = twins.get((id(task.stored), task.method.label))
+        wanted = task.run.identity not in known or (twin is not None and task.run.identity in alone)
+        if twin is not None and (twin.run.identity not in known or (wanted and not _kept(twin, results))):
+            left.append(twin)
+        if wanted:
+            left.append(task)
+    return left
+
+
+def _kept(task: Task, results: Path) -> bool:
+    """Say whether the volume on the disk is this very run's, not one of other parameters, code or data."""
+    return identity_of(results / "volumes" / task.file_name) == task.run.identity
 
 
 def run_all(listed: list[Task], results: Path, options: Options) -> Iterator[Record]:
@@ -126,31 +156,51 @@ def run_all(listed: list[Task], results: Path, options: Options) -> Iterator[Rec
     Raises OSError where results cannot be written. Failures of methods are records, not exceptions.
     """
     warm: dict[tuple[str, str, str], float] = {}
-    truth: tuple[str, Truth] | None = None
+    judge: tuple[str, Judge] | None = None
+    twin: tuple[Task, Outcome] | None = None
     for task in listed:
-        if truth is None or truth[0] != task.stored.content_hash:
-            truth = None  # let go of the last scan's masks first
-            truth = (task.stored.content_hash, truth_of(task.stored))
-        record = run_one(task, truth[1], results, options, warm)
+        if judge is None or judge[0] != task.stored.content_hash:
+            judge = twin = None  # let go of the last scan's masks first
+            judge = (task.stored.content_hash, Judge.of(task.stored))
+        outcome = run_one(task, options, warm)
+        if task.variant == "metal":
+            pair = _twin(task, twin, results, options)
+            twin = None
+        else:
+            pair, twin = Twin(), (task, outcome)
+        record = _record(task, outcome, (judge[1], pair), results, options)
         records.append(results / records.NAME, record)
         yield record
 
 
-def run_one(
-    task: Task, truth: Truth, results: Path, options: Options, warm: dict[tuple[str, str, str], float]
-) -> Record:
-    """Run one task and score it. `warm` remembers which methods are compiled for which counts."""
+def _twin(task: Task, last: tuple[Task, Outcome] | None, results: Path, options: Options) -> Twin:
+    """Return what the same method with the same parameters made of the metal-free scan, or why there is nothing."""
+    if task.stored.metal_free is None:
+        return Twin(reason=artefact.NO_TWIN)
+    if not options.anchor:
+        return Twin(reason=artefact.NOT_ASKED)
+    twin = dataclasses.replace(task, variant="metal_free")
+    if last is not None and last[0].run.identity == twin.run.identity:
+        outcome = last[1]
+        if outcome.values is not None and outcome.status == "ok":
+            return Twin(values=outcome.values)
+        return Twin(reason=f"{artefact.TWIN_ENDED} {outcome.status}: {outcome.reason}")
+    if _kept(twin, results):
+        return Twin(values=read_volume(results / "volumes" / twin.file_name))
+    return Twin(reason=artefact.NOT_ASKED)
+
+
+def run_one(task: Task, options: Options, warm: dict[tuple[str, str, str], float]) -> Outcome:
+    """Run one task. `warm` remembers which methods are compiled for which counts."""
     outcome = _skip(task)
     if outcome is None and (options.isolate or options.seconds is not None):
-        outcome = run_apart(
-            options.store, task.stored.folder, task.variant, task.method, options.device, options.seconds
-        )
-    elif outcome is None:
+        return run_apart(options.store, task.stored.folder, task.variant, task.method, options.device, options.seconds)
+    if outcome is None:
         key = (task.method.label, str(task.scan.counts.dtype), options.device)
         if key not in warm:
             warm[key] = warm_up(task.method, task.scan, options.device)
         outcome = attempt(task.method, task.scan, options.device, warm[key])
-    return _record(task, outcome, truth, results, options)
+    return outcome
 
 
 def _skip(task: Task) -> Outcome | None:
@@ -230,18 +280,17 @@ def tiny(scan: "Scan") -> "Scan":
     return dataclasses.replace(scan, geometry=msgspec.structs.replace(g, **changes), counts=scan.counts[:n])
 
 
-def _record(task: Task, outcome: Outcome, truth: Truth, results: Path, options: Options) -> Record:
+def _record(task: Task, outcome: Outcome, by: tuple[Judge, Twin], results: Path, options: Options) -> Record:
     """Score an outcome and write its volume."""
-    scores, kept = {}, None
+    scores, kept, run = {}, None, task.run
     if outcome.values is not None and outcome.status in ("ok", "diverged"):
         try:
-            scores = evaluate(outcome.values, truth, anchor=task.variant != "metal")
+            scores = by[0].scores(outcome.values, task.variant, by[1])
         except MemoryError as error:
             outcome.status, outcome.reason = "out_of_memory", f"while scoring: {describe(error)}"
     if outcome.values is not None and options.keep_volumes:
         kept = f"volumes/{task.file_name}"
-        write_volume(results / kept, outcome.values)
-    run = task.run
+        write_volume(results / kept, outcome.values, run.identity)
     return Record(
         identity=run.identity,
         run=run,
@@ -256,17 +305,3 @@ def _record(task: Task, outcome: Outcome, truth: Truth, results: Path, options: 
         commit=commit(),
         time=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     )
-
-
-def write_volume(path: Path, values: NDArray[np.float32]) -> None:
-    """Write a volume [z, y, x] in 1/mm as an uncompressed TIFF stack, whole or not at all."""
-    import tifffile
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".part")
-    try:
-        tifffile.imwrite(aside, values, photometric="minisblack", metadata={"axes": "ZYX", "unit": "1/mm"})
-        os.replace(aside, path)
-    finally:
-        with contextlib.suppress(OSError):
-            aside.unlink(missing_ok=True)

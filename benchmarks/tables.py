@@ -4,68 +4,18 @@ Nothing is computed anew. A cell is the mean ± standard deviation over noise se
 shows its status in place of numbers, and its reason below the tables.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import pandas as pd
 
-from benchmarks.records import OK, Record, latest
+from benchmarks.columns import COLUMNS, Column
+from benchmarks.compare import NMAR, derived, harm, row_of
+from benchmarks.records import OK, Record, latest, outdated
 from benchmarks.texts import escape, ranked
 from ctsim.errors import InputError
 
 Format = Literal["md", "tex"]
-
-
-@dataclass(frozen=True, slots=True)
-class Column:
-    """How a metric is shown: title, decimals, which way is better ("max", "min", "one" = nearest 1), and a factor."""
-
-    title: str
-    digits: int
-    better: str = ""
-    scale: float = 1.0
-
-
-COLUMNS: dict[str, dict[str, Column]] = {
-    "tissue": {"psnr3d": Column("PSNR3D (dB)", 2, "max"), "ssim3d": Column("SSIM3D", 3, "max")},
-    "aligned": {
-        "psnr3d": Column("PSNR3D (dB)", 2, "max"),
-        "ssim3d": Column("SSIM3D", 3, "max"),
-        "gain": Column("gain", 3),
-    },
-    "aligned_50kev": {
-        "psnr3d": Column("PSNR3D (dB)", 2, "max"),
-        "ssim3d": Column("SSIM3D", 3, "max"),
-        "gain": Column("gain", 3),
-    },
-    "paper": {
-        "psnr3d": Column("PSNR3D (dB)", 2, "max"),
-        "ssim3d": Column("SSIM3D", 3, "max"),
-        "psnr3d_full_gtmax": Column("psnr3d_full_gtmax", 2, "max"),
-        "psnr3d_r2": Column("psnr3d_r2", 2, "max"),
-        "ssim3d_r2": Column("ssim3d_r2", 3, "max"),
-        "ssim3d_naf": Column("ssim3d_naf", 3, "max"),
-    },
-    "metal": {
-        "core_ratio": Column("core ratio", 3, "one"),
-        "dice": Column("Dice", 3, "max"),
-        "boundary_rms": Column("boundary RMS (mm)", 3, "min"),
-    },
-    "against": {
-        "over_fdk": Column("over FDK (dB)", 2, "max"),
-        "over_nmar": Column("over NMAR (dB)", 2, "max"),
-        "anchored": Column("anchored score", 3, "min"),
-        "harm": Column("harm rate", 2, "min"),
-    },
-    "cost": {
-        "wall": Column("wall (s)", 2, "min"),
-        "cpu": Column("CPU (s)", 2, "min"),
-        "peak_bytes": Column("peak (MiB)", 0, "min", 1 / 2**20),
-        "view_updates": Column("view updates", 0),
-        "warm_up": Column("warm-up (s)", 2),
-    },
-}
 
 
 def tidy(records: list[Record]) -> pd.DataFrame:
@@ -86,40 +36,10 @@ def tidy(records: list[Record]) -> pd.DataFrame:
         rows += [{**base, "protocol": p, "metric": m, "value": v, "identical": i} for p, m, v, i in numbers]
         if not numbers:
             rows.append({**base, "protocol": "", "metric": "", "value": None, "identical": False})
-    frame = pd.DataFrame(
-        rows,
-        columns=["scene", "seed", "variant", "method", "inputs", "protocol", "metric", "value", "status", "identical"],
-    )
+    columns = ["scene", "seed", "variant", "method", "inputs", "protocol", "metric", "value", "status", "identical"]
+    frame = pd.DataFrame(rows + derived(rows), columns=pd.Index(columns))
     frame["value"] = pd.to_numeric(frame["value"])
-    return pd.concat([frame, _against(frame)], ignore_index=True) if len(frame) else frame
-
-
-def _against(frame: pd.DataFrame) -> pd.DataFrame:
-    """Derive gains over FDK and NMAR (tissue PSNR3D, dB), the anchored score (tissue RMSE) and harm, per run."""
-    scored: list[dict[Any, Any]] = [
-        row for row in _rows(frame) if row["protocol"] == "tissue" and row["status"] == OK and pd.notna(row["value"])
-    ]
-
-    def series(variant: str, method: str, metric: str) -> dict[Any, float]:
-        wanted = (variant, method, metric)
-        chosen = [row for row in scored if (row["variant"], row["method"], row["metric"]) == wanted]
-        return {(row["scene"], row["seed"]): row["value"] for row in chosen}
-
-    fdk, nmar = series("metal", "fdk", "psnr3d"), series("metal", "nmar", "psnr3d")
-    worst, best = series("metal", "fdk", "rmse"), series("metal_free", "fdk", "rmse")
-    rows = []
-    for row in scored:
-        key = (row["scene"], row["seed"])
-        found: dict[str, float] = {}
-        if row["variant"] != "metal":
-            continue
-        if row["metric"] == "psnr3d":
-            found = {n: row["value"] - base[key] for n, base in (("over_fdk", fdk), ("over_nmar", nmar)) if key in base}
-        elif row["metric"] == "rmse" and key in worst and key in best and worst[key] != best[key]:
-            score = (row["value"] - best[key]) / (worst[key] - best[key])
-            found = {"anchored": score, "harm": float(score > 1)}
-        rows += [{**row, "protocol": "against", "metric": m, "value": v} for m, v in found.items()]
-    return pd.DataFrame(rows, columns=frame.columns).astype(frame.dtypes.to_dict())
+    return frame
 
 
 def _rows(frame: pd.DataFrame) -> list[dict[Any, Any]]:
@@ -144,7 +64,8 @@ def _cell(row: dict[Any, Any] | None, column: Column) -> tuple[float | None, str
     if row is None:
         return None, "–"
     if row["n"] == 0:
-        return (float("inf"), "identical") if row["identical"] else (None, "–")
+        same = row["identical"] and row["metric"].startswith("psnr3d")
+        return (float("inf"), "identical") if same else (None, "–")
     mean = row["mean"] * column.scale
     text = f"{mean:.{column.digits}f}"
     if row["n"] > 1:
@@ -170,11 +91,16 @@ def _grid(table: pd.DataFrame, protocol: str, records: list[Record]) -> tuple[li
                 status = failed[scene, method]
                 number, text = None, status if number is None or protocol == "cost" else f"{text} ({status})"
             cells.append((number, text))
+        more = []
         if len(scenes) > 1:
-            cells += [_mean(cells, k, len(metrics), COLUMNS[protocol][m]) for k, m in enumerate(metrics)]
-        rows.append([inputs, method, cells])
+            more += [_mean(cells, k, len(metrics), COLUMNS[protocol][m]) for k, m in enumerate(metrics)]
+        if protocol == "anchored":
+            more += [harm([number for number, _ in cells[k :: len(metrics)]]) for k in range(len(metrics))]
+        rows.append([inputs, method, cells + more])
     if len(scenes) > 1:
         columns += [("mean", m) for m in metrics]
+    if protocol == "anchored":
+        columns += [("harm rate", m) for m in metrics]
     rows.sort(key=lambda row: row[0])
     return columns, rows
 
@@ -193,9 +119,16 @@ def caption(records: list[Record], protocol: str) -> str:
     if protocol == "cost":
         return "Protocol cost: seconds and peak resident memory of a run; compilation and first call stand apart."
     if protocol == "against":
+        nmar = row_of(NMAR, (r.label for r in records if r.status == OK and r.run.variant == "metal"))
         return (
-            "Protocol tissue, compared: gain in PSNR3D over no correction (FDK) and over NMAR; anchored score of the "
-            "RMSE (0: as FDK without the metal, 1: as uncorrected FDK); harm rate: share of runs with a score above 1."
+            "Protocol tissue, compared: gain in PSNR3D (dB) over no correction (FDK) and over NMAR"
+            f"{'' if nmar is None else f' (the row {nmar})'}, scene by scene and seed by seed."
+        )
+    if protocol == "anchored":
+        return (
+            "Anchored scores s = (e − e_ref)/(e_FDK − e_ref), e_ref from the metal-free scan reconstructed by FDK: "
+            "0 as if the metal had never been there, 1 uncorrected. Harm rate: share of scenes with s > 1, "
+            "and how many of how many scenes that have a score."
         )
     found = [(r.run.scene, r.scores[protocol]) for r in records if protocol in r.scores and r.run.variant == "metal"]
     if not found:
@@ -203,11 +136,34 @@ def caption(records: list[Record], protocol: str) -> str:
     score = found[0][1]
     references = dict.fromkeys(s.reference for _, s in found)
     alignment = "one least-squares gain on the body" if protocol.startswith("aligned") else score.alignment
-    ranges = {scene: s.data_range for scene, s in found if s.data_range is not None}
+    ranges: dict[str, list[float]] = {}
+    for scene, s in found:
+        if s.data_range is not None:
+            ranges.setdefault(scene, []).append(s.data_range)
     text = f"Protocol {protocol}: region {score.region}; reference {' / '.join(references)}; alignment {alignment}"
     if ranges:
-        text += "; data range " + ", ".join(f"{v:.4g} ({s})" for s, v in ranges.items()) + " 1/mm"
+        text += "; data range " + ", ".join(f"{_span(v)} ({s})" for s, v in ranges.items()) + " 1/mm"
     return text + "."
+
+
+def _span(numbers: list[float]) -> str:
+    """Write numbers as one, or as the least and the greatest where seeds differ."""
+    low, high = f"{min(numbers):.4g}", f"{max(numbers):.4g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def _notes(records: list[Record], protocol: str) -> list[str]:
+    """Return what the scores of a protocol declare: once for a scene and seed where its methods agree."""
+    labels: dict[tuple[str, int, str], list[str]] = {}
+    for record in records:
+        if record.run.variant == "metal" and protocol in record.scores and record.scores[protocol].note:
+            key = (record.run.scene, record.run.seed, record.scores[protocol].note)
+            labels.setdefault(key, []).append(record.label)
+    scenes = [(scene, seed) for scene, seed, _ in labels]
+    return [
+        f"{scene} (seed {seed}{'' if scenes.count((scene, seed)) == 1 else ', ' + ', '.join(methods)}): {note}"
+        for (scene, seed, note), methods in labels.items()
+    ]
 
 
 def _lines(columns: list[tuple[str, str]], rows: list[list[Any]], protocol: str, form: Format) -> list[list[str]]:
@@ -233,7 +189,7 @@ def _lines(columns: list[tuple[str, str]], rows: list[list[Any]], protocol: str,
 
 def render(records: list[Record], form: Format) -> str:
     """Render all tables as Markdown or LaTeX (booktabs); failures and skips follow with their reasons."""
-    records = latest(records)
+    left_out, records = outdated(records), latest(records)
     table = summary(records)
     parts = []
     for protocol in COLUMNS:
@@ -245,7 +201,8 @@ def render(records: list[Record], form: Format) -> str:
         if form == "md":
             head = ["| " + " | ".join(lines[0]) + " |", "|---|---|" + "---:|" * len(columns)]
             body = head + ["| " + " | ".join(line) + " |" for line in lines[1:]]
-            parts.append(f"## {protocol}\n\n{text}\n\n" + "\n".join(body) + "\n")
+            notes = "".join(f"- {escape(note, form)}\n" for note in _notes(records, protocol))
+            parts.append(f"## {protocol}\n\n{text}\n\n" + "\n".join(body) + "\n" + (f"\n{notes}" if notes else ""))
         else:
             body = [" & ".join(line) + r" \\" for line in lines]
             spec = "ll" + "r" * len(columns)
@@ -253,7 +210,7 @@ def render(records: list[Record], form: Format) -> str:
                 "\\begin{table}\n\\centering\n\\caption{" + text + "}\n\\begin{tabular}{" + spec + "}\n\\toprule\n"
                 f"{body[0]}\n\\midrule\n" + "\n".join(body[1:]) + "\n\\bottomrule\n\\end{tabular}\n\\end{table}\n"
             )
-    parts.append(_failures(records, form))
+    parts += [_failures(records, form), f"{'' if form == 'md' else '% '}{left_out}.\n" if left_out else ""]
     return "\n".join(p for p in parts if p)
 
 
@@ -277,6 +234,8 @@ def write(records: list[Record], results: Path) -> None:
     """
     if not records:
         raise InputError(f"{results}: there are no records to tabulate; run a method first")
+    if not latest(records):
+        raise InputError(f"{results}: {outdated(records)}")
     for form in ("md", "tex"):
         (results / f"table.{form}").write_text(render(records, form), encoding="utf-8")
     summary(records).to_csv(results / "table.csv", index=False)

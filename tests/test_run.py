@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import cli, cli_run, methods, records, run
+from benchmarks import artefact, cli, cli_run, methods, records, run
 from benchmarks.panels import cut, write_panels
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -104,15 +104,18 @@ def crash(scan, *, device):
 
 
 def once(name, results, stored=None, **options):
+    """Run one method on a scan alone, without its twin."""
     method = methods.find(f"test_run:{name}")
-    chosen = run.Options(store="test_run:open_double", **options)
+    chosen = run.Options(store="test_run:open_double", anchor=False, **options)
     return next(run.run_all(run.tasks([stored or double(results)], [method], chosen), results, chosen))
 
 
 def test_a_run_is_scored_timed_kept_and_recorded(tmp_path):
     record = once("good", tmp_path)
     assert record.status == "ok" and record.run.seed == 3 and record.run.params == {"level": 0.018}
-    assert set(record.scores) == {"tissue", "aligned", "aligned_50kev", "paper", "metal"}
+    assert set(record.scores) == {"tissue", "aligned", "aligned_50kev", "paper", "metal", "artefact"}
+    assert record.scores["artefact"].note == artefact.NOT_ASKED
+    assert set(record.scores["artefact"].values.values()) == {None}
     assert record.cost.view_updates == 12 and record.cost.peak_bytes > 0 and not record.cost.isolated
     assert record.host.ram > 0 and record.time.endswith("+00:00")
     assert records.read(tmp_path / records.NAME) == ([record], None)
@@ -165,7 +168,7 @@ def test_the_anchor_is_judged_in_the_region_of_the_metal_scan(tmp_path, monkeypa
     monkeypatch.setitem(methods.TABLE, "fdk", ("test_run:good", "counts only"))
     options = run.Options()
     listed = run.tasks([double(tmp_path)], [methods.find("fdk")], options)
-    with_metal, without = run.run_all(listed, tmp_path, options)
+    without, with_metal = run.run_all(listed, tmp_path, options)
     assert without.run.variant == "metal_free" and without.identity != with_metal.identity
     assert without.scores["tissue"] == with_metal.scores["tissue"]
     assert set(without.scores) == {"tissue", "aligned", "aligned_50kev"}
@@ -225,7 +228,7 @@ def test_ctrl_c_keeps_the_records(tmp_path, monkeypatch, capsys):
         monkeypatch, capsys, tmp_path, tmp_path, "--method", "test_run:good", "--method", "test_run:stop"
     )
     assert code == 130 and "interrupted" in said.err
-    assert [r.status for r in records.read(tmp_path / records.NAME)[0]] == ["ok"]
+    assert [r.status for r in records.read(tmp_path / records.NAME)[0]] == ["ok", "ok"]  # the twin and the scan
     assert (tmp_path / "table.md").exists()
 
 

@@ -1,3 +1,4 @@
+import msgspec
 import pandas as pd
 import pytest
 
@@ -86,20 +87,112 @@ def test_identical_is_named():
     assert "identical" in tables.render([record(psnr=None, rmse=0.0)], "md")
 
 
-def test_gain_and_anchored_score():
-    given = [
-        record("fdk", psnr=20.0, rmse=0.5),
-        record("fdk", rmse=0.1, psnr=34.0, variant="metal_free"),
-        record("nmar", psnr=26.0, rmse=0.2, inputs="mask"),
-        record("bad", psnr=19.0, rmse=0.7, inputs="mask"),
+def test_gain_over_fdk_and_nmar():
+    given = [record("fdk", psnr=20.0), record("nmar", psnr=26.0, inputs="mask"), record("bad", psnr=19.0)]
+    table = tables.summary(given).set_index(["method", "protocol", "metric"])["mean"]
+    assert table["nmar", "against", "over_fdk"] == pytest.approx(6.0)
+    assert table["bad", "against", "over_nmar"] == pytest.approx(-7.0)
+    assert "(the row nmar)" in tables.render(given, "md")
+    assert "over NMAR (dB)" not in tables.render(given[:1], "md")
+    assert "## against" not in tables.render(given[2:], "md")
+
+
+def test_nmar_with_parameters_is_named():
+    given = [record("fdk"), record("nmar[mask=oracle]", psnr=26.0), record("nmar[mask=auto]", psnr=25.0)]
+    text = tables.render(given, "md")
+    assert "over NMAR (the row nmar[mask=oracle])" in text
+    assert cells(text[text.index("## against") :], "| counts only | nmar[mask=auto]")[3] == "<u>-1.00</u>"
+
+
+def anchors(scene, rmse, best=0.1, worst=0.5, **more):
+    """FDK with and without the metal, and a method, of which the RMSE is given."""
+    return [
+        record("fdk", rmse=worst, scene=scene, **more),
+        record("fdk", rmse=best, scene=scene, variant="metal_free", **more),
+        record("net", rmse=rmse, scene=scene, **more),
     ]
+
+
+def test_anchored_score_of_the_rmse():
+    given = anchors("lung", 0.2)
     table = tables.summary(given).set_index(["variant", "method", "protocol", "metric"])["mean"]
-    assert table["metal", "fdk", "against", "anchored"] == pytest.approx(1.0)
-    assert table["metal", "nmar", "against", "anchored"] == pytest.approx(0.25)
-    assert table["metal", "nmar", "against", "over_fdk"] == pytest.approx(6.0)
-    assert table["metal", "bad", "against", "over_nmar"] == pytest.approx(-7.0)
-    assert table["metal", "bad", "against", "harm"] == 1 and table["metal", "nmar", "against", "harm"] == 0
+    assert table["metal", "net", "anchored", "tissue/rmse"] == pytest.approx(0.25)  # (0.2 − 0.1) / (0.5 − 0.1)
+    assert table["metal", "fdk", "anchored", "tissue/rmse"] == 1.0
     assert "metal_free" not in tables.render(given, "md")
+
+
+def test_harm_is_a_share_of_scenes():
+    given = anchors("a", 0.2) + anchors("b", 0.6) + anchors("c", 0.7)
+    text = tables.render(given, "md")
+    text = text[text.index("## anchored") :]
+    assert "harm rate: s tissue RMSE" in text
+    row = cells(text, "| counts only | net")
+    # s = 0.25, 1.25, 1.5; of two metrics SSIM has no score (all are equal), so the columns are RMSE alone
+    assert row[2:] == ["**0.250**", "<u>1.250</u>", "<u>1.500</u>", "**1.000**", "<u>0.67 (2/3)</u>"]
+    assert cells(text, "| counts only | fdk")[-1] == "**0.00 (0/3)**"
+
+
+def test_harm_counts_scenes_not_seeds():
+    # seeds 0.3 and 1.3: harmful once, but not on average
+    given = anchors("a", 0.22, seed=0) + anchors("a", 0.62, seed=1)
+    text = tables.render(given, "md")
+    row = cells(text[text.index("## anchored") :], "| counts only | net")
+    # std with ddof = 1 of 0.3 and 1.3 is 1/√2
+    assert row[2] == "**0.800 ± 0.707**" and row[3].strip("*<u>/") == "0.00 (0/1)"
+
+
+def test_a_scene_without_a_score_is_not_counted_as_unharmed():
+    given = anchors("a", 0.6) + anchors("b", 0.6, best=0.5)  # in b the metal does FDK no harm
+    text = tables.render(given, "md")
+    row = cells(text[text.index("## anchored") :], "| counts only | net")
+    assert row[3:] == ["–", "–", "1.00 (1/1)"]
+
+
+def artefact_record(method, streak, note="ROI water"):
+    found = record(method, psnr=20.0)
+    score = Score(
+        region="ROIs", reference="twin", alignment="none", data_range=None, n_voxels=9, note=note,
+        values={"streak": streak, "rmse_near": None},
+    )  # fmt: skip
+    return msgspec.structs.replace(found, scores={**found.scores, "artefact": score})
+
+
+def test_artefacts_are_anchored_on_nothing():
+    given = [artefact_record("fdk", 80.0), artefact_record("net", 20.0)]
+    table = tables.summary(given).set_index(["method", "protocol", "metric"])["mean"]
+    assert table["net", "anchored", "artefact/streak"] == 0.25
+    assert ("net", "anchored", "artefact/rmse_near") not in table.index
+
+
+def test_what_a_score_declares_stands_below_its_table():
+    given = [artefact_record("fdk", 80.0), artefact_record("net", 20.0)]
+    assert "- lung (seed 0): ROI water\n" in tables.render(given, "md")
+    given[1] = artefact_record("net", None, "no twin | at all")
+    text = tables.render(given, "md")
+    assert "- lung (seed 0, fdk): ROI water\n" in text and "- lung (seed 0, net): no twin \\| at all\n" in text
+
+
+def test_old_protocols_are_left_out_and_said_to_be(tmp_path):
+    old = record("old", psnr=99.0)
+    old = msgspec.structs.replace(old, run=msgspec.structs.replace(old.run, protocol=1))
+    text = tables.render([record(), old], "md")
+    assert "99.00" not in text and "1 of 2 records are of protocol version 1 and left out" in text
+    with pytest.raises(InputError, match="protocol version 1"):
+        tables.write([old], tmp_path)
+
+
+def test_ranges_of_seeds_that_differ_are_both_given():
+    other = record(seed=1)
+    score = msgspec.structs.replace(other.scores["tissue"], data_range=0.025)
+    other = msgspec.structs.replace(other, scores={"tissue": score})
+    assert "data range 0.0234 to 0.025 (lung) 1/mm" in tables.render([record(), other], "md")
+
+
+def test_identical_is_said_of_the_psnr_alone():
+    given = record(psnr=None)
+    score = msgspec.structs.replace(given.scores["tissue"], values={"psnr3d": None, "ssim3d": None}, identical=True)
+    text = tables.render([msgspec.structs.replace(given, scores={"tissue": score})], "md")
+    assert cells(text, "| counts only | fdk")[2:4] == ["identical", "–"]
 
 
 def test_latex_is_booktabs_and_escaped(tmp_path):

@@ -1,0 +1,39 @@
+"""All scores of one volume: every protocol that applies to it, from one scan's truth."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.artefact import NO_TWIN, Layout, artefact_score, layout_of
+from benchmarks.protocol import Score, Stored, Truth, evaluate, truth_of
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Twin:
+    """What a method made of the metal-free scan, [z, y, x] in 1/mm; where there is nothing, `reason` says why."""
+
+    values: NDArray[np.float32] | None = None
+    reason: str = NO_TWIN
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judge:
+    """What volumes of one scan are held against."""
+
+    truth: Truth
+    layout: Layout
+
+    @classmethod
+    def of(cls, stored: Stored) -> "Judge":
+        """Load a scan's references and choose where its artefacts are measured."""
+        truth = truth_of(stored)
+        return cls(truth=truth, layout=layout_of(stored, truth))
+
+    def scores(self, values: NDArray[Any], variant: str, twin: Twin) -> dict[str, Score]:
+        """Score a volume under every protocol; of the metal-free `variant` only what compares has a meaning."""
+        scores = evaluate(values, self.truth, anchor=variant != "metal")
+        if variant == "metal" and self.truth.metal.any():
+            scores["artefact"] = artefact_score(values, twin.values, self.layout, self.truth, twin.reason)
+        return scores
