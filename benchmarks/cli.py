@@ -17,10 +17,11 @@ def make_dataset() -> int:
 
 
 def run_benchmark() -> int:
-    """Run `run-benchmark`, or `run-benchmark peers`; return the exit code."""
+    """Run `run-benchmark`, `run-benchmark inspect` or `run-benchmark peers`; return the exit code."""
     arguments = sys.argv[1:]
-    if arguments[:1] == ["peers"]:
-        return guarded("run-benchmark peers", "benchmarks.peers", arguments[1:])
+    others = {"inspect": "benchmarks.inspector", "peers": "benchmarks.peers"}
+    if arguments and arguments[0] in others:
+        return guarded(f"run-benchmark {arguments[0]}", others[arguments[0]], arguments[1:])
     return guarded("run-benchmark", "benchmarks.cli_run", arguments)
 
 
