@@ -311,14 +311,15 @@ def _kept(given: Arguments, stored: "Stored") -> tuple[Volume, str]:
 def _made(given: Arguments, stored: "Stored") -> tuple[Volume, str]:
     """Reconstruct the scan."""
     from benchmarks import methods
-    from benchmarks.run import attempt
+    from benchmarks.run import attempt, scan_for
 
     if given.method is None:
         raise InputError("expected a results folder or --method NAME")
     method = methods.find(given.method)
-    if reason := method.skip(stored.scan):
+    scan = scan_for(method, stored, "metal")
+    if reason := method.skip(scan):
         raise InputError(f"method {given.method!r} does not apply to {stored.name!r}: {reason}")
-    outcome = attempt(method, stored.scan, given.device, 0.0)
+    outcome = attempt(method, scan, given.device, 0.0)
     if outcome.status != "ok" or outcome.values is None:
         raise InputError(f"method {given.method!r} ended as {outcome.status}: {outcome.reason}")
     return outcome.values, method.label

@@ -41,11 +41,12 @@ class _Ended(msgspec.Struct, frozen=True, kw_only=True):
 
 def _work(store: str, folder: str, variant: str, method: "Method", device: str, out: str) -> None:
     """Be the process: open the scan, warm up, run, leave the outcome in `out`."""
-    from benchmarks.run import attempt, variant_of, warm_up
+    from benchmarks.run import attempt, scan_for, warm_up
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C means
-    scan = variant_of(pkgutil.resolve_name(store)(folder), variant).scan
-    outcome = attempt(method, scan, device, warm_up(method, scan, device))
+    stored = pkgutil.resolve_name(store)(folder)
+    warm = warm_up(method, scan_for(method, stored, "metal"), device)
+    outcome = attempt(method, scan_for(method, stored, variant), device, warm)
     if outcome.values is not None:
         np.save(Path(out) / _VALUES, outcome.values)
     cost = None if outcome.cost is None else msgspec.structs.replace(outcome.cost, isolated=True)

@@ -67,7 +67,7 @@ class Task:
     @property
     def scan(self) -> "Scan":
         """What the method gets."""
-        return variant_of(self.stored, self.variant).scan
+        return scan_for(self.method, self.stored, self.variant)
 
     @property
     def run(self) -> Run:
@@ -105,12 +105,20 @@ def repetition(stored: Stored) -> tuple[str, int]:
     return stored.name.removesuffix(f"-s{seed}"), seed
 
 
-def variant_of(stored: Stored, variant: str) -> Stored:
-    """Return the scan itself or its twin without metal."""
+def scan_for(method: Method, stored: Stored, variant: str) -> "Scan":
+    """Return the scan itself or its twin without metal; with the true mask where the method's is "oracle".
+
+    Raises InputError where there is no twin. The twin's true mask is empty.
+    """
     found = stored if variant == "metal" else stored.metal_free
     if found is None:
         raise InputError(f"scan {stored.name!r} has no metal-free twin")
-    return found
+    if method.mask != "oracle":
+        return found.scan
+    import torch
+
+    metal = np.asarray(stored.metal) > 0
+    return dataclasses.replace(found.scan, metal=torch.from_numpy(metal & (variant == "metal")))
 
 
 def tasks(scans: list[Stored], methods: list[Method], options: Options) -> list[Task]:
@@ -198,7 +206,8 @@ def run_one(task: Task, options: Options, warm: dict[tuple[str, str, str], float
     if outcome is None:
         key = (task.method.label, str(task.scan.counts.dtype), options.device)
         if key not in warm:
-            warm[key] = warm_up(task.method, task.scan, options.device)
+            # also before the twin: without metal a method may take another way, and not be compiled
+            warm[key] = warm_up(task.method, scan_for(task.method, task.stored, "metal"), options.device)
         outcome = attempt(task.method, task.scan, options.device, warm[key])
     return outcome
 
@@ -269,7 +278,8 @@ def tiny(scan: "Scan") -> "Scan":
     """Return a scan of the first 8 views of `scan` and 8 whole slices of its volume.
 
     The counts are a view into the scan's own and the slices keep their size, so that kernels are
-    compiled for the very types (dtype, layout, alignment; one tile or several) of the timed run.
+    compiled for the very types (dtype, layout, alignment; one tile or several) of the timed run. Of a
+    true mask the 8 slices with the most metal are kept, so that correcting it is compiled too.
     """
     g = scan.geometry
     n = min(8, g.n_views)
@@ -277,7 +287,13 @@ def tiny(scan: "Scan") -> "Scan":
     for name in ("angles_deg", "poses"):
         if getattr(g, name) is not None:
             changes[name] = getattr(g, name)[:n]
-    return dataclasses.replace(scan, geometry=msgspec.structs.replace(g, **changes), counts=scan.counts[:n])
+    more: dict[str, Any] = {}
+    if scan.metal is not None:
+        height = changes["n_voxel"][0]
+        per_slice = np.asarray(scan.metal.sum((1, 2)))
+        most = int(np.argmax(np.convolve(per_slice, np.ones(height, per_slice.dtype), "valid")))
+        more["metal"] = scan.metal[most : most + height]
+    return dataclasses.replace(scan, **more, geometry=msgspec.structs.replace(g, **changes), counts=scan.counts[:n])
 
 
 def _record(task: Task, outcome: Outcome, by: tuple[Judge, Twin], results: Path, options: Options) -> Record:

@@ -28,7 +28,8 @@ class Pair(Double):
         return Scan(geometry=GEOMETRY, counts=counts, flat=torch.full(GEOMETRY.n_detector, 2000.0))
 
 
-def pair(folder: Path) -> Pair:
+def pair(folder: Path | str) -> Pair:
+    folder = Path(folder)
     (folder / "spectrum.csv").write_text("energy_kev,photon_fraction,signal_fraction\n60.0,1,1\n")
     return Pair(folder=folder, name="box", metal_free=Pair(folder=folder, name="box", level=900))
 
@@ -170,3 +171,41 @@ def test_a_volume_that_cannot_be_read_is_one_sentence(tmp_path):
     with pytest.raises(InputError, match="TIFF"):
         read_volume(tmp_path / "v.tif")
     assert identity_of(tmp_path / "v.tif") is None
+
+
+def masked(scan, *, device, mask="oracle"):
+    """The volume is 1 where the true mask is."""
+    if scan.metal is None:
+        raise RuntimeError("no mask was given")
+    return Volume(values=scan.metal.to(torch.float32))
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_the_true_mask_goes_to_methods_that_ask_for_it_and_is_empty_in_the_twin(tmp_path, isolate):
+    twin, record = do(tmp_path, name="masked", isolate=isolate, store="test_twins:pair")[1]
+    assert (twin.status, record.status, record.run.mask) == ("ok", "ok", "oracle")
+    assert read_volume(tmp_path / twin.volume).max() == 0
+    np.testing.assert_array_equal(read_volume(tmp_path / record.volume), pair(tmp_path).metal)
+    assert pair(tmp_path).scan.metal is None
+
+
+def test_warming_up_sees_the_metal(tmp_path):
+    scan = run.scan_for(methods.find("test_twins:masked"), pair(tmp_path), "metal")
+    small = run.tiny(scan)
+    assert tuple(small.metal.shape) == small.geometry.n_voxel == (8, 14, 16)
+    assert small.metal.sum() == scan.metal.sum() > 0
+
+
+def heard(scan, *, device):
+    """Remembers what it was called with."""
+    CALLS.append((int(scan.counts[0, 0, 0]), scan.geometry.n_views))
+    return Volume(values=torch.zeros(scan.geometry.n_voxel))
+
+
+CALLS: list[tuple[int, int]] = []
+
+
+def test_the_warm_up_is_on_the_scan_with_metal(tmp_path):
+    CALLS.clear()
+    do(tmp_path, name="heard")
+    assert CALLS == [(1000, 6), (900, 6), (1000, 6)]  # warm-up, twin, scan; 6 views are all there are
