@@ -1,0 +1,209 @@
+"""What the iterative methods share: the linear system of a scan, their course, and how they end.
+
+A x = p with A of `reconstruct.projector`, x the attenuation in 1/mm and p the measured line integrals; residuals
+are ‖A x − p‖_W / ‖p‖_W, so an empty volume has 1. Volumes are kept as [y, x, z] while iterating. Only voxels
+within the field of view that some ray meets are unknowns; all others are and stay zero.
+"""
+
+import contextlib
+import contextvars
+import math
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+from ctsim.types import Scan, Status, Volume
+from reconstruct.log import line_integrals
+from reconstruct.projector import Views, adjoint_columns, forward_columns
+from reconstruct.redundancy import ray_weights
+
+Array = NDArray[np.float32]
+OnUpdate = Callable[[int, float, torch.Tensor], None]
+Weights = str | torch.Tensor
+WEIGHTS = ("none", "exp(-p)")
+WORST = 1.5  # a relative residual that no fit of pure noise reaches: one view fitted to another's gives √2
+
+_watcher: contextvars.ContextVar[OnUpdate | None] = contextvars.ContextVar("watcher", default=None)
+
+
+@contextlib.contextmanager
+def watch(on_update: OnUpdate) -> Iterator[None]:
+    """Call `on_update(view_updates, seconds, volume)` after each iteration of every method run within.
+
+    `volume` is float32 [z, y, x]; the seconds since the start leave out what `on_update` took.
+    """
+    token = _watcher.set(on_update)
+    try:
+        yield
+    finally:
+        _watcher.reset(token)
+
+
+class System:
+    """A scan's linear system: data, ray weights, and the projector restricted to the unknowns.
+
+    `data` and `weights` are float32 [view, v, u], `support` is bool [y, x, z]. Counts the views projected
+    and backprojected. `weights` is "none" (all 1), "exp(-p)" (the share of photons that came through, hence
+    the inverse variance of p up to a factor) or a tensor [view, v, u] of one's own.
+    """
+
+    def __init__(self, scan: Scan, device: str, weights: Weights = "none") -> None:
+        if torch.device(device).type != "cpu":
+            raise InputError(f"the iterative methods run on device 'cpu' only, got {device!r}")
+        self.geometry = scan.geometry
+        data, clamped = line_integrals(scan, slice(None))
+        self.data: Array = data.numpy()
+        self.clamped = int(clamped.sum())
+        self.weights = _weights(weights, self.data)
+        self.views_projected = self.views_backprojected = 0
+        n_z, n_y, n_x = self.geometry.n_voxel
+        self.support = np.ones((n_y, n_x, n_z), np.bool_)
+        self.support &= _within_field_of_view(self.geometry)[:, :, None]
+        self.support &= self.adjoint(np.ones_like(self.data)) > 0
+        self.scale = weighted_norm(self.data, self.weights) or 1.0
+
+    def empty(self) -> Array:
+        """Return the volume that all methods start from."""
+        return np.zeros(self.support.shape, np.float32)
+
+    def forward(self, x: Array, views: Views = None) -> Array:
+        """Project the chosen views (default: all), [view, v, u]."""
+        projections = forward_columns(x, self.geometry, views)
+        self.views_projected += len(projections)
+        return projections
+
+    def adjoint(self, projections: Array, views: Views = None) -> Array:
+        """Backproject the chosen views onto the unknowns, [y, x, z]."""
+        x = adjoint_columns(projections, self.geometry, views)
+        self.views_backprojected += len(projections)
+        x *= self.support
+        return x
+
+    def residual(self, x: Array) -> float:
+        """Return ‖A x − p‖_W / ‖p‖_W."""
+        difference = self.forward(x)
+        difference -= self.data
+        return weighted_norm(difference, self.weights) / self.scale
+
+
+class Course:
+    """The residuals of a run by iteration, and the reason to stop it early, if any."""
+
+    def __init__(self) -> None:
+        self.view_updates = 0
+        self.residuals: list[float] = []
+        self.reason = ""
+        self._began, self._watching = time.perf_counter(), 0.0
+
+    def note(self, x: Array, views: int, residual: float) -> bool:
+        """Record an iteration that used `views` views; tell whether to go on.
+
+        A residual well above that of an empty volume, or not finite, is divergence.
+        """
+        self.view_updates += views
+        self.residuals.append(residual)
+        if not residual <= WORST:
+            self.reason = f"the data residual of iteration {len(self.residuals)} is {residual:.3g}, an empty volume's 1"
+        if watcher := _watcher.get():
+            now = time.perf_counter()
+            watcher(self.view_updates, now - self._began - self._watching, torch.from_numpy(as_volume(x)))
+            self._watching += time.perf_counter() - now
+        return not self.reason
+
+
+def finish(system: System, course: Course, x: Array, **details: Any) -> Volume:
+    """Measure the final residual and say how the run ended."""
+    values = as_volume(x)
+    finite = bool(np.isfinite(values).all())
+    if not finite:
+        values = np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+    residual = system.residual(x) if finite else math.inf
+    reason = course.reason
+    if not reason and not residual <= 1 + 1e-3:
+        reason = f"the final data residual is {residual:.3g}, an empty volume's 1"
+    return Volume(
+        values=torch.from_numpy(values),
+        status=Status.DIVERGED if reason else Status.OK,
+        reason=reason,
+        details={
+            "view_updates": course.view_updates,
+            "residual": residual if finite else None,
+            "residuals": [r if math.isfinite(r) else None for r in course.residuals],
+            "views_projected": system.views_projected,
+            "views_backprojected": system.views_backprojected,
+            "clamped_pixels": system.clamped,
+            **details,
+        },
+    )
+
+
+def as_volume(x: Array) -> Array:
+    """Turn [y, x, z] into [z, y, x]."""
+    return np.ascontiguousarray(x.transpose(2, 0, 1))
+
+
+def visiting_order(n: int) -> list[int]:
+    """Order n subsets so that each lies far from those before it: steps of the golden section, mod n."""
+    step = max(1, round(n * (math.sqrt(5) - 1) / 2))
+    while math.gcd(step, n) != 1:
+        step += 1
+    return [k * step % n for k in range(n)]
+
+
+def check_count(name: str, value: int, least: int = 1) -> None:
+    """Raise InputError unless `value` is a whole number of at least `least`."""
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise InputError(f"{name} must be a whole number of at least {least}, got {value!r}")
+
+
+def check_positive(name: str, value: float) -> None:
+    """Raise InputError unless `value` is finite and positive."""
+    if not (math.isfinite(value) and value > 0):
+        raise InputError(f"{name} must be positive, got {value!r}")
+
+
+def weighted_norm(values: Array, weights: Array) -> float:
+    """Return the square root of Σ w·a², summed in float64 in one order for any number of threads."""
+    return math.sqrt(weighted_dot(values, values, weights))
+
+
+def weighted_dot(a: Array, b: Array, weights: Array) -> float:
+    """Return Σ w·a·b, summed in float64 in one order for any number of threads."""
+    sums = np.zeros(len(a), np.float64)
+    _dot_by_row(a.reshape(len(a), -1), b.reshape(len(a), -1), weights.reshape(len(a), -1), sums)
+    return float(sums.sum())
+
+
+@njit(parallel=True, cache=True, fastmath={"reassoc", "contract"})
+def _dot_by_row(a, b, weights, sums):
+    for row in prange(a.shape[0]):
+        total = 0.0
+        for k in range(a.shape[1]):
+            total += np.float64(weights[row, k]) * a[row, k] * b[row, k]
+        sums[row] = total
+
+
+def _weights(given: Weights, data: Array) -> Array:
+    if isinstance(given, torch.Tensor):
+        weights = np.array(given.detach().cpu().numpy(), np.float32)
+        if weights.shape != data.shape or not np.isfinite(weights).all() or weights.min() < 0 or weights.max() == 0:
+            raise InputError(f"weights must be {data.shape}, finite, not negative and not all zero")
+        return weights
+    if given not in WEIGHTS:
+        raise InputError(f"weights must be one of {', '.join(WEIGHTS)}, got {given!r}")
+    return np.ones_like(data) if given == "none" else np.exp(-np.maximum(data, 0), dtype=np.float32)
+
+
+def _within_field_of_view(geometry: Geometry) -> NDArray[np.bool_]:
+    """Mark the voxel columns [y, x] that FDK reconstructs as well; with poses given, all of them."""
+    _, y, x = geometry.voxel_centres()
+    if geometry.poses is not None:
+        return np.ones((y.size, x.size), np.bool_)
+    return np.add.outer(y**2, x**2) <= ray_weights(geometry).radius ** 2

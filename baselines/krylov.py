@@ -1,0 +1,44 @@
+"""Conjugate gradients on the weighted normal equations Aᵀ W A x = Aᵀ W p (CGLS)."""
+
+import math
+
+import numpy as np
+
+from baselines.iterative import Course, System, Weights, check_count, finish, weighted_dot, weighted_norm
+from ctsim.types import Scan, Volume
+
+
+def cgls(scan: Scan, *, device: str = "cpu", iterations: int = 15, weights: Weights = "none") -> Volume:
+    """Reconstruct by CGLS; stopping early is the only regularisation, and values may be negative.
+
+    Hestenes and Stiefel, J. Res. Natl. Bur. Stand. 49, 1952, doi:10.6028/jres.049.044. Ends before
+    `iterations` where rounding lets the residual fall no more. `weights` as in `baselines.iterative.System`.
+    Raises InputError for wrong parameters and another device than the CPU.
+    """
+    check_count("iterations", iterations)
+    system, course = System(scan, device, weights), Course()
+    x, lacking, steps = system.empty(), system.data.copy(), []
+    ones = np.ones_like(x)
+    gradient = system.adjoint(lacking * system.weights)
+    square, direction = weighted_dot(gradient, gradient, ones), gradient
+    last = weighted_norm(lacking, system.weights)
+    for _ in range(iterations):
+        image = system.forward(direction)
+        length = weighted_dot(image, image, system.weights)
+        if not length > 0 or not math.isfinite(length):
+            break
+        step = square / length
+        image *= np.float32(step)
+        lacking -= image
+        norm = weighted_norm(lacking, system.weights)
+        if norm >= last:
+            break
+        last = norm
+        x += np.float32(step) * direction
+        steps.append(step)
+        if not course.note(x, scan.geometry.n_views, norm / system.scale):
+            break
+        gradient = system.adjoint(lacking * system.weights)
+        before, square = square, weighted_dot(gradient, gradient, ones)
+        direction = gradient + np.float32(square / before) * direction
+    return finish(system, course, x, step_sizes=steps, iterations_done=len(steps))

@@ -1,0 +1,128 @@
+"""Algebraic reconstruction by blocks of views: SART (one view), OS-SART (a subset), SIRT (all views).
+
+x ← x + λ D_s A_sᵀ W M (p_s − A_s x), with M the inverse row sums of A and D_s the inverse of A_sᵀ W 1: each voxel
+moves by the weighted mean of what its rays lack per mm. Converges for 0 < λ < 2. Andersen and Kak, Ultrason.
+Imaging 6, 1984, doi:10.1177/016173468400600107; ordered subsets: Hudson and Larkin, IEEE Trans. Med. Imaging 13,
+1994, doi:10.1109/42.363108; SIRT: Gregor and Benson, IEEE Trans. Med. Imaging 27, 2008, doi:10.1109/TMI.2008.923696.
+"""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from baselines.iterative import (
+    Array,
+    Course,
+    System,
+    Weights,
+    check_count,
+    check_positive,
+    finish,
+    visiting_order,
+    weighted_dot,
+)
+from ctsim.types import Scan, Volume
+
+CACHE_BYTES = 1 << 30  # voxel sums of the subsets are kept up to this size, else made anew on each visit
+
+
+def sart(
+    scan: Scan,
+    *,
+    device: str = "cpu",
+    iterations: int = 10,
+    relaxation: float = 0.5,
+    weights: Weights = "none",
+    positivity: bool = True,
+) -> Volume:
+    """Reconstruct by SART: `iterations` passes over the views, one view at a time.
+
+    `weights` as in `baselines.iterative.System`. Details hold view updates, residuals (by pass, each view's
+    taken before its update, and that of the result) and step sizes. Raises InputError for wrong parameters
+    and another device than the CPU.
+    """
+    return _run(scan, device, iterations, scan.geometry.n_views, relaxation, weights, positivity)
+
+
+def os_sart(
+    scan: Scan,
+    *,
+    device: str = "cpu",
+    iterations: int = 10,
+    subsets: int = 20,
+    relaxation: float = 1.0,
+    weights: Weights = "none",
+    positivity: bool = True,
+) -> Volume:
+    """Reconstruct by OS-SART: as `sart`, with the views in `subsets` interleaved subsets (at most one a view)."""
+    check_count("subsets", subsets)
+    return _run(scan, device, iterations, min(subsets, scan.geometry.n_views), relaxation, weights, positivity)
+
+
+def sirt(
+    scan: Scan,
+    *,
+    device: str = "cpu",
+    iterations: int = 100,
+    relaxation: float = 1.9,
+    weights: Weights = "none",
+    positivity: bool = True,
+) -> Volume:
+    """Reconstruct by SIRT: as `sart`, with all views at once; the residual in the norm W M falls in each iteration."""
+    return _run(scan, device, iterations, 1, relaxation, weights, positivity)
+
+
+def _run(
+    scan: Scan, device: str, iterations: int, subsets: int, relaxation: float, weights: Weights, positivity: bool
+) -> Volume:
+    check_count("iterations", iterations)
+    check_positive("relaxation", relaxation)
+    system, course = System(scan, device, weights), Course()
+    passes, x = Passes(system, subsets), system.empty()
+    for _ in range(iterations):
+        residual = passes.run(x, relaxation, positivity)
+        if not course.note(x, scan.geometry.n_views, residual):
+            break
+    return finish(system, course, x, subsets=subsets, step_sizes=[relaxation] * len(course.residuals))
+
+
+class Passes:
+    """Passes over all subsets of a system's views."""
+
+    def __init__(self, system: System, subsets: int) -> None:
+        self.system = system
+        n_views = system.geometry.n_views
+        self.subsets = [np.arange(first, n_views, subsets) for first in visiting_order(subsets)]
+        sums = system.forward(system.support.astype(np.float32))
+        # A ray that meets less than half a voxel says next to nothing of it, and would be divided by little.
+        met = sums > 0.5 * min(system.geometry.d_voxel)
+        self.weights = system.weights * met
+        self.share = np.divide(self.weights, sums, out=np.zeros_like(sums), where=met)
+        size = 4 * system.support.size * subsets
+        self._kept: list[Array] | None = [self._sums(views) for views in self.subsets] if size <= CACHE_BYTES else None
+
+    def run(self, x: Array, relaxation: float, positivity: bool) -> float:
+        """Update `x` with every subset once; return the residual, each subset's before its update."""
+        system, square = self.system, 0.0
+        for k, views in enumerate(self.subsets):
+            lacking = system.data[views] - system.forward(x, views)
+            square += weighted_dot(lacking, lacking, system.weights[views])
+            lacking *= self.share[views]
+            sums = self._kept[k] if self._kept is not None else self._sums(views)
+            move(x, system.adjoint(lacking, views), sums, np.float32(relaxation), positivity)
+        return math.sqrt(square) / system.scale
+
+    def _sums(self, views: np.ndarray) -> Array:
+        return self.system.adjoint(self.weights[views], views)
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def move(x, change, sums, relaxation, positivity):
+    """Add relaxation · change / sums to `x` in place where sums are positive, and cut at zero where asked."""
+    for row in prange(x.shape[0]):
+        for k in range(x.shape[1]):
+            for z in range(x.shape[2]):
+                if sums[row, k, z] > 0:
+                    value = x[row, k, z] + relaxation * change[row, k, z] / sums[row, k, z]
+                    x[row, k, z] = np.float32(0.0) if positivity and value < 0 else value
