@@ -20,7 +20,7 @@ def cgls(scan: Scan, *, device: str = "cpu", iterations: int = 15, weights: Weig
     x, lacking, steps = system.empty(), system.data.copy(), []
     ones = np.ones_like(x)
     gradient = system.adjoint(lacking * system.weights)
-    square, direction = weighted_dot(gradient, gradient, ones), gradient
+    square, direction = weighted_dot(gradient, gradient, ones), gradient.copy()
     last = weighted_norm(lacking, system.weights)
     for _ in range(iterations):
         image = system.forward(direction)
@@ -40,5 +40,6 @@ def cgls(scan: Scan, *, device: str = "cpu", iterations: int = 15, weights: Weig
             break
         gradient = system.adjoint(lacking * system.weights)
         before, square = square, weighted_dot(gradient, gradient, ones)
-        direction = gradient + np.float32(square / before) * direction
+        direction *= np.float32(square / before)
+        direction += gradient
     return finish(system, course, x, step_sizes=steps, iterations_done=len(steps))

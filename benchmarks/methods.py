@@ -30,6 +30,13 @@ COUNTS_ONLY = "counts only"
 
 TABLE: dict[str, tuple[str, str]] = {
     "fdk": ("reconstruct.fdk:reconstruct", COUNTS_ONLY),
+    "sart": ("baselines.sart:sart", COUNTS_ONLY),
+    "os-sart": ("baselines.sart:os_sart", COUNTS_ONLY),
+    "sirt": ("baselines.sart:sirt", COUNTS_ONLY),
+    "cgls": ("baselines.krylov:cgls", COUNTS_ONLY),
+    "fista-tv": ("baselines.tv_methods:fista_tv", COUNTS_ONLY),
+    "asd-pocs": ("baselines.tv_methods:asd_pocs", COUNTS_ONLY),
+    "awpcsd": ("baselines.tv_methods:awpcsd", COUNTS_ONLY),
 }
 """name -> ("module:function", what it needs beside the counts)."""
 
