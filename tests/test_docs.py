@@ -46,6 +46,7 @@ def test_commands_in_the_pages_are_understood():
     import tyro
 
     from benchmarks.cli_run import Arguments
+    from benchmarks.inspector import Arguments as Inspect
     from benchmarks.make_dataset import Options
 
     parsed = 0
@@ -53,6 +54,8 @@ def test_commands_in_the_pages_are_understood():
         for line in re.split(r"\n|&&", text.replace("\\\n", " ")) if kind == "bash" else ():
             name, *words = shlex.split(line, comments=True) or [""]
             form = {"make-dataset": Options, "run-benchmark": Arguments}.get(name.rpartition("/")[2])
+            if form is Arguments and words[:1] == ["inspect"]:
+                form, words = Inspect, words[1:]
             if form and words[:1] != ["peers"]:
                 tyro.cli(form, args=words)
                 parsed += 1

@@ -1,9 +1,11 @@
+import dataclasses
 import math
 
 import numpy as np
 import pytest
+import torch
 from scipy import ndimage
-from skimage.metrics import structural_similarity
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from benchmarks import metrics
 from benchmarks.protocol import Truth, evaluate, tissue_range
@@ -119,6 +121,44 @@ def test_compatibility_columns():
     assert metrics.ssim3d_r2(values, np.zeros_like(reference)) is None
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_compatibility_columns_are_always_there_and_are_scikit_images(kind):
+    t = truth()
+    noise = 0.01 * np.random.default_rng(3).standard_normal(t.metal.shape)
+    values, reference = (t.references["50kev"] + noise).astype(kind), t.references["50kev"]
+    found = evaluate(values, t)["paper"].values
+    # scikit-image sums float32 squares in float32: pairwise sums of 1e4 terms are good to some 1e-6, 4e-6 dB
+    for name, data_range in (("psnr3d_full_gtmax", float(reference.max())), ("psnr3d_r2", 1.0)):
+        expected = peak_signal_noise_ratio(reference, values, data_range=data_range)
+        assert found[name] == pytest.approx(expected, abs=2e-5)
+    # the trap: left to itself, scikit-image takes another range than the one stated, or refuses floats
+    wrong = structural_similarity(reference.astype(float), values.astype(float), data_range=1.0, win_size=7)
+    naf = structural_similarity(reference.astype(float), values.astype(float), data_range=2.0, win_size=7)
+    # its filters of float32 volumes work in float32: variances of 1e-4 to 1e-7, against c2 = 4e-3
+    assert found["ssim3d_naf"] == pytest.approx(naf, abs=1e-4) and abs(wrong - naf) > 1e-3
+    assert found["ssim3d_r2"] == pytest.approx(zero_border(values, reference), abs=1e-6)
+
+
+def zero_border(values, reference):
+    """SSIM with peak 1 by torch's convolution, which pads with zeros, as R2-Gaussian computes it."""
+    taps = torch.from_numpy(window())
+    kernel = (taps[:, None] * taps[None])[None, None]
+    scores = []
+    for axis in range(3):
+        pairs = zip(np.moveaxis(values, axis, 0), np.moveaxis(reference, axis, 0), strict=True)
+        kept = [(a, b) for a, b in pairs if b.max() > 0]
+        x, y = (torch.from_numpy(np.stack(v).astype(float))[:, None] for v in zip(*kept, strict=True))
+
+        def mean(f):
+            return torch.nn.functional.conv2d(f, kernel, padding=5)
+
+        mu, nu = mean(x), mean(y)
+        va, vb, cov = mean(x * x) - mu**2, mean(y * y) - nu**2, mean(x * y) - mu * nu
+        top = (2 * mu * nu + 1e-4) * (2 * cov + 9e-4)
+        scores.append(float((top / ((mu**2 + nu**2 + 1e-4) * (va + vb + 9e-4))).mean()))
+    return np.mean(scores)
+
+
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
 def test_a_range_must_be_positive(bad):
     values, reference = volumes((5, 7, 11))
@@ -175,6 +215,38 @@ def test_metal_metrics_of_a_scaled_metal():
     assert shrunk["dice"] == pytest.approx(2 * small.sum() / (small.sum() + metal.sum()))
     # The balls' surfaces are one voxel apart, give or take the staircase of the voxels (< 0.5).
     assert 0.6 < shrunk["boundary_rms"] < 1.5
+
+
+def test_a_metal_that_is_shifted_by_one_voxel():
+    metal = np.zeros((12, 14, 30), bool)
+    metal[2:10, 3:11, 8:18] = True
+    reference = np.where(metal, 0.4, 0.02)
+    found = metrics.metal_metrics(np.roll(reference, 1, 2), reference, metal, np.ones_like(metal), (3.0, 3.0, 0.5))
+    # nine of ten slices overlap; of the core (8 of 10 slices, all still inside) nothing is lost
+    assert found["dice"] == pytest.approx(0.9) and found["core_ratio"] == pytest.approx(1.0)
+    # surface voxels: two end faces of 8 × 8, and per slice between them a ring of 28. Shifted, one end face lies
+    # 0.5 mm outside; the other 0.5 mm inside, where only its inner 6 × 6 is off the surface: both ways the same
+    n, off = 2 * 64 + 8 * 28, 64 + 36
+    assert found["boundary_rms"] == pytest.approx(0.5 * math.sqrt(off / n), rel=1e-12)
+
+
+def test_half_maximum_is_half_of_the_core():
+    metal = np.zeros((9, 9, 21), bool)
+    metal[2:7, 2:7, 5:16] = True
+    for level, dice in ((0.51, 2 * 5 * 5 * 11 / (5 * 5 * 11 + 5 * 5 * 13)), (0.49, 1.0)):
+        values = np.where(metal, 1.0, 0.0)
+        values[2:7, 2:7, [4, 16]] = level  # blurred to one more slice at each end
+        found = metrics.metal_metrics(values, metal.astype(float), metal, np.ones_like(metal), (1.0, 1.0, 1.0))
+        assert found["dice"] == pytest.approx(dice)
+
+
+def test_a_thin_metal_says_that_its_core_is_all_of_it():
+    t = truth()
+    assert evaluate(t.references["effective"], t)["metal"].note == ""
+    thin = np.zeros_like(t.metal)
+    thin[10, 12, 10:18] = True
+    score = evaluate(t.references["effective"], dataclasses.replace(t, metal=thin))["metal"]
+    assert "too thin" in score.note and score.values["core_ratio"] == pytest.approx(1.0)
 
 
 def test_metal_that_vanished_scores_zero():
