@@ -52,7 +52,7 @@ def fill(image: NDArray[np.float32], trace: NDArray[np.bool_], how: str, filled:
     if not trace.any():
         return
     rows = np.flatnonzero(trace.any(1))
-    full = trace.all(1)
+    full: NDArray[np.bool_] = np.all(trace, axis=1)
     filled.views += 1
     filled.rows += len(rows)
     filled.pixels += int(trace.sum())
@@ -111,4 +111,4 @@ def harmonic(image: NDArray[np.float32], unknown: NDArray[np.bool_]) -> None:
         columns.append(other[~known])
     i, j = np.concatenate(rows), np.concatenate(columns)
     matrix = scipy.sparse.coo_array((-np.ones(len(i)), (i, j)), (len(v), len(v))) + scipy.sparse.diags_array(degree)
-    image[unknown] = scipy.sparse.linalg.spsolve(matrix.tocsc(), right)
+    image[unknown] = np.asarray(scipy.sparse.linalg.spsolve(matrix.tocsc(), right), np.float32)

@@ -8,6 +8,7 @@ import scipy.ndimage
 import torch
 from numpy.typing import NDArray
 
+from baselines.morphology import dilate, filled, pieces
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.project import Tracer
@@ -15,8 +16,8 @@ from ctsim.types import Phantom, Scan
 
 PEAK, HALF, SMALLEST = 0.25, 0.5, 8  # of the maximum; of the metal's value; voxels
 FACTORS = (8.0, 1.5)  # metal must exceed this many times water, and this many times the body's 99.9th percentile
+SHARE, PLAIN = 0.5, 0.75  # at most this share of the mask may lie below three quarters of the metal's value
 THINNEST = 0.05  # length in metal, in voxels, from which a pixel belongs to the trace
-_TOUCHING = np.ones((3, 3, 3), bool)  # 26 neighbours
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,24 +87,26 @@ def auto_mask(volume: NDArray[np.float32]) -> Metal:
     The metal's value is the 90th percentile of what exceeds a quarter of the maximum; half of it is the threshold.
     Components of fewer than 8 voxels are dropped, holes filled. A fixed multiple of water does not serve: the
     best was 20 for Fe, 10 for Ti and 4 for Al. Where the metal does not stand out from the densest of the body
-    the mask is doubted, since correcting beside bone does more harm than leaving it.
+    the mask is doubted, since correcting beside bone does more harm than leaving it; so it is where most of it is
+    far from the metal's value (0.64 of the mask where enamel was in it, 0.08 and 0.17 with Fe and Al alone).
     """
     top = float(volume.max(initial=0.0))
     if not np.isfinite(volume).all() or top <= 0:
         return Metal(mask=np.zeros(volume.shape, bool), source="auto", doubt="the reconstruction has no finite maximum")
     level = float(np.percentile(volume[volume > PEAK * top], 90))
     mask = volume > HALF * level
-    names, n = scipy.ndimage.label(mask, _TOUCHING)
+    names, n = pieces(mask)
     sizes = np.bincount(names.ravel(), minlength=n + 1)
     sizes[0] = 0
-    mask = scipy.ndimage.binary_fill_holes(sizes[names] >= SMALLEST)
-    assert mask is not None
+    mask = filled(sizes[names] >= SMALLEST)
     water = water_value(volume)
-    around = scipy.ndimage.binary_dilation(mask, _TOUCHING, iterations=2)
-    body = volume[(volume > 0.5 * water) & ~around]
+    body = volume[(volume > 0.5 * water) & ~dilate(mask, 2, corners=True)]
     dense = float(np.percentile(body, 99.9)) if body.size else 0.0
+    below = float(np.mean(volume[mask] < PLAIN * level)) if mask.any() else 0.0
     doubt = ""
-    if level < FACTORS[0] * water:
+    if below > SHARE:
+        doubt = f"{below:.0%} of the mask lie below {PLAIN:g} of the metal's value: dense tissue is in it"
+    elif level < FACTORS[0] * water:
         doubt = f"the metal's value is {level / water:.1f} times water, expected {FACTORS[0]:g} times or more"
     elif level < FACTORS[1] * dense:
         doubt = f"the metal's value is {level / dense:.2f} times the body's densest, expected {FACTORS[1]:g} or more"
@@ -111,30 +114,23 @@ def auto_mask(volume: NDArray[np.float32]) -> Metal:
 
 
 def water_value(volume: NDArray[np.float32]) -> float:
-    """Value of water-like tissue in a reconstruction, in 1/mm: the highest peak above what parts air from body.
+    """Value of water-like tissue in a reconstruction, in 1/mm; 0 where nothing stands out from air.
 
-    Measured, since beam hardening moves it: FDK's water lay 28 % above that at 50 keV for 90 kVp.
+    Measured, since beam hardening moves it: FDK's water lay 28 % above that at 50 keV for 90 kVp. Of the peaks in
+    the histogram of what exceeds the noise of air it is the highest in value that has a third of the tallest one's
+    height: lungs lie below, and bone is less.
     """
     smooth = scipy.ndimage.gaussian_filter(volume, 1.0)
-    values = smooth[smooth > 0]
-    if values.size < 2:
+    air = smooth[smooth < 0]
+    noise = float(np.sqrt(np.mean(np.square(air, dtype=np.float64)))) if air.size else 0.0
+    body = smooth[smooth > max(5 * noise, 0.02 * float(np.percentile(smooth, 99)), 1e-9)]
+    if body.size < SMALLEST:
         return 0.0
-    values = np.minimum(values, np.percentile(values, 99))
-    counts, edges = np.histogram(values, 512)
-    middle = (edges[1:] + edges[:-1]) / 2
-    part = middle[_otsu(counts, middle)]
-    body = np.where(middle > part, scipy.ndimage.gaussian_filter1d(counts.astype(float), 3), 0)
-    return float(middle[int(body.argmax())])
-
-
-def _otsu(counts: NDArray[np.int64], middle: NDArray[np.float64]) -> int:
-    """Bin that parts a histogram in two with the greatest variance between (Otsu, doi:10.1109/TSMC.1979.4310076)."""
-    below = np.cumsum(counts)
-    above = below[-1] - below
-    first = np.cumsum(counts * middle)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        between = below * above * (first / below - (first[-1] - first) / above) ** 2
-    return int(np.nanargmax(np.where((below > 0) & (above > 0), between, -1.0)))
+    counts, edges = np.histogram(body, 256, (0.0, float(np.percentile(body, 97))))
+    height = scipy.ndimage.gaussian_filter1d(counts.astype(float), 4, mode="constant")
+    peak = (height >= np.roll(height, 1)) & (height > np.roll(height, -1)) & (height > height.max() / 3)
+    at = int(np.flatnonzero(peak)[-1]) if peak.any() else int(height.argmax())
+    return float((edges[at] + edges[at + 1]) / 2)
 
 
 class Trace:
@@ -156,10 +152,7 @@ class Trace:
     def view(self, view: int) -> NDArray[np.bool_]:
         """Return the trace in one view, [v, u]."""
         self.tracer.background(self.geometry, view, self._lengths)
-        trace = self._lengths[1] > self.thinnest
-        if self.dilation and trace.any():
-            trace = scipy.ndimage.binary_dilation(trace, iterations=self.dilation)
-        return np.asarray(trace)
+        return dilate(self._lengths[1] > self.thinnest, self.dilation)
 
     def lengths(self, view: int) -> NDArray[np.float32]:
         """Return the length in metal in one view in mm, [v, u]."""
@@ -184,7 +177,7 @@ def reinsert(values: torch.Tensor, first: NDArray[np.float32], metal: Metal, ins
     if insert == "fdk":
         out[mask] = first[mask]
         return
-    names, n = scipy.ndimage.label(mask, _TOUCHING)
+    names, n = pieces(mask)
     means = np.asarray(scipy.ndimage.mean(first, names, np.arange(1, n + 1)), np.float32)
     out[mask] = means[names[mask] - 1]
 

@@ -1,0 +1,35 @@
+"""Binary morphology on masks [z, y, x] or [v, u]."""
+
+from typing import Any, cast
+
+import numpy as np
+import scipy.ndimage
+from numpy.typing import NDArray
+
+Mask = NDArray[np.bool_]
+
+
+def _all(ndim: int) -> Mask:
+    return np.ones((3,) * ndim, np.bool_)
+
+
+def dilate(mask: Mask, n: int, *, corners: bool = False) -> Mask:
+    """Grow a mask n times by its neighbours, those across edges and corners too where asked."""
+    structure = _all(mask.ndim) if corners else None
+    return np.asarray(scipy.ndimage.binary_dilation(mask, structure, n), np.bool_) if n else mask
+
+
+def opened(mask: Mask) -> Mask:
+    """Leave out of a mask what is thinner than three pixels."""
+    return np.asarray(scipy.ndimage.binary_opening(mask, _all(mask.ndim)), np.bool_)
+
+
+def filled(mask: Mask) -> Mask:
+    """Fill the holes of a mask."""
+    return np.asarray(scipy.ndimage.binary_fill_holes(mask), np.bool_)
+
+
+def pieces(mask: Mask) -> tuple[NDArray[np.int32], int]:
+    """Number the pieces of a mask from 1, joining neighbours across edges and corners; return also how many."""
+    names, n = cast(tuple[NDArray[np.int32], int], cast(Any, scipy.ndimage.label(mask, _all(mask.ndim))))
+    return names, n

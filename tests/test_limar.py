@@ -1,0 +1,285 @@
+"""LIMAR and NMAR: what they leave alone, what they count, and where they must stay finite."""
+
+import dataclasses
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from baselines import limar, nmar
+from baselines.inpaint import Filled, fill, harmonic
+from baselines.metal import Metal, Trace, auto_mask, find_metal, reinsert, water_value
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+from ctsim.noise import Noise
+from ctsim.plan import make_plan
+from ctsim.project import Tracer, path_lengths
+from ctsim.settings import Simulation, Truth
+from ctsim.simulate import flat_image, simulate_views
+from ctsim.solids import FRUSTUM, Primitive, Solid
+from ctsim.types import Phantom, Scan, Scanner, Status
+from ctsim.voxelise import metal_mask
+from reconstruct.fdk import reconstruct as fdk
+
+METHODS = {"limar": limar.reconstruct, "nmar": nmar.reconstruct}
+GEOMETRY = Geometry(
+    dso=250.0, dsd=500.0, n_voxel=(14, 40, 40), d_voxel=(1.5, 1.25, 1.25), n_detector=(24, 64), d_detector=(2.0, 2.0),
+    n_views=60,
+)  # fmt: skip
+
+
+def rod(radius, x, y, half=40.0, material="Fe"):
+    piece = Primitive(kind=FRUSTUM, centre=(x, y, 0.0), params=(half, radius, radius))
+    return Solid(name="rod", material=material, primitives=(piece,), metal=material in ("Fe", "Al", "Ti"))
+
+
+def simulated(solids, geometry=GEOMETRY):
+    """A scan on solids and a body of 2× finer voxels than are reconstructed, and its metal-free twin."""
+    body = rod(21.0, 0.0, 0.0, 30.0, "water")
+    bone = rod(4.0, -9.0, 6.0, 30.0, "cortical_bone")
+    phantom = Phantom(
+        labels=np.zeros((28, 80, 80), np.uint8),
+        materials=("air", "water", "cortical_bone", "Fe", "Al"),
+        d_voxel=(0.75, 0.625, 0.625),
+        solids=(body, bone, *solids),
+    )
+    scanner = Scanner(geometry=geometry)
+    plan = make_plan(phantom, scanner, Simulation(), Truth(twin=bool(solids)), "scene")
+    views = [images for _, images in simulate_views(plan, phantom, scanner)]
+    mask = torch.from_numpy(metal_mask(phantom, geometry))
+
+    def scan(name, metal):
+        return Scan(
+            geometry=geometry, counts=torch.from_numpy(np.stack([v[name] for v in views])),
+            flat=torch.from_numpy(flat_image(plan, scanner)), dark=Noise().dark, metal=metal,
+        )  # fmt: skip
+
+    twin = scan("metal_free/counts" if solids else "counts", torch.zeros_like(mask))
+    return scan("counts", mask), twin
+
+
+@pytest.fixture(scope="module")
+def iron():
+    return simulated((rod(2.2, 8.0, 2.0), rod(1.8, -4.0, -11.0)))
+
+
+def tissue_error(volume, twin, scan):
+    """RMS difference from FDK of the metal-free twin, away from the metal, in the unit of the volume."""
+    z = slice(4, 10)
+    far = ~np.asarray(nmar.dilate(scan.metal.numpy() != 0, 2))[z]
+    return float(np.sqrt(np.mean((volume.values.numpy() - twin.values.numpy())[z][far] ** 2)))
+
+
+def test_on_iron_nmar_is_better_than_limar_and_limar_than_nothing(iron):
+    scan, bare = iron
+    twin, first = fdk(bare), fdk(scan)
+    none = tissue_error(first, twin, scan)
+    by = {prior: tissue_error(nmar.reconstruct(scan, prior=prior), twin, scan) for prior in ("fdk", "limar")}
+    # streaks of iron spoil the prior that is made from them
+    assert by["limar"] < tissue_error(limar.reconstruct(scan), twin, scan) < 0.6 * none
+    chosen = nmar.reconstruct(scan)
+    assert tissue_error(chosen, twin, scan) == by[chosen.details["prior"]] < none
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("mask", ["oracle", "auto"])
+def test_without_metal_the_result_is_fdk_to_the_last_bit_and_nothing_is_projected(iron, name, mask, monkeypatch):
+    _, bare = iron
+    first = fdk(bare)
+    monkeypatch.setattr("baselines.metal.Tracer.background", None)
+    monkeypatch.setattr("baselines.nmar.forward_columns", None)
+    volume = METHODS[name](bare, mask=mask)
+    assert torch.equal(volume.values, first.values) and not volume.details["corrected"]
+    # bone is the densest there is: the automatic mask finds it, and says that it is not to be relied on
+    assert volume.details["mask_status"] == ("no_metal" if mask == "oracle" else "mask_unreliable")
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_reinsertion_changes_metal_voxels_only(iron, name):
+    scan, _ = iron
+    by = {insert: METHODS[name](scan, insert=insert).values.numpy() for insert in ("fdk", "mean", "none")}
+    mask, first = scan.metal.numpy() != 0, fdk(scan).values.numpy()
+    for insert in ("fdk", "mean"):
+        assert np.array_equal(by[insert][~mask], by["none"][~mask])
+    assert np.array_equal(by["fdk"][mask], first[mask])
+    assert by["mean"][mask].mean() == pytest.approx(first[mask].mean(), rel=1e-5)
+    assert len(np.unique(by["mean"][mask])) == 2  # two rods, one value each
+
+
+def test_only_rows_that_hold_metal_are_touched(iron):
+    scan, _ = iron
+    metal = find_metal(scan, fdk(scan).values.numpy(), "oracle")
+    short = dataclasses.replace(metal, mask=metal.mask & (np.arange(14) < 4)[:, None, None])
+    trace = Trace(short, scan.geometry)
+    seen = np.stack([trace.view(k) for k in range(scan.geometry.n_views)])
+    assert seen.any() and not seen[:, 14:].any()
+    values, filled = limar.interpolated(scan, trace, "rows")
+    assert filled.pixels == seen.sum() and filled.rows == seen.any(2).sum() and filled.views == seen.any((1, 2)).sum()
+    first = fdk(scan).values
+    # the filter runs along rows and the cone spreads them: voxels above the highest row touched are FDK's
+    assert torch.equal(values[-2:], first[-2:]) and not torch.equal(values[:4], first[:4])
+
+
+def test_a_ratio_with_a_tiny_floor_diverges_on_a_protruding_rod_and_the_offset_does_not():
+    long = rod(2.0, 26.0, 0.0)  # beside the body: its shadow leaves the prior's in most views
+    scan, bare = simulated((rod(2.2, 8.0, 2.0), long))
+    twin = fdk(bare)
+    error = {
+        kind: tissue_error(nmar.reconstruct(scan, normalisation=kind, floor=floor), twin, scan)
+        for kind, floor in (("offset", None), ("additive", None), ("ratio", None))
+    }
+    broken = tissue_error(nmar.reconstruct(scan, normalisation="ratio", floor=1e-6), twin, scan)
+    water = water_value(twin.values.numpy())
+    assert max(error.values()) < water
+    assert broken > 10 * max(error.values())
+
+
+def test_the_guard_fires_on_aluminium_beside_bone():
+    scan, _ = simulated((rod(3.0, 8.0, 2.0, material="Al"),))
+    first = fdk(scan)
+    metal = auto_mask(first.values.numpy())
+    assert metal.doubt and not metal.found
+    volume = limar.reconstruct(scan, mask="auto")
+    assert torch.equal(volume.values, first.values) and "times" in volume.reason
+
+
+def test_the_automatic_mask_finds_iron(iron):
+    scan, _ = iron
+    found, true = auto_mask(fdk(scan).values.numpy()), scan.metal.numpy() != 0
+    assert not found.doubt
+    # at rods of 3 voxels across half a voxel around decides over a third of the mask
+    assert 2 * (found.mask & true).sum() / (found.mask.sum() + true.sum()) > 0.75
+
+
+def test_the_trace_is_where_the_mask_has_length(iron):
+    scan, _ = iron
+    metal = Metal(mask=scan.metal.numpy() != 0, source="oracle")
+    trace = Trace(metal, scan.geometry)
+    phantom = Phantom(labels=metal.mask.astype(np.uint8), materials=("air", "Fe"), d_voxel=GEOMETRY.d_voxel)
+    for view in (0, 17):
+        length = path_lengths(Tracer.of(phantom), scan.geometry, view)[1]
+        assert np.array_equal(trace.view(view), length > 0.05 * np.prod(GEOMETRY.d_voxel) ** (1 / 3))
+        wide = Trace(metal, scan.geometry, dilation=1).view(view)
+        assert wide.sum() > trace.view(view).sum() and wide[trace.view(view)].all()
+
+
+HARD = {
+    "trace on the detector's edge": ({"d_detector": (2.0, 1.0)}, (rod(2.0, 15.0, 0.0),)),
+    "metal fills whole rows": ({"d_detector": (2.0, 0.3)}, (rod(9.0, 0.0, 0.0),)),
+    "merging shadows": ({}, (rod(2.0, 5.0, 0.0), rod(2.0, 10.0, 0.0), rod(2.0, 15.0, 0.0))),
+    "offset detector": ({"off_detector": (3.0, 14.0)}, (rod(2.0, 5.0, 0.0),)),
+    "non-cubic voxels": ({"d_voxel": (3.0, 0.9, 1.3)}, (rod(2.0, 5.0, 0.0),)),
+    "metal outside the volume": ({"n_voxel": (14, 20, 20)}, (rod(2.0, 17.0, 0.0),)),
+    "short arc": ({"arc_deg": 200.0}, (rod(2.0, 5.0, 0.0),)),
+    "one view": ({"n_views": 1}, (rod(2.0, 5.0, 0.0),)),
+}
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("case", HARD)
+def test_hard_scans_stay_finite_and_counted(name, case):
+    changes, solids = HARD[case]
+    geometry = msgspec.structs.replace(GEOMETRY, **{"n_views": 12, **changes})
+    scan, _ = simulated(solids, geometry)
+    volume = METHODS[name](scan)
+    assert volume.status is Status.OK and bool(torch.isfinite(volume.values).all())
+    first = fdk(scan)
+    assert volume.values.abs().max() < 20 * first.values.abs().max()
+    if case == "metal outside the volume":
+        assert torch.equal(volume.values, first.values) and volume.details["mask_status"] == "no_metal"
+    else:
+        assert volume.details["filled_pixels"] > 0
+    if case == "metal fills whole rows":
+        assert volume.details["full_rows"] > 0
+    if case == "trace on the detector's edge":
+        assert volume.details["edge_gaps"] > 0
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_starved_and_empty_readings_stay_finite(iron, name):
+    scan, _ = iron
+    dark = scan.counts.clone()
+    dark[:, :, 28:36] = 0  # below the pedestal: P saturates at ln i0 and more
+    bright = scan.counts.clone()
+    bright[:, :4] = 65535  # brighter than the open field: negative P
+    for counts in (dark, bright, torch.zeros_like(dark)):
+        volume = METHODS[name](dataclasses.replace(scan, counts=counts))
+        assert volume.status is Status.OK and bool(torch.isfinite(volume.values).all())
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ({"mask": "somewhere.tif"}, "no file somewhere.tif"),
+        ({"insert": "gold"}, "insert must be one of"),
+        ({"interpolation": "cubic"}, "interpolation must be one of"),
+        ({"dilation": -1}, "dilation must be"),
+    ],
+)
+def test_wrong_settings_are_refused_by_name(iron, name, setting, words):
+    with pytest.raises(InputError, match=words):
+        METHODS[name](iron[0], **setting)
+    with pytest.raises(InputError, match="no true metal mask"):
+        METHODS[name](dataclasses.replace(iron[0], metal=None))
+    for wrong, said in (({"prior": "x"}, "prior"), ({"floor": 0.0}, "floor"), ({"normalisation": "x"}, "normalis")):
+        with pytest.raises(InputError, match=said):
+            nmar.reconstruct(iron[0], **wrong)
+
+
+def test_a_mask_file_serves_as_well_as_the_oracle(iron, tmp_path):
+    import tifffile
+
+    scan, _ = iron
+    tifffile.imwrite(tmp_path / "mask.tif", scan.metal.numpy())
+    given = limar.reconstruct(dataclasses.replace(scan, metal=None), mask=str(tmp_path / "mask.tif"))
+    assert torch.equal(given.values, limar.reconstruct(scan).values)
+    tifffile.imwrite(tmp_path / "small.tif", scan.metal.numpy()[1:])
+    with pytest.raises(InputError, match="has shape"):
+        limar.reconstruct(scan, mask=str(tmp_path / "small.tif"))
+
+
+def test_rows_are_bridged_by_straight_lines():
+    image = np.arange(7 * 11, dtype=np.float32).reshape(7, 11) ** 1.5
+    trace = np.zeros(image.shape, bool)
+    trace[1, 3:7] = trace[2, :4] = trace[3, 8:] = trace[4] = True
+    want, filled = image.copy(), Filled()
+    want[1, 3:7] = np.interp(np.arange(3, 7), [2, 7], image[1, [2, 7]])
+    want[2, :4], want[3, 8:] = image[2, 4], image[3, 7]
+    fill(image, trace, "rows", filled)
+    np.testing.assert_allclose(image[:4], want[:4], rtol=1e-6)
+    assert np.array_equal(image[5:], want[5:])
+    assert (filled.pixels, filled.rows, filled.edge_gaps, filled.full_rows, filled.views) == (22, 4, 2, 1, 1)
+    # the full row is harmonic: each pixel the mean of its neighbours, mirrored at the detector's edge
+    left, right = np.r_[image[4, 0], image[4, :-1]], np.r_[image[4, 1:], image[4, -1]]
+    np.testing.assert_allclose(image[4] * 4, left + right + image[3] + image[5], rtol=1e-5)
+
+
+def test_harmonic_filling_continues_a_harmonic_function():
+    v, u = np.mgrid[:20, :30].astype(np.float64) / 10
+    exact = u**2 - v**2 + 3 * u * v
+    image, unknown = exact.astype(np.float32), np.zeros(exact.shape, bool)
+    unknown[5:13, 7:21] = True
+    image[unknown] = 99
+    harmonic(image, unknown)
+    # the five-point stencil has no error on polynomials of degree 2; float32 holds values up to 20
+    np.testing.assert_allclose(image, exact, atol=4e-6)
+    nothing_known = np.full((3, 4), 7.0, np.float32)
+    harmonic(nothing_known, np.ones((3, 4), bool))
+    assert (nothing_known == 7).all()
+
+
+def test_water_is_measured_in_the_scan(iron):
+    scan, bare = iron
+    twin = fdk(bare).values.numpy()
+    inside = twin[5:9, 15:25, 22:30]  # of the body, away from the bone
+    assert water_value(twin) == pytest.approx(np.median(inside), rel=0.06)
+    assert water_value(fdk(scan).values.numpy()) == pytest.approx(np.median(inside), rel=0.1)
+    assert water_value(np.zeros((4, 5, 6), np.float32)) == 0
+
+
+def test_reinsertion_refuses_what_it_does_not_know():
+    metal = Metal(mask=np.ones((2, 2, 2), bool), source="oracle")
+    with pytest.raises(InputError, match="insert must be one of"):
+        reinsert(torch.zeros(2, 2, 2), np.zeros((2, 2, 2), np.float32), metal, "x")
