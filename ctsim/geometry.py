@@ -129,13 +129,17 @@ class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         return z, y, x
 
     @property
+    def is_full_turn(self) -> bool:
+        """Whether the views stand evenly on a whole circle, so that each has an opposite one."""
+        return self.poses is None and self.angles_deg is None and abs(self.arc_deg) >= 360 - 1e-9
+
+    @property
     def fov_radius(self) -> float:
         """Radius in mm of the cylinder about the axis that every view's fan covers (0 if none).
 
-        For a laterally offset detector over a full turn this is the covered half plus its mirror:
-        the larger of the two sides.
+        For a laterally offset detector over a full turn this is the covered half plus its mirror: the
+        larger of the two sides, as long as every view sees the axis.
         """
-        half, off = self.s_detector[1] / 2, self.off_detector[1]
-        full_turn = abs(self.arc_deg) >= 360 - 1e-9 and self.angles_deg is None
-        edge = half + abs(off) if full_turn else half - abs(off)
+        half, off = self.s_detector[1] / 2, abs(self.off_detector[1])
+        edge = half + off if self.is_full_turn and off < half else half - off
         return self.dso * math.sin(math.atan(edge / self.dsd)) if edge > 0 else 0.0

@@ -125,6 +125,22 @@ def test_impossible_geometry_is_refused_by_name() -> None:
     assert parse_suite("truncated = true\n" + full(d_detector=[0.5, 0.5]))[0].truncated
 
 
+def test_a_lateral_offset_counts_twice_only_while_every_view_sees_the_axis() -> None:
+    # the panel is 160 mm wide, the object's shadow 113 mm: 2·500·tan(asin(27.6/250)) = 111 and its ends' height
+    assert parse_suite(full(off_detector=[0.0, 79.0]))
+    for changes, words in (
+        ({"off_detector": [0.0, 81.0]}, "reaches out of the cone"),
+        ({"off_detector": [0.0, 79.0], "arc_deg": 200.0}, "reaches out of the cone"),
+        ({"off_detector": [0.0, 500.0]}, "outside the cone of all views"),
+    ):
+        with pytest.raises(InputError, match=words):
+            parse_suite(full(**changes))
+    with pytest.raises(InputError, match="outside the cone of all views"):
+        parse_suite("truncated = true\n" + full(off_detector=[0.0, 500.0]))
+    with pytest.raises(InputError, match="outside the cone of all views"):
+        parse_suite('name = "a"\nphantom = { recipe = "lung" }\nscanner = { off_detector = [0, 500.0] }')
+
+
 @pytest.mark.parametrize("name", MACHINES)
 def test_presets_cover_the_object_and_refuse_what_is_too_large(name: str) -> None:
     scanner = preset(name, 90, (96, 96), (64, 64, 64), 60.0)
