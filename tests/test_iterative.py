@@ -189,6 +189,18 @@ def test_fista_keeps_its_promise():
     assert tau > 0 and values[0] > 1.5 * least
 
 
+def test_fista_by_hand():
+    scan, a = tiny(), matrix(TINY)
+    volume = fista_tv(scan, iterations=7, tv=0.0, positivity=False)
+    p, step = System(scan, "cpu").data.ravel().astype(float), volume.details["step_sizes"][0]
+    x = ahead = np.zeros(a.shape[1])
+    t = 1.0
+    for _ in range(7):
+        after, t_after = ahead + step * a.T @ (p - a @ ahead), (1 + np.sqrt(1 + 4 * t * t)) / 2
+        x, ahead, t = after, after + (t - 1) / t_after * (after - x), t_after
+    np.testing.assert_allclose(volume.values.numpy().ravel(), x, rtol=0, atol=1e-5 * np.abs(x).max())
+
+
 def test_step_bound_is_above_the_largest_eigenvalue_and_near():
     scan = tiny()
     exact = np.linalg.norm(matrix(TINY), 2) ** 2
@@ -239,8 +251,9 @@ def test_denoiser_closes_the_duality_gap(positivity, tau):
         inner = b - tau * transposed(field, RATIOS)
         inner = np.where(support, np.maximum(inner, 0) if positivity else inner, 0)
         gaps.append((primal - 0.5 * ((b.astype(float) ** 2).sum() - (inner**2).sum())) / primal)
-    # FGP's gap falls like 1/k²; float32 holds the sums of 385 terms to some 1e-6.
-    assert gaps[0] > gaps[1] > -1e-6 and -1e-6 < gaps[2] < 1e-4
+    # FGP's gap falls like 1/k² (1/k without its momentum: 3e-3 and 5e-5 here); float32 holds sums to some 1e-6.
+    assert gaps[0] > gaps[1] > -1e-6 and gaps[1] < 1e-3
+    assert -1e-6 < gaps[2] < 5e-6
 
 
 def test_total_variation_and_its_descent():

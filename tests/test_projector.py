@@ -53,6 +53,13 @@ CASES = {
     "rows downwards": with_(
         poses=tuple(map(tuple, (SMALL.pose_array() * np.r_[np.ones(9), -np.ones(3)]).tolist())),
     ),
+    "exactly diagonal": with_(
+        n_views=2,
+        poses=(
+            (20.0, 20.25, 0.5, -15.0, -14.75, 0.5, -1.0, 1.0, 0.0, 0.0, 0.0, 1.0),
+            (-20.0, 20.25, 0.5, 15.0, -14.75, 0.5, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0),
+        ),
+    ),
     "one voxel": with_(n_voxel=(1, 1, 1), d_voxel=(3.0, 2.0, 4.0)),
     "one row": with_(n_detector=(1, 15)),
 }
