@@ -197,18 +197,21 @@ def render(records: list[Record], form: Format) -> str:
         if not columns:
             continue
         lines = _lines(columns, rows, protocol, form)
-        text = escape(caption(records, protocol), form)
+        text, declared = escape(caption(records, protocol), form), _notes(records, protocol)
         if form == "md":
             head = ["| " + " | ".join(lines[0]) + " |", "|---|---|" + "---:|" * len(columns)]
             body = head + ["| " + " | ".join(line) + " |" for line in lines[1:]]
-            notes = "".join(f"- {escape(note, form)}\n" for note in _notes(records, protocol))
+            notes = "".join(f"- {escape(note, form)}\n" for note in declared)
             parts.append(f"## {protocol}\n\n{text}\n\n" + "\n".join(body) + "\n" + (f"\n{notes}" if notes else ""))
         else:
             body = [" & ".join(line) + r" \\" for line in lines]
             spec = "ll" + "r" * len(columns)
             parts.append(
                 "\\begin{table}\n\\centering\n\\caption{" + text + "}\n\\begin{tabular}{" + spec + "}\n\\toprule\n"
-                f"{body[0]}\n\\midrule\n" + "\n".join(body[1:]) + "\n\\bottomrule\n\\end{tabular}\n\\end{table}\n"
+                f"{body[0]}\n\\midrule\n"
+                + "\n".join(body[1:])
+                + "\n\\bottomrule\n\\end{tabular}\n\\end{table}\n"
+                + "".join(f"% {note}\n" for note in declared)
             )
     parts += [_failures(records, form), f"{'' if form == 'md' else '% '}{left_out}.\n" if left_out else ""]
     return "\n".join(p for p in parts if p)

@@ -183,6 +183,23 @@ def test_a_material_too_small_for_a_roi_is_named():
     assert [r.material for r in rois] == ["label 1"] and small == ["label 2"]
 
 
+def test_metal_that_has_no_label_is_kept_away_from_too():
+    labels, metal = bodies()
+    labels[labels > 0] = 1
+    (roi,), _ = homogeneous(labels, truth_of(labels, metal), [])
+    at = np.array(np.unravel_index(roi.voxels, SHAPE)).T
+    assert KDTree(np.argwhere(metal)).query(at, p=math.inf)[0].min() == 3
+
+
+def test_pieces_that_touch_at_a_corner_are_one():
+    metal = np.zeros(SHAPE, bool)
+    metal[10:12, 10:12, 10:12] = metal[12:14, 12:14, 12:14] = True
+    assert metal_lines(truth_of(np.ones(SHAPE, np.uint8), metal))[1] == 0
+    metal[10:12, 10:12, 10:12] = False
+    metal[9:11, 10:12, 10:12] = True
+    assert metal_lines(truth_of(np.ones(SHAPE, np.uint8), metal))[1] == 1
+
+
 def test_a_roi_is_one_piece():
     labels, metal = bodies()
     labels[labels == 2] = 1

@@ -167,6 +167,7 @@ def test_artefacts_are_anchored_on_nothing():
 def test_what_a_score_declares_stands_below_its_table():
     given = [artefact_record("fdk", 80.0), artefact_record("net", 20.0)]
     assert "- lung (seed 0): ROI water\n" in tables.render(given, "md")
+    assert "\\end{table}\n% lung (seed 0): ROI water\n" in tables.render(given, "tex")
     given[1] = artefact_record("net", None, "no twin | at all")
     text = tables.render(given, "md")
     assert "- lung (seed 0, fdk): ROI water\n" in text and "- lung (seed 0, net): no twin \\| at all\n" in text

@@ -76,6 +76,15 @@ def test_methods_with_other_parameters_have_twins_of_their_own(tmp_path):
     assert do(tmp_path, scales=scales)[0] == []
 
 
+def test_the_twin_that_was_just_run_is_not_taken_for_anothers(tmp_path):
+    options = run.Options(keep_volumes=False)
+    found = [methods.find("test_twins:counted", {"scale": s}) for s in (1e-5, 3e-5)]
+    a_twin, _, _, b_scan = run.tasks([pair(tmp_path)], found, options)
+    _, record = run.run_all([a_twin, b_scan], tmp_path, options)
+    assert record.scores["artefact"].note == artefact.NOT_ASKED
+    assert set(record.scores["artefact"].values.values()) == {None}
+
+
 def forget(folder, identity):
     """Take the record of a run out of the file, as if it had not been done."""
     path = folder / records.NAME
