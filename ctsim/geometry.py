@@ -7,7 +7,7 @@ from +z. At view angle a the source is at dso·(cos a, sin a, 0), the detector's
 """
 
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -18,6 +18,8 @@ from ctsim.errors import InputError
 Triple = tuple[float, float, float]
 Pair = tuple[float, float]
 FARTHEST = 1e6  # mm, and degrees: nothing of a scanner is larger
+MOST_VIEWS, MOST_PIXELS, MOST_VOXELS = 10**6, 2**28, 2**34  # of a scan, of one view, of one volume
+_SHORTEST, _FLAT = 1e-9, 1e-6  # a pixel's step in mm; the sine below which two directions are one
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
@@ -53,23 +55,32 @@ class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         for name in ("n_voxel", "n_detector", "n_views"):
             if np.min(getattr(self, name)) < 1:
                 raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name, most in (("n_voxel", MOST_VOXELS), ("n_detector", MOST_PIXELS), ("n_views", MOST_VIEWS)):
+            if math.prod(np.atleast_1d(getattr(self, name)).tolist()) > most:
+                raise InputError(f"{name} must give at most {most} in all, got {getattr(self, name)}")
         for name in ("d_voxel", "d_detector"):
             if np.min(getattr(self, name)) <= 0:
                 raise InputError(f"{name} must be positive (mm), got {getattr(self, name)}")
         if not 0 < self.dso < self.dsd:
-            raise InputError(f"expected 0 < dso < dsd (mm), got dso = {self.dso} and dsd = {self.dsd}")
+            wrong = "dsd" if self.dso > 0 else "dso"
+            raise InputError(f"{wrong}: expected 0 < dso < dsd (mm), got dso = {self.dso} and dsd = {self.dsd}")
         if not 0 < abs(self.arc_deg) <= 360:
             raise InputError(f"arc_deg must be within (0, 360] in magnitude, got {self.arc_deg}")
         if self.angles_deg is not None and self.poses is not None:
-            raise InputError("give angles_deg or poses, not both")
+            raise InputError("angles_deg and poses exclude each other: expected one of them")
         for name in ("angles_deg", "poses"):
             given = getattr(self, name)
             if given is not None and len(given) != self.n_views:
                 raise InputError(f"{name} has {len(given)} entries but n_views is {self.n_views}")
-            if given is not None and not all(np.all(np.isfinite(row)) for row in given):
-                raise InputError(f"{name} must be finite")
-        if self.poses is not None and any(len(row) != 12 for row in self.poses):
-            raise InputError("every pose needs 12 numbers: source, detector centre, u step, v step (x, y, z each)")
+        if self.angles_deg is not None and not np.all(np.abs(self.angles_deg) <= FARTHEST):
+            raise InputError(f"angles_deg must be finite and within ±{FARTHEST:.0e}")
+        if self.poses is not None:
+            _check_poses(self.poses, self.n_detector)
+        elif not (longest := _longest_rays(self.pose(0)[None], self.n_detector)[0]) < FARTHEST:
+            raise InputError(
+                f"d_detector, n_detector, dsd and off_detector put a pixel {longest:.3g} mm from the source; "
+                f"expected less than {FARTHEST:.0e} mm"
+            )
 
     @property
     def angles(self) -> NDArray[np.float64]:
@@ -143,3 +154,39 @@ class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         half, off = self.s_detector[1] / 2, abs(self.off_detector[1])
         edge = half + off if self.is_full_turn and off < half else half - off
         return self.dso * math.sin(math.atan(edge / self.dsd)) if edge > 0 else 0.0
+
+
+def _longest_rays(poses: NDArray[np.float64], n_detector: tuple[int, int]) -> NDArray[np.float64]:
+    """Distance in mm from the source to the farthest corner of the detector in each view: [view]."""
+    v, u = (n / 2 for n in n_detector)
+    across = poses[:, 3:6] - poses[:, :3]
+    corners = [across + i * u * poses[:, 6:9] + j * v * poses[:, 9:] for i in (-1, 1) for j in (-1, 1)]
+    return np.linalg.norm(corners, axis=2).max(0)
+
+
+def _check_poses(rows: tuple[tuple[float, ...], ...], n_detector: tuple[int, int]) -> None:
+    """Refuse poses that are no source before a detector, naming the first such view."""
+    for view, row in enumerate(rows):
+        if len(row) != 12:
+            raise InputError(
+                f"poses[{view}] has {len(row)} numbers; expected 12: "
+                "source, detector centre, u step, v step (x, y, z each)"
+            )
+    poses = np.asarray(rows, np.float64)
+
+    def refuse(bad: Any, what: str) -> None:
+        if bad.any():
+            raise InputError(f"poses[{int(bad.argmax())}]: {what}")
+
+    refuse(~(np.abs(poses) <= FARTHEST).all(1), f"every number must be finite and within ±{FARTHEST:.0e}")
+    across, du, dv = poses[:, 3:6] - poses[:, :3], poses[:, 6:9], poses[:, 9:]
+    length_u, length_v, length = (np.linalg.norm(x, axis=1) for x in (du, dv, across))
+    for axis, steps in (("u", length_u), ("v", length_v)):
+        refuse(steps < _SHORTEST, f"the {axis} step must be at least {_SHORTEST:.0e} mm long")
+    normal = np.cross(du / length_u[:, None], dv / length_v[:, None])
+    sine = np.linalg.norm(normal, axis=1)
+    refuse(sine < _FLAT, "the u and v steps must not be parallel")
+    height = np.abs((across * normal).sum(1)) / sine
+    refuse(height <= _FLAT * length, "the source must not lie in the detector's plane")
+    longest = _longest_rays(poses, n_detector)
+    refuse(~(longest < FARTHEST), f"every pixel must be less than {FARTHEST:.0e} mm from the source")

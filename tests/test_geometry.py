@@ -4,7 +4,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.spectrum import Bowtie, Tube
+from ctsim.types import Scanner
 
 GEOMETRY = Geometry(
     dso=200.0,
@@ -36,3 +39,56 @@ def test_a_full_turn_covers_half_the_detector_more_or_nothing(off: float) -> Non
     edge = 1.0 + off if off < 1.0 else 0.0
     assert turn.fov_radius == pytest.approx(200 * np.sin(np.arctan(edge / 400)))
     assert short.fov_radius == pytest.approx(200 * np.sin(np.arctan(max(1.0 - off, 0) / 400)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({0: np.nan}, "finite"),
+        ({3: 1e301}, "within"),
+        ({6: 0.0, 7: 0.0, 8: 0.0}, "u step"),
+        ({9: 0.0, 10: 0.0, 11: 0.0}, "v step"),
+        ({6: 0.0, 7: 0.0, 8: 0.2}, "parallel"),
+        ({0: -99.0, 1: 170.0, 3: -99.0, 4: 170.0, 5: 3.0}, "plane"),  # 3 mm above the source, along v
+        ({0: 7e5, 3: -7e5}, "1e+06 mm"),
+    ],
+)
+def test_impossible_poses_are_refused_by_their_view(changes: dict[int, float], said: str) -> None:
+    assert with_(poses=posed({})).poses
+    with pytest.raises(InputError, match=r"poses\[1\]") as caught:
+        with_(poses=posed(changes))
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_no_ray_is_longer_than_the_kernels_hold() -> None:
+    # a detector of 2·a mm square, a = 0.7e6: its corners are hypot(dsd, a, a) ≈ sqrt(2)·a = 0.99e6 mm away
+    for d_detector, dsd in (((1.4e6 / 5, 1.4e6 / 8), 400.0), ((0.2, 0.25), 9.9e5)):
+        assert with_(d_detector=d_detector, dsd=dsd)
+    for d_detector, dsd in (((1.43e6 / 5, 1.43e6 / 8), 400.0), ((0.2, 0.25), 1e6)):
+        with pytest.raises(InputError, match=r"d_detector.*1e\+06 mm"):
+            with_(d_detector=d_detector, dsd=dsd)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"n_views": 10**6 + 1},
+        {"n_detector": (2**14, 2**14 + 1)},
+        {"n_detector": (9999999, 9999999)},
+        {"n_voxel": (4096, 2048, 2049)},
+        {"angles_deg": (0.0, 1e7, 2.0)},
+    ],
+)
+def test_absurd_numbers_are_refused_by_name(changes: dict) -> None:
+    assert with_(n_views=10**6, n_detector=(2**14, 2**14), n_voxel=(4096, 2048, 2048)).n_views
+    with pytest.raises(InputError, match=next(iter(changes))):
+        with_(**changes)
+
+
+@pytest.mark.parametrize(
+    "tube", [Tube(heel=True), Tube(bowtie=Bowtie(center=1.0, edge=20.0, half_angle_deg=20.0))], ids=["heel", "bowtie"]
+)
+def test_heel_and_bowtie_need_a_circular_orbit(tube: Tube) -> None:
+    assert Scanner(geometry=GEOMETRY, tube=tube) and Scanner(geometry=with_(poses=posed({})))
+    with pytest.raises(InputError, match=r"tube\.heel and tube\.bowtie need a circular orbit.*geometry\.poses"):
+        Scanner(geometry=with_(poses=posed({})), tube=tube)
