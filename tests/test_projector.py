@@ -46,6 +46,7 @@ CASES = {
     "thick slices": with_(d_voxel=(20.0, 0.5, 0.4)),
     "coarse detector": with_(n_detector=(3, 4), d_detector=(4.0, 5.0)),
     "source within the grid": with_(dso=4.0, dsd=20.0),
+    "source next to a plane": with_(dso=3.0 + 1e-7, dsd=20.0, n_views=1, start_deg=0.0, n_voxel=(5, 7, 7)),
     "detector within the grid": with_(dso=30.0, dsd=31.0),
     "slightly tilted": turned(SMALL, 7.0, 0),
     "from above": turned(SMALL, 80.0, 1),

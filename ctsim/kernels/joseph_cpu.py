@@ -241,15 +241,15 @@ def _add_slab(scaled, live, shape, lines, views, axis, slab, volume):
                 part, at, rest = sums[: high - low], index[: high - low], gap[: high - low]
                 for z in range(part.size):
                     place = origin + inverse * np.float32(z)
-                    row = np.floor(place) + np.float32(1.0)
+                    row = min(max(np.floor(place) + np.float32(1.0), np.float32(0.0)), np.float32(n_v))
                     at[z] = np.int32(row) + 1
                     rest[z] = (row - place) * step - np.float32(1.0)
                     part[z] = 0.0
-                for tap in range(int(math.ceil(2.0 / slope))):
+                for tap in range(int(math.ceil(min(2.0 / slope, n_v)))):
                     offset = np.float32(tap * slope)
                     for z in range(part.size):
                         weight = np.float32(1.0) - abs(rest[z] + offset)
-                        v = np.uint32(min(max(at[z] + np.int32(tap), np.int32(0)), np.int32(n_v + 1)))
+                        v = np.uint32(min(at[z] + np.int32(tap), np.int32(n_v + 1)))
                         part[z] += max(weight, np.float32(0.0)) * column[v]
                 a = volume[left * n_z + low : left * n_z + high]
                 b = volume[right * n_z + low : right * n_z + high]
