@@ -6,6 +6,7 @@ has an `index.jsonl` with one line per finished scene (the last line of a name c
 
 import fcntl
 import hashlib
+import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,7 +19,8 @@ MANIFEST = "manifest.json"
 INDEX = "index.jsonl"
 PROGRESS = ".progress.json"
 OWN = (MANIFEST, PROGRESS, f"{PROGRESS}.new")  # our own notes, in no manifest
-FORMAT = 1
+FORMAT = 2
+DTYPES = ("uint8", "uint16", "uint32", "int8", "int16", "int32", "float32", "float64")
 _NOT_CONTENT = ("plan.json",)  # estimates of time and disk are no part of what a method sees
 
 
@@ -58,9 +60,9 @@ def file_sha256(path: Path) -> str:
 
 
 def content_hash(files: dict[str, FileEntry]) -> str:
-    """Hash what the files hold, independent of their order and of the plan's estimates."""
-    lines = (f"{path} {entry.sha256}\n" for path, entry in sorted(files.items()) if path not in _NOT_CONTENT)
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
+    """Hash what the files hold and how it is to be read, independent of their order and of the plan's estimates."""
+    entries = [(path, entry) for path, entry in sorted(files.items()) if path not in _NOT_CONTENT]
+    return hashlib.sha256(msgspec.json.encode(entries)).hexdigest()
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -148,7 +150,7 @@ def list_scans(data_dir: str | Path) -> tuple[Path, ...]:
 
 
 def check_sizes(folder: Path, manifest: Manifest) -> list[str]:
-    """List files that are missing or have another size than was written (quick: nothing is read)."""
+    """List files that are missing, of another size than was written, or too small for their array (reads nothing)."""
     problems = []
     for name, entry in manifest.files.items():
         path = folder / name
@@ -157,7 +159,26 @@ def check_sizes(folder: Path, manifest: Manifest) -> list[str]:
         elif (size := path.stat().st_size) != entry.bytes:
             how = "truncated" if size < entry.bytes else "too long"
             problems.append(f"{path}: {how}, {size} bytes instead of {entry.bytes}")
+        elif wrong := _array_problem(entry):
+            problems.append(f"{path}: {wrong}, says {MANIFEST}")
     return problems
+
+
+def _array_problem(entry: FileEntry) -> str:
+    """Say why an entry's array cannot lie in its file; empty where it can, or where there is none."""
+    import numpy as np
+
+    shape, dtype, offset = entry.shape, entry.dtype, entry.offset
+    if shape is None and dtype is None and offset is None:
+        return ""
+    if shape is None or dtype is None or offset is None:
+        return "an array needs shape, dtype and offset"
+    if dtype not in DTYPES:
+        return f"dtype {dtype!r}, expected one of {', '.join(DTYPES)}"
+    need = offset + math.prod(shape) * np.dtype(dtype).itemsize
+    if min(shape, default=1) < 0 or offset < 0 or need > entry.bytes:
+        return f"an array {shape} of {dtype} from byte {offset} on does not fit into {entry.bytes} bytes"
+    return ""
 
 
 def verify_scene(folder: str | Path) -> list[str]:
@@ -189,7 +210,8 @@ def verify(data_dir: str | Path) -> list[str]:
     """
     data_dir = Path(data_dir)
     if not data_dir.is_dir():
-        raise InputError(f"{data_dir}: no such folder")
+        what = "is a file, expected a data folder" if data_dir.exists() else "no such folder"
+        raise InputError(f"{data_dir}: {what}")
     index = read_index(data_dir)
     problems: list[str] = []
     for name in sorted({*index, *_scene_names(data_dir.iterdir())}):

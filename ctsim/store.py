@@ -107,11 +107,12 @@ def _open(
     from ctsim.types import Scan
 
     where = folder / "scan.json"
+    counts, flat = (torch.from_numpy(_map(folder, manifest.files, name)) for name in (f"{prefix}counts", "flat"))
     try:
         scan = Scan(
             geometry=msgspec.convert(info["geometry"], Geometry),
-            counts=torch.from_numpy(_map(folder, manifest.files, f"{prefix}counts")),
-            flat=torch.from_numpy(_map(folder, manifest.files, "flat")),
+            counts=counts,
+            flat=flat,
             dark=float(info["dark"]),
             i0=float(info["i0"]),
             e_max=float(info["e_max"]),
@@ -147,4 +148,8 @@ def _map(folder: Path, files: dict[str, mf.FileEntry], name: str) -> NDArray[Any
     entry = files.get(f"{name}.tif")
     if entry is None or entry.shape is None or entry.dtype is None or entry.offset is None:
         raise InputError(f"{folder}: was written without {name}.tif")
-    return map_array(folder / f"{name}.tif", entry.shape, entry.dtype, entry.offset)
+    path = folder / f"{name}.tif"
+    try:
+        return map_array(path, entry.shape, entry.dtype, entry.offset)
+    except (OSError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: cannot be mapped ({error})") from error

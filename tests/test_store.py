@@ -12,6 +12,7 @@ import tifffile
 import torch
 from small_scan import GEOMETRY, STACKS, one_view, volume, write
 
+from ctsim import store
 from ctsim.errors import InputError
 from ctsim.manifest import INDEX, MANIFEST, read_index
 from ctsim.store import list_scans, open_scan, verify
@@ -131,6 +132,54 @@ def test_verify_finds_a_manifest_that_was_tampered_with(tmp_path):
     (folder / MANIFEST).write_text(text[:50])
     with pytest.raises(InputError, match="damaged manifest"):
         open_scan(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"offset": 8}, "content hash"),
+        ({"shape": [6, 7, 5]}, "content hash"),
+        ({"dtype": "int16"}, "content hash"),
+        ({"offset": 10**6}, "counts.tif"),
+        ({"shape": [600, 5, 7]}, "counts.tif"),
+        ({"dtype": "float64"}, "counts.tif"),
+        ({"shape": [-6, 5, 7]}, "counts.tif"),
+        ({"offset": -1}, "counts.tif"),
+        ({"dtype": "potato"}, "counts.tif"),
+        ({"dtype": "O"}, "counts.tif"),
+        ({"shape": None}, "counts.tif"),
+    ],
+)
+def test_an_edited_array_entry_is_found_and_named(tmp_path, change, said):
+    folder = write(tmp_path)
+    manifest = msgspec.json.decode((folder / MANIFEST).read_bytes())
+    manifest["files"]["counts.tif"] |= change
+    (folder / MANIFEST).write_bytes(msgspec.json.encode(manifest))
+    problems = verify(tmp_path)
+    assert any(said in p for p in problems) and any("content hash" in p for p in problems)
+    if said == "counts.tif":  # what lies inside the file can be mapped, and only the hash tells
+        with pytest.raises(InputError, match=r"counts\.tif") as caught:
+            open_scan(folder)
+        assert "scan.json" not in str(caught.value)
+
+
+def test_an_array_that_cannot_be_mapped_is_refused_by_its_own_name(tmp_path, monkeypatch):
+    folder = write(tmp_path)
+
+    def refuse(*_):
+        raise OSError(12, "Cannot allocate memory")
+
+    monkeypatch.setattr(store, "map_array", refuse)
+    with pytest.raises(InputError, match=r"counts\.tif: .*Cannot allocate memory"):
+        open_scan(folder)
+
+
+def test_a_file_is_no_data_folder(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="is a file"):
+        verify(tmp_path / "file")
+    with pytest.raises(InputError, match="no such folder"):
+        verify(tmp_path / "none")
 
 
 def test_the_index_survives_a_torn_line_and_a_missing_folder(tmp_path):
