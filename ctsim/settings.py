@@ -40,3 +40,6 @@ class Truth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     def __post_init__(self) -> None:
         if any(not 1.0 <= e <= 800.0 for e in self.mono_kev):
             raise InputError(f"mono_kev must lie within 1…800 keV, got {self.mono_kev}")
+        names = [f"{e:g}" for e in self.mono_kev]  # of the files
+        if twice := [n for n in names if names.count(n) > 1]:
+            raise InputError(f"mono_kev: two energies write mono_{twice[0]}kev.tif; expected energies of unequal names")

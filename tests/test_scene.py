@@ -201,7 +201,7 @@ PHANTOM = table(
 )
 SETTINGS = table({}, tolerance=st.floats(1e-7, 0.1), subrays=st.integers(1, 256), skip=st.booleans())
 FLAGS = {k: st.booleans() for k in ("twin", "noise_free", "scatter_free", "trace", "metal_path", "paths")}
-TRUTH = table({}, mono_kev=st.lists(st.floats(1, 800), max_size=2), **FLAGS)
+TRUTH = table({}, mono_kev=st.lists(st.floats(1, 800), max_size=2, unique_by="{:g}".format), **FLAGS)
 NAN, INF = float("nan"), float("inf")
 # by path in the file: values of which each must be refused with the last part of the path in the message
 ABSURD = {
@@ -210,10 +210,11 @@ ABSURD = {
     "phantom.metal": ["Xx", ""],
     "phantom.size": [NAN, 0.0, -1.0, 2001.0, INF],
     "phantom.n_voxel": [[0, 8, 8], [8, 8], [8, 8, 4096]],
+    "scanner.n_voxel": [[4096, 2048, 2049]],
     "phantom.n_inserts": [-1, 17],
     "phantom.insert_mm": [NAN, 0.0, 40.0],
-    "scanner.n_views": [0, 1.5],
-    "scanner.n_detector": [[0, 4], [4]],
+    "scanner.n_views": [0, 1.5, 10**9],
+    "scanner.n_detector": [[0, 4], [4], [9999999, 9999999]],
     "scanner.field_mm": [NAN, 0.0, INF],
     "scanner.arc_deg": [NAN, 0.0, 361.0],
     "scanner.start_deg": [NAN, INF],
@@ -234,7 +235,7 @@ ABSURD = {
     "scanner.scatter.fraction": [NAN, -1.0, 10.0],
     "simulation.tolerance": [NAN, 0.0],
     "simulation.subrays": [0, 257],
-    "truth.mono_kev": [[NAN], [0.0]],
+    "truth.mono_kev": [[NAN], [0.0], [60.0, 60.0], [60.0, 60.00001], [INF]],
 }
 ABSURDITIES = [(path, value) for path, values in ABSURD.items() for value in values]
 
