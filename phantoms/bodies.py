@@ -19,7 +19,7 @@ REACH = 0.92
 Shape = tuple[int, int, int]
 Millimetres = Annotated[float, msgspec.Meta(ge=1e-3, le=2000)]
 Side = Annotated[int, msgspec.Meta(ge=1, le=2048)]
-Inserts = Annotated[int, msgspec.Meta(ge=0, le=16)]
+InsertCount = Annotated[int, msgspec.Meta(ge=0, le=16)]
 
 
 class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="recipe"):
@@ -34,7 +34,7 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     n_voxel: tuple[Side, Side, Side] = (96, 96, 96)
     size: Millimetres = 60.0
     metal: str = "Fe"
-    n_inserts: Inserts | None = None
+    n_inserts: InsertCount | None = None
     insert_mm: Millimetres | None = None
 
     def __post_init__(self) -> None:

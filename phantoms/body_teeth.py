@@ -78,7 +78,7 @@ def teeth(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Teeth) ->
     for jaw, row in zip((-1, 1), rows, strict=True):
         _bone(canvas, jaw, spongy)
         gone = body.permutation(14)[: params.missing]
-        implants, _ = _sites(metal, params) if jaw < 0 else ([], [])
+        implants, _ = _sites(params) if jaw < 0 else ([], [])
         for tooth in row:
             if tooth.slot not in gone or (jaw < 0 and tooth.slot in SITES):
                 _tooth(canvas, tooth, body, rootless=tooth.slot in implants)
@@ -225,8 +225,8 @@ def _roots(canvas: Canvas, tooth: Tooth, bend: NDArray[np.float64]) -> None:
 SITES: tuple[int, ...] = (5, 12, 3, 10, 6, 4, 13, 11)  # slots of the lower jaw that can carry inserts, in order of use
 
 
-def _sites(rng: np.random.Generator, params: Teeth) -> tuple[list[int], list[int]]:
-    """Slots of implants and of crowns; drawn from the settings, not from the metal, so twins agree."""
+def _sites(params: Teeth) -> tuple[list[int], list[int]]:
+    """Slots of implants and of crowns, from the settings alone, so that twins agree."""
     total = min(4 if params.n_inserts is None else params.n_inserts, len(SITES))
     crowned = min(params.crowns, total)
     slots = list(SITES[:total])
@@ -237,7 +237,7 @@ def _metal(rng: np.random.Generator, params: Teeth, unit: float, row: list[Tooth
     if count(params, 4) == 0:
         return []
     make, d = inserts(params, unit), diameter(params, 4.2, unit)
-    implants, crowns = _sites(rng, params)
+    implants, crowns = _sites(params)
     by_slot = {tooth.slot: tooth for tooth in row}
     solids: list[Solid] = []
     for slot in implants:
