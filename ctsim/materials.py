@@ -100,6 +100,8 @@ def _mass_fractions(formula: str) -> tuple[tuple[int, float], ...]:
         total = sum(w for _, w in pairs)
         if not total > 0:
             raise ValueError("weights must be positive")
+        for z, _ in pairs:
+            xrl.CS_Total(int(z), E_MIN)  # the heaviest elements have symbols but no tables
     except ValueError as error:
         raise InputError(
             f"formula {formula!r} cannot be read ({error}); expected one like 'NaI' or 'H 11.2 O 88.8'"
@@ -114,7 +116,7 @@ def names() -> tuple[str, ...]:
 
 @functools.lru_cache(maxsize=256)
 def material(name: str) -> Material:
-    """Look a material up by name, or build one from "formula@density" ("NaI@3.67").
+    """Look a material up by name or element symbol, or build one from "formula@density" ("NaI@3.67").
 
     Raises InputError naming near matches where the name is unknown.
     """
@@ -128,10 +130,23 @@ def material(name: str) -> Material:
         except ValueError:
             raise InputError(f"material {name!r}: expected formula@density with a density in g/cm3") from None
         return Material(name=name, formula=formula, density=density)
+    if (tabulated := _element_density(name)) is not None:
+        return Material(name=name, formula=name, density=tabulated)
     lower = {known.lower(): known for known in _TABLE}
-    near = [lower[k] for k in difflib.get_close_matches(name.lower(), lower, n=3, cutoff=0.5)]
+    near = [lower[k] for k in difflib.get_close_matches(name.lower(), lower, n=3, cutoff=0.7)]
     hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(_TABLE)}"
-    raise InputError(f"unknown material {name!r}: {hint} (or give a formula and density, 'NaI@3.67')")
+    raise InputError(
+        f"unknown material {name!r}: {hint} (or give an element's symbol, 'Pb', or a formula and density, 'NaI@3.67')"
+    )
+
+
+def _element_density(symbol: str) -> float | None:
+    """Return an element's tabulated density (g/cm3), None where there is no such element or no table."""
+    xrl = _xraylib()
+    try:
+        return float(xrl.ElementDensity(xrl.SymbolToAtomicNumber(symbol)))
+    except ValueError:
+        return None
 
 
 def _as_material(which: str | Material) -> Material:

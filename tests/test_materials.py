@@ -57,6 +57,29 @@ def test_every_promised_name_is_known() -> None:
         assert np.all(np.isfinite(mu) & (mu > 0))
 
 
+@pytest.mark.parametrize(("symbol", "density", "at_60"), [("Pb", 11.35, 5.021), ("Ag", 10.5, 5.766)])
+def test_an_element_is_a_material_of_its_tabulated_density(symbol: str, density: float, at_60: float) -> None:
+    # densities: NIST SRD 126, table 1; μ/ρ at 60 keV: tables z82 and z47. 0.2 %: xraylib against NIST, heavy elements
+    assert symbol not in names()
+    assert material(symbol).density == pytest.approx(density, rel=1e-3)
+    assert mass_attenuation(symbol, [60.0]) == pytest.approx(at_60, rel=2e-3)
+    assert material("W").density == 19.3 and material("Sn").density == 7.31
+
+
+@pytest.mark.parametrize("name", ["Fm", "Bh", "pb", "None", "Fm@10"])
+def test_elements_without_tables_are_refused(name: str) -> None:
+    with pytest.raises(InputError, match=name.split("@")[0]):
+        attenuation(name, [60.0])
+
+
+def test_a_hint_is_given_only_when_it_is_close() -> None:
+    with pytest.raises(InputError) as caught:
+        material("Unobtainium")
+    assert "did you mean" not in str(caught.value) and "cortical_bone" in str(caught.value)
+    with pytest.raises(InputError, match="did you mean cortical_bone"):
+        material("cortical-bone")
+
+
 def test_weights_and_formulas_agree() -> None:
     share = material("water").mass_fractions
     weights = Material(name="w", formula=f"H {100 * share[1]:.9f} O {100 * share[8]:.9f}", density=1.0)
