@@ -30,6 +30,6 @@ def filled(mask: Mask) -> Mask:
 
 
 def pieces(mask: Mask) -> tuple[NDArray[np.int32], int]:
-    """Number the pieces of a mask from 1, joining neighbours across edges and corners; return also how many."""
+    """Return a mask's pieces, numbered from 1 with neighbours across edges and corners joined, and their number."""
     names, n = cast(tuple[NDArray[np.int32], int], cast(Any, scipy.ndimage.label(mask, _all(mask.ndim))))
     return names, n

@@ -26,10 +26,12 @@ if TYPE_CHECKING:
     from ctsim.types import Scan, Volume
 
 OURS = ("ctsim", "reconstruct", "baselines")
-COUNTS_ONLY = "counts only"
+COUNTS_ONLY, METAL_MASK = "counts only", "metal mask"
 
 TABLE: dict[str, tuple[str, str]] = {
     "fdk": ("reconstruct.fdk:reconstruct", COUNTS_ONLY),
+    "limar": ("baselines.limar:reconstruct", METAL_MASK),
+    "nmar": ("baselines.nmar:reconstruct", METAL_MASK),
     "sart": ("baselines.sart:sart", COUNTS_ONLY),
     "os-sart": ("baselines.sart:os_sart", COUNTS_ONLY),
     "sirt": ("baselines.sart:sirt", COUNTS_ONLY),
@@ -112,11 +114,14 @@ def find(name: str, overrides: dict[str, Any] | None = None) -> Method:
     for key in given:
         if key not in params:
             raise InputError(f"method {name!r} has no parameter {key!r}: expected one of {', '.join(params) or 'none'}")
+    params |= given
+    if inputs == METAL_MASK and params["mask"] == "auto":
+        inputs = COUNTS_ONLY  # it finds the metal itself
     return Method(
         name=name,
         target=target,
         inputs=inputs or getattr(module, "INPUTS", COUNTS_ONLY),
-        params={**params, **given},
+        params=params,
         overrides=given,
         code=code_version(function.__module__),
     )

@@ -51,9 +51,9 @@ class Plan:
     """The work for one scan. `seconds` is an estimate for this machine, the only entry that differs between runs.
 
     `materials` are those that are met, air first. In P = −ln(signal/open), `error` bounds what the energy
-    quadrature does and `edge_error` is the largest found at the edge of an insert (see `ctsim.survey`); `l0` is
-    the median water-equivalent path of the body in mm. `memory_bytes` estimates the arrays; Python and its
-    libraries take a quarter of a gigabyte more.
+    quadrature does and `edge_error` is the largest found in eight windows at edges of inserts, in one view (see
+    `ctsim.survey`); `l0` is the median water-equivalent path of the body in mm. `memory_bytes` estimates the arrays;
+    Python and its libraries take a quarter of a gigabyte more.
     """
 
     stream_id: str
@@ -111,7 +111,7 @@ class Plan:
         for stage in self.stages:
             if not stage.runs:
                 skipped.setdefault(stage.reason, []).append(stage.name)
-        edges = f", {self.edge_error:.0e} (worst edge pixel)" if self.edge_error else ""
+        edges = f", {self.edge_error:.0e} (worst edge pixel looked at)" if self.edge_error else ""
         lines = {
             "does": does,
             "skips": "; ".join(f"{reason}: {', '.join(names)}" for reason, names in skipped.items()),

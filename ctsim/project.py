@@ -23,8 +23,9 @@ from ctsim.solids import pack
 from ctsim.types import Phantom
 
 # Over a pixel in which the thickness changes linearly by R the intensity mean differs from the central
-# ray by R²/24 in P, so R = 0.1 costs 4e-4, below the photon noise of 1e6 photons.
-EDGE_THRESHOLD = 0.1
+# ray by R²/24 in P, so R = 0.1 costs 4e-4, below the photon noise of 1e6 photons. Where a solid begins within the
+# pixel the mean can differ by R/2.
+EDGE_THRESHOLD, STEP_THRESHOLD = 0.1, 0.004
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,7 +137,7 @@ def transmit(
     """
     shape, pose = geometry.n_detector, geometry.pose(view)
     if out is None:
-        # summed in the kernel's order, so that a skipped ray equals a traced one to the last bit
+        # summed in the kernel's order, so that a skipped ray equals a traced one
         m1, m2 = (np.full(shape, np.cumsum(w, dtype=np.float32)[-1]) for w in (response.w1, response.w2))
         spans = np.tile(np.array([0, shape[1]]), (shape[0], 1))
     else:
@@ -150,7 +151,7 @@ def transmit(
         spans,
         tracer.background(geometry, view) if background is None else background,
         (response.mu, response.w1, response.w2),
-        (response.edge_mu, EDGE_THRESHOLD, most),
+        (response.edge_mu, EDGE_THRESHOLD, STEP_THRESHOLD, most),
         m1,
         m2,
     )

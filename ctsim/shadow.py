@@ -32,10 +32,12 @@ def primitive_corners(prims: NDArray[np.float64]) -> NDArray[np.float64]:
 def cast(pose: NDArray[np.float64], shape: tuple[int, int], corners: NDArray[np.float64]) -> NDArray[np.int64]:
     """Columns (from, to) of each row in which the hulls of `corners` [part, 8, 3] are seen: [v, part, 2].
 
-    Both ends are meant, there is one pixel of margin on every side (so −1…n_u at most), and from > to where nothing
-    is seen. A part that reaches behind the source is seen everywhere.
+    Both ends are meant and from > to where nothing is seen. A part that reaches behind the source is seen everywhere.
+    On every side there is a margin of half a pixel's diagonal (see `inflate`), at least a pixel.
     """
     source, centre, e_u, e_v = pose.reshape(4, 3)
+    sides = np.array([np.linalg.norm(e_v), np.linalg.norm(e_u)])
+    margin = np.maximum(np.ceil(np.hypot(*sides) / 2 / sides), 1)
     normal = np.cross(e_u, e_v)
     reach = (corners - source) @ normal / ((centre - source) @ normal)
     behind: NDArray[np.bool_] = np.any(reach <= 1e-9, axis=1)
@@ -43,12 +45,12 @@ def cast(pose: NDArray[np.float64], shape: tuple[int, int], corners: NDArray[np.
     u = hit @ e_u / (e_u @ e_u) + (shape[1] - 1) / 2
     v = hit @ e_v / (e_v @ e_v) + (shape[0] - 1) / 2
     out = np.empty((shape[0], len(corners), 2), np.int64)
-    _fill(u, v, behind, shape[1], out)
+    _fill(u, v, behind, float(margin[0]), int(margin[1]), shape[1], out)
     return out
 
 
 @njit(cache=True)
-def _fill(us, vs, behind, n_u, out):
+def _fill(us, vs, behind, margin_v, margin_u, n_u, out):
     """Join the shadows' corners in pairs: the outermost of these lines in a row are the hull's border."""
     n_v = out.shape[0]
     for p in range(us.shape[0]):
@@ -62,15 +64,15 @@ def _fill(us, vs, behind, n_u, out):
                 if v0 > v1 or i == j:
                     continue
                 slope = (u1 - u0) / (v1 - v0) if v1 > v0 else 0.0
-                for v in range(int(min(max(v0 - 1.0, 0.0), n_v)), int(min(max(v1 + 2.0, 0.0), n_v))):
-                    # the part of the line within a row of the margin
-                    low, high = min(max(v - 1.0, v0), v1), max(min(v + 1.0, v1), v0)
+                for v in range(int(min(max(v0 - margin_v, 0.0), n_v)), int(min(max(v1 + margin_v + 1.0, 0.0), n_v))):
+                    # the part of the line within the margin
+                    low, high = min(max(v - margin_v, v0), v1), max(min(v + margin_v, v1), v0)
                     a, b = u0 + slope * (low - v0), u0 + slope * (high - v0)
                     if v1 == v0:
                         b = u1
-                    left, right = min(max(min(a, b), -9.0), n_u + 9.0), min(max(max(a, b), -9.0), n_u + 9.0)
-                    out[v, p, 0] = min(out[v, p, 0], max(int(np.floor(left)) - 1, -1))
-                    out[v, p, 1] = max(out[v, p, 1], min(int(np.ceil(right)) + 1, n_u))
+                    left, right = min(max(min(a, b), -1e6), n_u + 1e6), min(max(max(a, b), -1e6), n_u + 1e6)
+                    out[v, p, 0] = min(out[v, p, 0], max(int(np.floor(left)) - margin_u, -1))
+                    out[v, p, 1] = max(out[v, p, 1], min(int(np.ceil(right)) + margin_u, n_u))
         for v in range(n_v):
             if out[v, p, 1] < 0 or out[v, p, 0] > n_u - 1:  # beside the detector
                 out[v, p, 0], out[v, p, 1] = n_u, -1

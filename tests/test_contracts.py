@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from benchmarks.methods import TABLE, find
+from benchmarks.run import scan_for
 from ctsim.store import list_scans, open_scan
 from ctsim.types import Status
 
@@ -17,10 +18,11 @@ def stored(smallest):
 @pytest.mark.parametrize("name", TABLE)
 def test_a_method_gives_a_finite_volume_of_the_scans_grid(name, stored):
     method = find(name)
-    if reason := method.skip(stored.scan):
+    scan = scan_for(method, stored, "metal")
+    if reason := method.skip(scan):
         assert isinstance(reason, str)
         pytest.skip(reason)
-    volume = method.reconstruct(stored.scan, "cpu")
+    volume = method.reconstruct(scan, "cpu")
     assert volume.status is Status.OK and not volume.reason
     assert volume.values.dtype == torch.float32
     assert tuple(volume.values.shape) == stored.geometry.n_voxel
@@ -33,16 +35,18 @@ def test_a_method_gives_a_finite_volume_of_the_scans_grid(name, stored):
 
 @pytest.mark.parametrize("name", TABLE)
 def test_a_method_leaves_the_scan_as_it_was_and_repeats_itself(name, stored):
-    method, counts = find(name), stored.scan.counts.clone()
-    if method.skip(stored.scan):
+    method = find(name)
+    scan = scan_for(method, stored, "metal")
+    counts = scan.counts.clone()
+    if method.skip(scan):
         pytest.skip("does not apply")
-    first = method.reconstruct(stored.scan, "cpu").values
-    assert torch.equal(stored.scan.counts, counts)
-    assert torch.equal(method.reconstruct(stored.scan, "cpu").values, first)
+    first = method.reconstruct(scan, "cpu").values
+    assert torch.equal(scan.counts, counts)
+    assert torch.equal(method.reconstruct(scan, "cpu").values, first)
 
 
 @pytest.mark.parametrize("name", TABLE)
 def test_a_method_refuses_a_device_that_is_not_there(name, stored):
     # "meta" holds no data: nothing can be computed on it, so falling back silently would show
     with pytest.raises((ValueError, RuntimeError, NotImplementedError)):
-        find(name).reconstruct(stored.scan, "meta")
+        find(name).reconstruct(scan_for(find(name), stored, "metal"), "meta")

@@ -124,16 +124,19 @@ def _near(shadow, active, n_u):
 
 
 @njit(cache=True, error_model="numpy")
-def _corners(prims, shadow, active, near, pose, v, edge_mu, out):
-    """Fill `out` [u + 1] with the solids' thickness at the pixel corners at height v (from the detector's centre)."""
+def _corners(prims, shadow, active, near, pose, v, edge_mu, out, hit):
+    """Fill `out` [u + 1] with the solids' thickness at the pixel corners at height v (from the detector's centre).
+
+    `hit` [u + 1] is the number of intervals there.
+    """
     ray, pair, hits = np.empty(7), np.empty(4), np.empty((2 * active.size, 3))
     middle = (out.size - 2) / 2
     for u in range(out.size):
-        out[u] = 0.0
+        out[u], hit[u] = 0.0, 0.0
         if near[u]:
             aim(pose, u - 0.5 - middle, v, ray)
             n = _collect(prims, shadow, active, u - 0.5, ray, pair, hits)
-            out[u] = _thickness(hits, n, edge_mu)
+            out[u], hit[u] = _thickness(hits, n, edge_mu), n
 
 
 @njit(inline="always", error_model="numpy")
@@ -187,7 +190,7 @@ def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, m1
     """
     prims, fat, shadow, active, near = solids
     mu, w1, w2 = rule
-    _, threshold, most = edge
+    most = edge[3]
     first, last, n_v = columns
     n_m, n_u = background.shape
     size = most * MOST_TIMES
@@ -204,7 +207,7 @@ def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, m1
         if thin:
             aim(pose, u - (n_u - 1) / 2, v - (n_v - 1) / 2, ray)
             times = _grazes(fat, shadow, active, u, ray, pair)
-        if times == 0 and changes[u] <= threshold:
+        if times == 0 and changes[u] == 0:
             continue
         count = most * times if times else max(2, int(most * min(1.0, (1.0 + changes[u]) / ALL_SUBRAYS)))
         t, far = np.inf, -np.inf
@@ -230,19 +233,19 @@ def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, m1
 
 @njit(cache=True, error_model="numpy")
 def _measure_row(volume, solids, pose, v, span, background, rule, edge, corners, m1, m2):
-    """Measure columns span[0]…span[1] of row v; `corners` [2, u + 1] are those below and above once it is done."""
+    """Measure columns span[0]…span[1] of row v; `corners` [4, u + 1] are those below and above once it is done."""
     prims, fat, shadows = solids
     shadow = shadows[v]
     mu, w1, w2 = rule
     n_m, n_v, n_u = background.shape
     active = _active(shadow)
     near = _near(shadow, active, n_u)
-    edges = active.size > 0 and edge[2] > 1
+    edges = active.size > 0 and edge[3] > 1
+    corners[0], corners[2] = corners[1], corners[3]
     if edges:
-        corners[0] = corners[1]
-        _corners(prims, shadow, active, near, pose, v + 0.5 - (n_v - 1) / 2, edge[0], corners[1])
+        _corners(prims, shadow, active, near, pose, v + 0.5 - (n_v - 1) / 2, edge[0], corners[1], corners[3])
     else:
-        corners[1] = 0.0
+        corners[1], corners[3] = 0.0, 0.0
     row = background[:, v]
     first, last = _trim(row, span, near)
     if first >= last:
@@ -256,7 +259,11 @@ def _measure_row(volume, solids, pose, v, span, background, rule, edge, corners,
     if edges:
         for u in range(first, last):
             a, b, c, d = corners[0, u], corners[0, u + 1], corners[1, u], corners[1, u + 1]
-            centre[u] = max(max(max(a, b), max(c, d)), centre[u]) - min(min(min(a, b), min(c, d)), centre[u])
+            change = max(max(max(a, b), max(c, d)), centre[u]) - min(min(min(a, b), min(c, d)), centre[u])
+            a, b, c, d = corners[2, u], corners[2, u + 1], corners[3, u], corners[3, u + 1]
+            # where a solid begins the change is not linear, and less of it matters
+            limit = edge[1] if a == b and b == c and c == d else edge[2]
+            centre[u] = change if change > limit else 0.0
         parts = (prims, fat, shadow, active, near)
         _edges(volume, parts, pose, v, columns, row, rule, edge, centre, m1[v], m2[v])
 
@@ -264,12 +271,13 @@ def _measure_row(volume, solids, pose, v, span, background, rule, edge, corners,
 @njit(cache=True, error_model="numpy")
 def _measure_strip(volume, solids, pose, first, spans, background, rule, edge, m1, m2):
     n_v, n_u = m1.shape
-    corners = np.zeros((2, n_u + 1))
+    corners = np.zeros((4, n_u + 1))
     shadow = solids[2][first]
     active = _active(shadow)
-    if active.size > 0 and edge[2] > 1:
+    if active.size > 0 and edge[3] > 1:
         near = _near(shadow, active, n_u)
-        _corners(solids[0], shadow, active, near, pose, first - 0.5 - (n_v - 1) / 2, edge[0], corners[1])
+        v = first - 0.5 - (n_v - 1) / 2
+        _corners(solids[0], shadow, active, near, pose, v, edge[0], corners[1], corners[3])
     for v in range(first, min(first + STRIP, n_v)):
         _measure_row(volume, solids, pose, v, spans[v], background, rule, edge, corners, m1, m2)
 
@@ -282,8 +290,8 @@ def transmit_view(volume, solids, pose, order, spans, background, rule, edge, m1
     (mm, float32) what the central rays cross in it. `solids` is (prims, fat, shadows): primitive rows, their
     inflated twins and the columns in which they are seen (`ctsim.shadow.inflate` and `cast`). `pose` [12];
     `order` [strip] is the order of work; only columns spans[row] = (from, to) are touched. `rule` is
-    (mu [material, node] 1/mm, w1 [node], w2 [node]); `edge` is (edge_mu [material], threshold in optical
-    thickness, most sub-rays a pixel).
+    (mu [material, node] 1/mm, w1 [node], w2 [node]); `edge` is (edge_mu [material], least change of
+    optical thickness that takes sub-rays, the same where a solid begins, most sub-rays a pixel).
     """
     for index in prange(order.size):
         _measure_strip(volume, solids, pose, order[index] * STRIP, spans, background, rule, edge, m1, m2)

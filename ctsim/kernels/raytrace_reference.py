@@ -83,19 +83,21 @@ def _lengths(volume, grid, prims, ray, n_materials, central=None):
 
 def _thickness(prims, ray, edge_mu):
     source, direction, distance = ray
-    total = 0.0
+    total, hits = 0.0, 0
     for prim in prims:
         pairs = np.empty(4)
         found = _intervals(prim, source, direction, pairs)
         for t0, t1 in pairs[: 2 * found].reshape(-1, 2):
-            total += max(min(t1, distance) - max(t0, 0.0), 0.0) * edge_mu[int(prim[1])]
-    return total
+            length = max(min(t1, distance) - max(t0, 0.0), 0.0)
+            total += length * edge_mu[int(prim[1])]
+            hits += length > 0
+    return total, hits
 
 
 def _n_subrays(solids, pose, u, v, edge):
     """How many rays measure the pixel at detector position (u, v)."""
     prims, fat, _ = solids
-    edge_mu, threshold, most = edge
+    edge_mu, smooth, begins, most = edge
     if most < 2 or len(prims) == 0:
         return 1
     centre = _ray(pose, u, v)
@@ -103,8 +105,8 @@ def _n_subrays(solids, pose, u, v, edge):
     if hidden:
         return most * int(max(hidden))
     corners = [_ray(pose, u + du, v + dv) for du in (-0.5, 0.5) for dv in (-0.5, 0.5)]
-    tau = [_thickness(prims, ray, edge_mu) for ray in (centre, *corners)]
-    change = max(tau) - min(tau)
+    tau, hits = zip(*(_thickness(prims, ray, edge_mu) for ray in (centre, *corners)), strict=True)
+    change, threshold = max(tau) - min(tau), begins if len(set(hits[1:])) > 1 else smooth
     return max(2, int(most * min(1.0, (1 + change) / 8.5))) if change > threshold else 1
 
 
