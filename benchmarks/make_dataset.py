@@ -1,5 +1,6 @@
 """make-dataset: from scene recipes to scans on disk, resumable at any moment."""
 
+import contextlib
 import dataclasses
 import difflib
 import shutil
@@ -115,8 +116,21 @@ def _plan(scene: "Scene") -> "tuple[Plan, Phantom, Scanner]":
     from ctsim.plan import make_plan
     from phantoms.scene import build, stream_id
 
-    phantom, scanner = build(scene), scene.resolve()
-    return make_plan(phantom, scanner, scene.simulation, scene.truth, stream_id(scene)), phantom, scanner
+    with _memory(scene.name):
+        phantom, scanner = build(scene), scene.resolve()
+        return make_plan(phantom, scanner, scene.simulation, scene.truth, stream_id(scene)), phantom, scanner
+
+
+@contextlib.contextmanager
+def _memory(name: str) -> Iterator[None]:
+    """Turn a lack of memory into the user's error that names the scene."""
+    try:
+        yield
+    except MemoryError as error:
+        raise InputError(
+            f"{name}: there is not enough memory ({error or 'no size is known'}); expected a smaller "
+            "phantom.n_voxel, scanner.n_voxel or scanner.n_detector"
+        ) from error
 
 
 def _dry_run(scenes: "tuple[Scene, ...]", options: Options) -> int:
@@ -147,8 +161,9 @@ def _make(scenes: "tuple[Scene, ...]", out: Path, force: bool) -> int:
     plans = {scene.name: _plan(scene)[0] for scene in todo}  # all phantoms could be more than memory holds
     _check_space(out, sum(plan.disk_bytes for plan in plans.values()))
     for number, scene in enumerate(todo, 1):
-        parts, title = (build(scene), scene.resolve()), f"{number}/{len(todo)} {scene.name}"
-        make_scene(scene, plans[scene.name], parts, out, force=force, title=title)
+        title = f"{number}/{len(todo)} {scene.name}"
+        with _memory(scene.name):
+            make_scene(scene, plans[scene.name], (build(scene), scene.resolve()), out, force=force, title=title)
     return 0
 
 

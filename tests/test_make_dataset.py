@@ -194,6 +194,7 @@ def test_wrong_arguments_are_one_sentence(suite, tmp_path, capsys):
         ([suite], "data folder is missing"),
         (["nothing.toml", "x"], "nothing.toml"),
         (["--verify", str(tmp_path / "none")], "no such folder"),
+        (["--verify", suite], "is a file, expected a data folder"),
         ([suite, "x", "--only", "rod"], "expected one of rods"),
         ([suite, suite], "is a file"),
     )
@@ -201,6 +202,23 @@ def test_wrong_arguments_are_one_sentence(suite, tmp_path, capsys):
         assert main(argv) == 2
         error = capsys.readouterr().err
         assert said in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("where", "flags"),
+    [
+        ("phantoms.scene.build", []),
+        ("phantoms.scene.build", ["--dry-run"]),
+        ("ctsim.plan.make_plan", []),
+        ("ctsim.simulate.simulate_views", []),
+        ("ctsim.simulate.truth_volumes", []),
+    ],
+)
+def test_a_scene_too_large_for_memory_is_named(suite, tmp_path, monkeypatch, capsys, where, flags):
+    monkeypatch.setattr(where, lambda *_, **__: np.zeros(2**58))  # 2 EB: NumPy's own MemoryError
+    assert main([suite, str(tmp_path / "data"), *flags]) == 2
+    error = capsys.readouterr().err
+    assert "make-dataset: rods: " in error and "memory" in error and error.count("\n") == 1
 
 
 def test_units_read_well():
