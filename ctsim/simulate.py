@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.detector import response
-from ctsim.errors import InputError
 from ctsim.materials import attenuation
 from ctsim.noise import detect, flat_field, pixel_pattern
 from ctsim.plan import Plan
@@ -56,8 +55,6 @@ class _Beam:
 
 def _beam(plan: Plan, scanner: Scanner) -> _Beam:
     tube, geometry = scanner.tube, scanner.geometry
-    if (tube.heel or tube.bowtie) and geometry.poses is not None:
-        raise InputError("tube.heel and tube.bowtie need a circular orbit, but geometry.poses is given")
     n_v, n_u = geometry.n_detector
     v = (np.arange(n_v) - (n_v - 1) / 2) * geometry.d_detector[0] + geometry.off_detector[0]
     u = (np.arange(n_u) - (n_u - 1) / 2) * geometry.d_detector[1] + geometry.off_detector[1]
