@@ -23,6 +23,13 @@ _TABLE_ANGLE_DEG = (1.0, 40.0)
 _NEGLIGIBLE = 1e-12  # bins with less than this share of the largest are cut off at the soft end
 
 
+def _check_material(name: str) -> None:
+    try:
+        material(name)
+    except InputError as error:
+        raise InputError(f"material: {error}") from None
+
+
 class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A sheet in front of the tube: material and thickness (mm)."""
 
@@ -30,9 +37,9 @@ class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     thickness: float
 
     def __post_init__(self) -> None:
-        material(self.material)
+        _check_material(self.material)
         if not (math.isfinite(self.thickness) and self.thickness >= 0):
-            raise InputError(f"filter {self.material!r}: thickness must be at least 0 mm, got {self.thickness}")
+            raise InputError(f"thickness must be at least 0 mm for a filter of {self.material!r}, got {self.thickness}")
 
 
 class Bowtie(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -44,7 +51,7 @@ class Bowtie(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     half_angle_deg: float
 
     def __post_init__(self) -> None:
-        material(self.material)
+        _check_material(self.material)
         for name in ("center", "edge"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
@@ -77,8 +84,8 @@ class Tube(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
             raise InputError(f"tube: kvp must be within [{low:g}, {high:g}] for model {self.model!r}, got {self.kvp}")
         if self.model == "table" and not TABLE_KVP[0] <= self.kvp <= TABLE_KVP[1]:
             raise InputError(
-                f"tube: the bundled table covers {TABLE_KVP[0]:g} to {TABLE_KVP[1]:g} kVp, got {self.kvp:g}; "
-                "model = 'finkelshtein-pavlova' covers 10 to 500"
+                f"tube: kvp must be within {TABLE_KVP[0]:g} to {TABLE_KVP[1]:g} kVp, as the bundled table is, "
+                f"got {self.kvp:g}; model = 'finkelshtein-pavlova' covers 10 to 500"
             )
         low, high = _TABLE_ANGLE_DEG
         if not (math.isfinite(self.anode_deg) and low <= self.anode_deg <= high):

@@ -74,13 +74,16 @@ def preset(
     Raises `InputError` for an unknown name and for an object that the panel cannot cover.
     """
     if name not in MACHINES:
-        raise InputError(f"unknown scanner preset {name!r}: expected one of {', '.join(MACHINES)}")
+        raise InputError(f"preset {name!r} is unknown: expected one of {', '.join(MACHINES)}")
     if not (math.isfinite(object_mm) and object_mm > 0):
         raise InputError(f"object_mm must be positive (mm), got {object_mm}")
     if min(*n_detector, *n_voxel, n_views) < 1:
         raise InputError(f"n_views, n_detector and n_voxel must be at least 1, got {n_views}, {n_detector}, {n_voxel}")
     machine = MACHINES[name]
-    need = [s * MARGIN for s in shadow(machine.dso, machine.dsd, object_mm)]
+    try:
+        need = [s * MARGIN for s in shadow(machine.dso, machine.dsd, object_mm)]
+    except InputError as error:
+        raise InputError(f"preset {name!r}, phantom.size = {object_mm} mm: {error}") from None
     if need[0] > machine.panel[0] or need[1] > machine.panel[1]:
         raise InputError(
             f"preset {name!r}: an object of {object_mm} mm needs {need[0]:.0f} x {need[1]:.0f} mm of panel (v, u), "

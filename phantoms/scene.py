@@ -15,6 +15,7 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.settings import Simulation, Truth
 from ctsim.types import Phantom, Scanner
+from phantoms.messages import explain
 from phantoms.recipes import AnyRecipe, build_recipe
 from phantoms.scanners import REACH, ScannerSettings
 
@@ -40,7 +41,11 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise InputError(f"name must be letters, digits, '.', '_', '-' (it names a folder), got {self.name!r}")
         if not 0 <= self.seed < 2**63:
             raise InputError(f"seed must be within 0 to 2^63 - 1, got {self.seed}")
-        check_geometry(self.resolve().geometry, self.phantom.size, self.truncated)
+        try:
+            scanner = self.resolve()
+        except InputError as error:
+            raise InputError(f"scanner.{error}") from error
+        check_geometry(scanner.geometry, self.phantom.size, self.truncated)
 
     def resolve(self) -> Scanner:
         """Return the scanner with the preset and its overrides worked out."""
@@ -97,7 +102,7 @@ def parse_suite(text: str, where: str = "scene") -> tuple[Scene, ...]:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{where}: not TOML: {error}") from error
-    if "phantom" in data and "scene" not in data:
+    if "scene" not in data and not set(data).isdisjoint(Scene.__struct_fields__):
         return (_decode(data, where, ""),)
     if extra := sorted(set(data) - {"defaults", "scene"}):
         raise InputError(f"{where}: unknown key {extra[0]!r}; expected [defaults] and [[scene]]")
@@ -117,9 +122,7 @@ def _decode(data: dict[str, Any], where: str, prefix: str) -> Scene:
     try:
         return msgspec.convert(_nulls(data), Scene)
     except msgspec.ValidationError as error:
-        message, _, key = str(error).partition(" - at `$")
-        key = (prefix + key.rstrip("`")).lstrip(".")
-        raise InputError(f"{where}: {key + ': ' if key else ''}{message}") from error
+        raise InputError(f"{where}: {explain(error, _nulls(data), Scene, prefix)}") from error
 
 
 def _merge(under: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
@@ -183,10 +186,16 @@ def check_geometry(geometry: Geometry, size: float, truncated: bool) -> None:
 def _check_source(source: NDArray[np.float64], geometry: Geometry, size: float) -> None:
     radius = np.hypot(source[:, 0], source[:, 1])
     if ((radius <= REACH * size / 2) & (np.abs(source[:, 2]) <= REACH * size / 2)).any():
-        raise InputError(f"the source lies inside the object ({size} mm); expected a larger dso or a smaller size")
+        raise InputError(
+            f"phantom.size = {size} mm: the source lies inside the object, whose radius and half height are "
+            f"{REACH * size / 2:.4g} mm; expected a larger dso or a smaller size"
+        )
     box = np.array(geometry.s_voxel[::-1]) / 2
     if (np.abs(source - np.array(geometry.off_origin[::-1])) <= box).all(1).any():
-        raise InputError(f"the source lies inside the reconstructed volume ({geometry.s_voxel} mm, z y x)")
+        raise InputError(
+            f"scanner: the source lies inside the reconstructed volume of {geometry.s_voxel} mm (z, y, x) "
+            f"at off_origin = {geometry.off_origin}; expected a smaller one"
+        )
 
 
 def _shadow(poses: NDArray[np.float64], size: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import re
 from pathlib import Path
 
 import msgspec
@@ -88,6 +89,73 @@ def test_bad_files_are_refused_by_file_key_and_expectation(text: str, words: lis
     assert "\n" not in str(caught.value)
 
 
+RODS = 'recipe = "validation"'
+FULL = (
+    "dsd = 500.0, n_voxel = [8, 8, 8], d_voxel = [7.5, 7.5, 7.5], d_detector = [2.0, 2.0], n_detector = [80, 80], "
+    "n_views = 8"
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "words"),
+    [
+        ('name = "a"', "phantom", ["missing", "recipe", *NAMES]),
+        ('name = "a"\nphantom = {}', "phantom.recipe", ["missing", *NAMES]),
+        (f"phantom = {{ {RODS} }}", "name", ["missing"]),
+        (f'name = "a/b"\nphantom = {{ {RODS} }}', "name", ["letters"]),
+        (f'[[scene]]\nname = "a/b"\nphantom = {{ {RODS} }}', "scene[0].name", ["letters"]),
+        ('name = "a"\nphantom = { recipe = "potato" }', "phantom.recipe", ["potato", *NAMES]),
+        ('name = "a"\nphantom = { recipe = "lungs" }', "phantom.recipe", ["did you mean lung?"]),
+        ('name = "a"\nphantom = { recipe = "lung", vesels = 3 }', "phantom.vesels", ["did you mean vessels?", "size"]),
+        (f'name = "a"\nphantom = {{ {RODS}, metal = "Unobtainium" }}', "phantom.metal", ["Unobtainium", "known: air"]),
+        (MINIMAL + "sede = 1", "sede", ["did you mean seed?", "truth"]),
+        (MINIMAL + 'scanner = { noise = { model = "potato" } }', "scanner.noise.model", ["compound", "tigre", "none"]),
+        (MINIMAL + 'scanner = { preset = "dentl" }', "scanner.preset", ["did you mean dental?", *MACHINES]),
+        (MINIMAL + "scanner = { geometry = { dso = -1.0, " + FULL + " } }", "scanner.geometry.dso", ["0 < dso < dsd"]),
+        (MINIMAL + "scanner = { geometry = { dso = 600.0, " + FULL + " } }", "scanner.geometry.dsd", ["0 < dso < dsd"]),
+        (MINIMAL + "scanner = { geometry = { " + FULL + " } }", "scanner.geometry.dso", ["missing", "number"]),
+        (
+            MINIMAL + "scanner = { geometry = { dso = 20.0, " + FULL + " } }",
+            "phantom.size",
+            ["inside the object", "dso"],
+        ),
+        (MINIMAL + "scanner = { angles_deg = [0, 1], n_views = 3 }", "scanner.angles_deg", ["2 entries"]),
+        (MINIMAL + "scanner = { angles_deg = [0, nan] }", "scanner.angles_deg", ["finite"]),
+        (MINIMAL + "scanner = { n_views = 1000000000 }", "scanner.n_views", ["at most 1000000"]),
+        (MINIMAL + "scanner = { detector = { threshold = -1 } }", "scanner.detector.threshold", ["at least 0"]),
+        (
+            MINIMAL + 'scanner = { detector = { kind = "counting", threshold = 90 } }',
+            "scanner.detector.threshold",
+            ["below tube.kvp"],
+        ),
+        (
+            MINIMAL + 'scanner = { tube = { filters = [{ material = "Al", thickness = -1 }] } }',
+            "scanner.tube.filters[0].thickness",
+            ["at least 0 mm"],
+        ),
+        (
+            MINIMAL + 'scanner = { tube = { filters = [{ material = "Alu", thickness = 1 }] } }',
+            "scanner.tube.filters[0].material",
+            ["did you mean", "Al?"],
+        ),
+        (MINIMAL + "scanner = { tube = { kvp = 12 } }", "scanner.tube.kvp", ["20 to 300"]),
+        (
+            MINIMAL.replace('"validation"', '"lung", size = 600'),
+            "scanner.preset",
+            ["inside the object", "phantom.size"],
+        ),
+        (MINIMAL.replace('"validation"', '"lung", size = 400'), "scanner.preset", ["panel"]),
+    ],
+)
+def test_messages_begin_with_file_and_key_and_say_what_there_is(text: str, key: str, words: list[str]) -> None:
+    with pytest.raises(InputError) as caught:
+        parse_suite(text, "s.toml")
+    assert re.match(rf"s\.toml: {re.escape(key)}( |: )", str(caught.value)), caught.value
+    for word in words:
+        assert word in str(caught.value)
+    assert "did you mean" in "".join(words) or "did you mean" not in str(caught.value)
+
+
 def test_two_scenes_of_one_name_and_missing_files_are_refused(tmp_path: Path) -> None:
     table = '[[scene]]\nname = "a"\nphantom = { recipe = "lung" }\n'
     with pytest.raises(InputError, match="two scenes are named 'a'"):
@@ -146,7 +214,7 @@ def test_presets_cover_the_object_and_refuse_what_is_too_large(name: str) -> Non
     scanner = preset(name, 90, (96, 96), (64, 64, 64), 60.0)
     assert scanner.geometry.s_voxel == pytest.approx((60.0, 60.0, 60.0))
     assert scanner.geometry.fov_radius >= 0.46 * 60
-    assert ScannerSettings(preset=name, n_views=90).resolve(60.0) == scanner
+    assert msgspec.convert({"preset": name, "n_views": 90}, ScannerSettings).resolve(60.0) == scanner
     with pytest.raises(InputError, match="panel"):
         preset(name, 90, (96, 96), (64, 64, 64), 400.0)
 
