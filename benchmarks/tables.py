@@ -4,6 +4,8 @@ Nothing is computed anew. A cell is the mean ± standard deviation over noise se
 shows its status in place of numbers, and its reason below the tables.
 """
 
+import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -114,6 +116,23 @@ def _mean(cells: list[tuple[float | None, str]], k: int, step: int, column: Colu
     return mean, f"{mean:.{column.digits}f}"
 
 
+def merged(texts: Iterable[str]) -> str:
+    """Join texts that differ in numbers only into one with their ranges, others with " / "."""
+    kinds: dict[str, list[list[str]]] = {}
+    for text in texts:
+        kinds.setdefault(_NUMBER.sub("#", text), []).append(_NUMBER.findall(text))
+    out = []
+    for kind, found in kinds.items():
+        pieces = kind.split("#")
+        ranges = [sorted(set(column), key=float) for column in zip(*found, strict=True)]
+        shown = [r[0] if len(r) == 1 else f"{r[0]} to {r[-1]}" for r in ranges]
+        out.append("".join(a + b for a, b in zip(pieces, [*shown, ""], strict=True)))
+    return " / ".join(out)
+
+
+_NUMBER = re.compile(r"\d+\.\d+")
+
+
 def caption(records: list[Record], protocol: str) -> str:
     """State protocol, region, reference, alignment and data range of a table."""
     if protocol == "cost":
@@ -140,7 +159,7 @@ def caption(records: list[Record], protocol: str) -> str:
     for scene, s in found:
         if s.data_range is not None:
             ranges.setdefault(scene, []).append(s.data_range)
-    text = f"Protocol {protocol}: region {score.region}; reference {' / '.join(references)}; alignment {alignment}"
+    text = f"Protocol {protocol}: region {score.region}; reference {merged(references)}; alignment {alignment}"
     if ranges:
         text += "; data range " + ", ".join(f"{_span(v)} ({s})" for s, v in ranges.items()) + " 1/mm"
     return text + "."

@@ -1,7 +1,7 @@
 """Draw the two pictures of the documentation: the frame of `docs/conventions.md` and the README's artefact.
 
 `python -m reports.drawings geometry docs/geometry.svg`
-`python -m reports.drawings artefact DATA/SCENE RESULTS/volumes/SCENE__fdk.tif docs/images/artefact.png`
+`python -m reports.drawings artefact DATA/SCENE docs/images/artefact.png RESULTS/volumes/SCENE__fdk.tif …`
 """
 
 import sys
@@ -88,29 +88,29 @@ def _panel(axes: Axes) -> None:
     axes.axis("off")
 
 
-def artefact(scene: Path, volume: Path, path: Path) -> None:
-    """Draw one slice of a scene through most metal: the reference, a reconstruction, and their difference."""
+def artefact(scene: Path, volumes: list[Path], path: Path) -> None:
+    """Draw one slice of a scene through most metal: the reference and reconstructions named SCENE__METHOD.tif."""
     import tifffile
 
-    from benchmarks.panels import ERROR_SHARE, cut
-    from benchmarks.protocol import tissue_range, truth_of
+    from benchmarks.panels import cut
+    from benchmarks.protocol import truth_of
     from ctsim.store import open_scan
 
     truth = truth_of(open_scan(scene))
     z = cut(truth.metal, truth.body)[0]
     reference = np.asarray(truth.references["effective"][z])
-    found = tifffile.memmap(volume, mode="r")[z]
-    data_range = tissue_range(truth, "effective")
-    figure = Figure(figsize=(9, 3.2), layout="constrained")
-    panels = (("reference", reference), ("FDK", found), ("FDK − reference", found - reference))
-    for axes, (title, image) in zip(figure.subplots(1, 3), panels, strict=True):
-        difference = title.startswith("FDK −")
-        low, high = (-ERROR_SHARE, ERROR_SHARE) if difference else (0.0, 1.2)
-        colours = "RdBu_r" if difference else "gray"
-        shown = axes.imshow(image, cmap=colours, vmin=low * data_range, vmax=high * data_range, origin="lower")
+    top = 2.5 * float(np.median(reference[truth.body[z] & ~truth.metal[z]]))  # a window on tissue
+    figure = Figure(figsize=(2.8 * (1 + len(volumes)) + 0.6, 3.2), layout="constrained")
+    panels = [("reference", reference)]
+    panels += [(v.stem.split("__")[-1].upper(), np.asarray(tifffile.memmap(v, mode="r")[z])) for v in volumes]
+    grid = figure.subplots(1, len(panels), squeeze=False)[0]
+    shown = None
+    for axes, (title, image) in zip(grid, panels, strict=True):
+        shown = axes.imshow(image, cmap="gray", vmin=0.0, vmax=top, origin="lower")
         axes.contour(truth.metal[z], levels=[0.5], colors="#ffb000", linewidths=0.7)
         axes.set(title=title, xticks=[], yticks=[])
-        figure.colorbar(shown, ax=axes, fraction=0.045, pad=0.02, label="1/mm")
+    assert shown is not None
+    figure.colorbar(shown, ax=list(grid), fraction=0.02, pad=0.01, label="1/mm")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
 
@@ -120,10 +120,10 @@ def main(arguments: list[str]) -> None:
     match arguments:
         case ["geometry", path]:
             geometry(Path(path))
-        case ["artefact", scene, volume, path]:
-            artefact(Path(scene), Path(volume), Path(path))
+        case ["artefact", scene, path, *volumes] if volumes:
+            artefact(Path(scene), [Path(v) for v in volumes], Path(path))
         case _:
-            raise InputError("expected: geometry OUT, or artefact SCENE VOLUME OUT")
+            raise InputError("expected: geometry OUT, or artefact SCENE OUT VOLUME…")
 
 
 if __name__ == "__main__":

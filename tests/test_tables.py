@@ -211,3 +211,9 @@ def test_write_makes_three_files(tmp_path):
     assert (tmp_path / "table.md").exists() and (tmp_path / "table.tex").exists()
     with pytest.raises(InputError, match="no records"):
         tables.write([], tmp_path)
+
+
+def test_texts_that_differ_in_numbers_only_are_merged_to_ranges():
+    assert tables.merged(["behind 9.5 mm", "behind 30.25 mm", "behind 12.0 mm"]) == "behind 9.5 to 30.25 mm"
+    assert tables.merged(["50 keV", "behind 1.0 of 2.0", "behind 1.0 of 3.0"]) == "50 keV / behind 1.0 of 2.0 to 3.0"
+    assert tables.merged([]) == ""
