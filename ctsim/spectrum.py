@@ -96,12 +96,12 @@ class Tube(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 class Spectrum:
     """Photon shares `weights` [n] (sum 1) in bins around `energies` [n] (keV, ascending).
 
-    `fluence` is photons per cm2 at 1 m and mAs behind the filters, nan where the model does not know it.
+    `fluence` is photons per cm2 at 1 m and mAs behind the filters, None for "mono", which has no mAs.
     """
 
     energies: NDArray[np.float64]
     weights: NDArray[np.float64]
-    fluence: float = math.nan
+    fluence: float | None = None
 
     def __post_init__(self) -> None:
         e, w = self.energies, self.weights
@@ -158,7 +158,7 @@ def spectrum(tube: Tube) -> Spectrum:
     return _frozen(e[first:], photons[first:] / photons[first:].sum(), total)
 
 
-def _frozen(e: NDArray[np.float64], w: NDArray[np.float64], fluence: float = math.nan) -> Spectrum:
+def _frozen(e: NDArray[np.float64], w: NDArray[np.float64], fluence: float | None = None) -> Spectrum:
     e.flags.writeable = w.flags.writeable = False
     return Spectrum(energies=e, weights=w, fluence=fluence)
 
