@@ -26,12 +26,15 @@ if TYPE_CHECKING:
     from ctsim.types import Scan, Volume
 
 OURS = ("ctsim", "reconstruct", "baselines")
-COUNTS_ONLY, METAL_MASK = "counts only", "metal mask"
+COUNTS_ONLY, METAL_MASK, SPECTRUM = "counts only", "metal mask", "spectrum"
 
 TABLE: dict[str, tuple[str, str]] = {
     "fdk": ("reconstruct.fdk:reconstruct", COUNTS_ONLY),
     "limar": ("baselines.limar:reconstruct", METAL_MASK),
     "nmar": ("baselines.nmar:reconstruct", METAL_MASK),
+    "bhc-poly": ("baselines.bhc:bhc_poly", METAL_MASK),
+    "water-precorrection": ("baselines.known_spectrum:water_precorrection", SPECTRUM),
+    "ibhc": ("baselines.known_spectrum:ibhc", SPECTRUM),
     "sart": ("baselines.sart:sart", COUNTS_ONLY),
     "os-sart": ("baselines.sart:os_sart", COUNTS_ONLY),
     "sirt": ("baselines.sart:sirt", COUNTS_ONLY),
