@@ -14,7 +14,7 @@ from baselines.limar import check, finished, interpolated, uncorrected
 from baselines.metal import Trace, find_metal, reinsert, water_value
 from baselines.morphology import dilate
 from baselines.nmar import PRIORS, RING, tissue_prior
-from baselines.nmar import _choose as choose_prior
+from baselines.nmar import choose_prior as choose_prior
 from ctsim.errors import InputError
 from ctsim.types import Scan, Status, Volume
 from reconstruct.fdk import fdk_stream

@@ -66,7 +66,7 @@ def reconstruct(
     if water <= 0:
         return uncorrected(first, metal)
     candidates = {k: tissue_prior(x, metal, water) for k, x in (("fdk", x_0), ("limar", x_li.numpy()))}
-    chosen, misfit, largest = _choose(scan, trace, candidates, prior, margin)
+    chosen, misfit, largest = choose_prior(scan, trace, candidates, prior, margin)
     columns = np.ascontiguousarray(candidates[chosen].transpose(1, 2, 0))
     filled = Filled()
 
@@ -155,7 +155,7 @@ def tissue_prior(volume: NDArray[np.float32], metal: Metal, water: float) -> NDA
     return out
 
 
-def _choose(
+def choose_prior(
     scan: Scan, trace: Trace, candidates: dict[str, NDArray[np.float32]], prior: str, margin: float
 ) -> tuple[str, dict[str, float], float]:
     """Return the prior to use, the misfit of each around the trace, and its greatest projection, in some views."""

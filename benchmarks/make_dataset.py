@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from ctsim.errors import InputError
+from ctsim.human import human_bytes, human_time
 
 if TYPE_CHECKING:
     from ctsim.plan import Plan
@@ -224,22 +225,6 @@ def spectrum_csv(scanner: "Scanner") -> str:
     signal = signal / signal.sum()
     rows = zip(tube.energies, tube.weights, signal, strict=True)
     return "energy_kev,photon_fraction,signal_fraction\n" + "".join(f"{e:.4f},{w:.8g},{s:.8g}\n" for e, w, s in rows)
-
-
-def human_bytes(size: float) -> str:
-    """Return a size with a decimal unit, such as 113 MB."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if size < 999.5:
-            return f"{size:.3g} {unit}"
-        size /= 1000
-    return f"{size:.3g} TB"
-
-
-def human_time(seconds: float) -> str:
-    """Return a duration in the unit that reads best, such as 41 s or 3.5 h."""
-    if seconds < 99.5:
-        return f"{seconds:.2g} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5970 else f"{seconds / 3600:.1f} h"
 
 
 def _check_space(out: Path, need: int) -> None:

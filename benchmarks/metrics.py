@@ -118,7 +118,7 @@ def surface(mask: Mask) -> Mask:
     """Return the voxels of `mask` that have one of six neighbours outside it."""
     from scipy import ndimage
 
-    return mask & ~ndimage.binary_erosion(mask, border_value=1)
+    return mask & ~np.asarray(ndimage.binary_erosion(mask, border_value=1), np.bool_)
 
 
 def boundary_rms(found: Mask, truth: Mask, d_voxel: tuple[float, float, float]) -> float | None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ctsim.detector import response
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.human import human_bytes, human_time
 from ctsim.materials import attenuation
 from ctsim.project import Response, Tracer
 from ctsim.quadrature import EnergyRule, energy_rule, full_rule
@@ -116,8 +117,8 @@ class Plan:
             "does": does,
             "skips": "; ".join(f"{reason}: {', '.join(names)}" for reason, names in skipped.items()),
             "error": f"{self.error:.0e} (energies){edges}",
-            "takes": f"{self.seconds:.2g} s, {self.disk_bytes / 1e9:.2g} GB on disk, {self.memory_bytes / 1e9:.2g} GB "
-            f"of memory, {self.n_rays / 1e6:.3g} M rays, {self.flops / 1e9:.2g} Gflop",
+            "takes": f"{human_time(self.seconds)}, {human_bytes(self.disk_bytes)} on disk, "
+            f"{human_bytes(self.memory_bytes)} of memory, {self.n_rays / 1e6:.3g} M rays, {self.flops / 1e9:.2g} Gflop",
         }
         return "\n".join(f"  {key:7s} {value}" for key, value in lines.items() if value)
 

@@ -10,8 +10,9 @@ import pytest
 import tifffile
 
 import benchmarks.make_dataset as command
-from benchmarks.make_dataset import human_bytes, human_time, main
+from benchmarks.make_dataset import main
 from ctsim import simulate
+from ctsim.human import human_bytes, human_time
 from ctsim.store import list_scans, open_scan
 from phantoms.scene import load_suite, scene_id
 

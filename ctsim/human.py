@@ -1,0 +1,17 @@
+"""Sizes and times for people."""
+
+
+def human_bytes(size: float) -> str:
+    """Return a size with a decimal unit, such as 113 MB."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if size < 999.5:
+            return f"{size:.3g} {unit}"
+        size /= 1000
+    return f"{size:.3g} TB"
+
+
+def human_time(seconds: float) -> str:
+    """Return a duration in the unit that reads best, such as 41 s or 3.5 h."""
+    if seconds < 99.5:
+        return f"{seconds:.2g} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5970 else f"{seconds / 3600:.1f} h"
