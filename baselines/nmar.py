@@ -4,10 +4,12 @@ Meyer, Raupach, Lell, Schmidt and Kachelriess, Med. Phys. 37, 2010, doi:10.1118/
 by those of a prior, an image of tissue classes, before the metal trace is interpolated, and multiplied again.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.ndimage
+import torch
 from numpy.typing import NDArray
 
 from baselines.inpaint import Filled, fill
@@ -67,8 +69,22 @@ def reconstruct(
         return uncorrected(first, metal)
     candidates = {k: tissue_prior(x, metal, water) for k, x in (("fdk", x_0), ("limar", x_li.numpy()))}
     chosen, misfit, largest = choose_prior(scan, trace, candidates, prior, margin)
-    columns = np.ascontiguousarray(candidates[chosen].transpose(1, 2, 0))
-    filled = Filled()
+    values, filled = normalised(scan, trace, candidates[chosen], lambda *view: rule.fill(*view, largest, interpolation))
+    reinsert(values, x_0, metal, insert)
+    details: dict[str, object] = {"prior": chosen, "water_per_mm": water, "prior_misfit": misfit}
+    details |= {"largest_prior": largest, "view_updates": 3 * scan.geometry.n_views}
+    return finished(values, first, metal, details | filled.details())
+
+
+Bridge = Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], Filled], NDArray[np.float32]]
+
+
+def normalised(scan: Scan, trace: Trace, prior: NDArray[np.float32], bridge: Bridge) -> tuple[torch.Tensor, Filled]:
+    """Return FDK of the projections, their trace bridged with the projections of `prior`, and what was filled.
+
+    `bridge(p, q, trace, filled)` gets the rows [v, u] of a view that hold metal; only those are projected.
+    """
+    columns, filled = np.ascontiguousarray(prior.transpose(1, 2, 0)), Filled()
 
     def read(views: slice) -> NDArray[np.float32]:
         p = line_integrals(scan, views)[0].numpy()
@@ -81,18 +97,10 @@ def reconstruct(
         for k in np.flatnonzero(held.any(1)):
             at = np.flatnonzero(wanted[k])
             rows = slice(at[0], at[-1] + 1)
-            p[k, rows] = rule.fill(p[k, rows], q[k, rows], traces[k, rows], largest, interpolation, filled)
+            p[k, rows] = bridge(p[k, rows], q[k, rows], traces[k, rows], filled)
         return p
 
-    values = fdk_stream(read, scan.geometry)
-    reinsert(values, x_0, metal, insert)
-    details: dict[str, object] = {
-        "prior": chosen,
-        "water_per_mm": water,
-        "prior_misfit": misfit,
-        "largest_prior": largest,
-    }
-    return finished(values, first, metal, details | {"view_updates": 3 * scan.geometry.n_views} | filled.details())
+    return fdk_stream(read, scan.geometry), filled
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,9 +126,9 @@ class Normalise:
         p: NDArray[np.float32],
         q: NDArray[np.float32],
         trace: NDArray[np.bool_],
+        filled: Filled,
         largest: float,
         how: str,
-        filled: Filled,
     ) -> NDArray[np.float32]:
         """Return `p` [v, u] with its trace filled; `largest` is the greatest projection of the prior."""
         floor = self.floor if self.floor is not None else 0.2 if self.kind == "offset" else 0.05
