@@ -4,6 +4,7 @@ Meyer, Raupach, Lell, Schmidt and Kachelriess, Med. Phys. 37, 2010, doi:10.1118/
 by those of a prior, an image of tissue classes, before the metal trace is interpolated, and multiplied again.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -69,7 +70,8 @@ def reconstruct(
         return uncorrected(first, metal)
     candidates = {k: tissue_prior(x, metal, water) for k, x in (("fdk", x_0), ("limar", x_li.numpy()))}
     chosen, misfit, largest = choose_prior(scan, trace, candidates, prior, margin)
-    values, filled = normalised(scan, trace, candidates[chosen], lambda *view: rule.fill(*view, largest, interpolation))
+    bridge = functools.partial(rule.fill, largest=largest, how=interpolation)
+    values, filled = normalised(scan, trace, candidates[chosen], bridge)
     reinsert(values, x_0, metal, insert)
     details: dict[str, object] = {"prior": chosen, "water_per_mm": water, "prior_misfit": misfit}
     details |= {"largest_prior": largest, "view_updates": 3 * scan.geometry.n_views}
