@@ -5,7 +5,7 @@ import pkgutil
 import signal
 import sys
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,22 +13,28 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks import intermediates
+from benchmarks.intermediates import Intermediates
 from benchmarks.records import Cost
 
 if TYPE_CHECKING:
     from benchmarks.methods import Method
 
-_RESULT, _VALUES = "outcome.json", "values.npy"
+_RESULT, _VALUES, _SHOWN = "outcome.json", "values.npy", "intermediates.npz"
 
 
 @dataclass(slots=True, kw_only=True)
 class Outcome:
-    """How a run ended: its status and reason, the volume [z, y, x] float32 in 1/mm if any, and its cost."""
+    """How a run ended: its status and reason, the volume [z, y, x] float32 in 1/mm if any, and its cost.
+
+    `intermediates` are what the method worked with, for pictures (`benchmarks.intermediates`).
+    """
 
     status: str
     reason: str = ""
     values: NDArray[np.float32] | None = None
     cost: Cost | None = None
+    intermediates: Intermediates = field(default_factory=dict)
 
 
 class _Ended(msgspec.Struct, frozen=True, kw_only=True):
@@ -49,6 +55,8 @@ def _work(store: str, folder: str, variant: str, method: "Method", device: str, 
     outcome = attempt(method, scan_for(method, stored, variant), device, warm)
     if outcome.values is not None:
         np.save(Path(out) / _VALUES, outcome.values)
+    if outcome.intermediates:
+        intermediates.write(Path(out) / _SHOWN, outcome.intermediates, "")
     cost = None if outcome.cost is None else msgspec.structs.replace(outcome.cost, isolated=True)
     ended = _Ended(status=outcome.status, reason=outcome.reason, cost=cost)
     (Path(out) / _RESULT).write_bytes(msgspec.json.encode(ended))
@@ -86,4 +94,5 @@ def _collect(out: Path, exit_code: int) -> Outcome:
         return Outcome(status="error", reason=f"the process died with {how}")
     ended = msgspec.json.decode((out / _RESULT).read_bytes(), type=_Ended)
     values = np.load(out / _VALUES) if (out / _VALUES).exists() else None
-    return Outcome(status=ended.status, reason=ended.reason, values=values, cost=ended.cost)
+    shown = intermediates.read(out / _SHOWN, "")
+    return Outcome(status=ended.status, reason=ended.reason, values=values, cost=ended.cost, intermediates=shown)

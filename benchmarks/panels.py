@@ -1,18 +1,53 @@
-"""One picture a scene: reference and every method in one window, and their errors, with the metal's outline."""
+"""One picture a scene: every method's volume in one window, its signed error on one scale, and what it worked with.
 
+Rows are the reference and the methods. Columns are a slice normal to z and one normal to y, their errors against the
+effective-spectrum reference, and, where a method attached them (`benchmarks.intermediates`), the projection that
+it backprojected with the metal's trace, and its prior.
+"""
+
+import textwrap
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 
-from benchmarks.protocol import Stored, Truth, tissue_range, truth_of
-from benchmarks.records import Record, latest
+from benchmarks import intermediates
+from benchmarks.artefact import water_attenuation
+from benchmarks.intermediates import Intermediates
+from benchmarks.protocol import Stored, Truth, truth_of
+from benchmarks.records import OK, Record, latest
+from benchmarks.volumes import identity_of
 
-AXES = ("z", "y", "x")
-ERROR_SHARE = 0.25
-"""Error maps span ± this share of the tissue data range."""
+PLANES = ((0, "z"), (1, "y"))
+TOP, ERROR = 2.5, 1.0
+"""The window ends at 2.5 times the median of the body, errors at once that: for soft tissue 1500 and ± 1000 HU."""
+
+METAL, UNJUDGED = "#ffb000", "#8c8c8c"
+CELL, LABEL, DPI = 1.75, 1.1, 150  # inches, inches, dots an inch
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """What is shown of one method: its name and scores, its volume [z, y, x] in 1/mm, and what it worked with."""
+
+    caption: str
+    volume: NDArray[Any]
+    shown: Intermediates = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """The windows that all rows share, in 1/mm (−ln for `projection`); `water` is μ of water, to print HU."""
+
+    top: float
+    error: float
+    projection: float
+    water: float | None
 
 
 def cut(metal: NDArray[np.bool_], body: NDArray[np.bool_]) -> tuple[int, int, int]:
@@ -29,65 +64,173 @@ def write_panels(records: list[Record], scans: list[Stored], results: Path) -> l
 
     written = []
     for stored in scans:
-        volumes: dict[str, NDArray[np.float32]] = {}
+        rows = []
         for record in latest(records):
-            run = record.run
             path = results / record.volume if record.volume else None
-            mine = run.scan == stored.content_hash and run.variant == "metal" and record.scores
-            if mine and path is not None and path.exists():
-                volumes[_title(record)] = tifffile.memmap(path, mode="r")
-        if volumes:
+            mine = record.run.scan == stored.content_hash and record.run.variant == "metal" and record.scores
+            if mine and path is not None and identity_of(path) == record.identity:
+                shown = intermediates.read(intermediates.path_of(path), record.identity)
+                rows.append(Row(caption=_caption(record), volume=tifffile.memmap(path, mode="r"), shown=shown))
+        if rows:
             path = results / "panels" / f"{stored.name}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
-            draw(stored.name, truth_of(stored), volumes).savefig(path, dpi=110)
+            draw(stored, truth_of(stored), rows).savefig(path, dpi=DPI)
             written.append(path)
     return written
 
 
-def _title(record: Record) -> str:
+def _caption(record: Record) -> str:
+    """Name the method and its scores under `tissue`, as they stand in the tables."""
     values = record.scores["tissue"].values
     psnr, ssim = values["psnr3d"], values["ssim3d"]
-    return f"{record.label}\n{'identical' if psnr is None else f'{psnr:.2f} dB'}, SSIM3D {ssim:.3f}"
+    lines = textwrap.wrap(record.label, 22, break_long_words=False)
+    lines += ["identical" if psnr is None else f"PSNR3D {psnr:.2f} dB", f"SSIM3D {ssim:.3f}"]
+    return "\n".join(lines + ([record.status] if record.status != OK else []))
 
 
-def draw(name: str, truth: Truth, volumes: dict[str, NDArray[Any]]) -> Figure:
-    """Draw slices along z, y and x (columns) of the reference, each volume and its error (rows)."""
-    reference = truth.references["effective"]
-    data_range = tissue_range(truth, "effective")
+def look_of(truth: Truth, measured: NDArray[Any] | None, shadow: NDArray[np.bool_], water: float | None) -> Look:
+    """Choose the windows from the truth and one measured view [v, u], beside the metal's shadow; none from a method."""
+    reference, tissue = truth.references["effective"], truth.body & ~truth.near_metal
+    middle = float(np.median(reference[tissue])) if tissue.any() else float(reference.max())
+    middle = middle if middle > 0 else float(reference.max())
+    clear = measured[~shadow] if measured is not None and not shadow.all() else measured
+    highest = float(np.max(clear)) if clear is not None else 1.0
+    return Look(top=TOP * middle, error=ERROR * middle, projection=max(highest, 1e-3), water=water)
+
+
+def draw(stored: Stored, truth: Truth, rows: list[Row]) -> Figure:
+    """Draw the reference and each row: volumes in one window, errors on one scale, colourbars below."""
+    worked = any(r.shown for r in rows)
+    view = next((int(r.shown["view"]) for r in rows if "view" in r.shown), None)
+    measured, shadow = (None, np.zeros(0, bool)) if view is None else _measured(stored, view)
+    look = look_of(truth, measured, shadow, water_attenuation(stored))
     at = cut(truth.metal, truth.body)
-    rows: list[tuple[str, NDArray[Any], float, float, str]] = [
-        ("reference\neffective spectrum", reference, 0.0, 1.2 * data_range, "gray")
-    ]
-    limit = ERROR_SHARE * data_range
-    for title, volume in volumes.items():
-        rows.append((title, volume, 0.0, 1.2 * data_range, "gray"))
-        rows.append((f"{title.splitlines()[0]}\n− reference", volume - reference, -limit, limit, "RdBu_r"))
-    figure = Figure(figsize=(10, 3.1 * len(rows) + 0.8), layout="constrained")
-    grid = figure.subplots(len(rows), 3, squeeze=False)
-    for i, (title, volume, low, high, colours) in enumerate(rows):
-        for axis in range(3):
-            _slice(grid[i, axis], volume, truth, axis, at[axis], (low, high, colours))
-        grid[i, 0].set_ylabel(title)
-        bar = figure.colorbar(grid[i, 2].images[0], ax=list(grid[i]), fraction=0.03, pad=0.01)
-        bar.set_label("1/mm")
-    for axis in range(3):
-        grid[0, axis].set_title(f"slice normal to {AXES[axis]}, {at[axis]}")
-    figure.suptitle(
-        f"{name} · protocol tissue, data range {data_range:.4g} 1/mm, one window for all · metal outlined", fontsize=10
-    )
+    n_columns, n_rows = 2 * len(PLANES) + 2 * worked, 1 + len(rows)
+    size = (CELL * n_columns + LABEL, CELL * n_rows + 1.1)
+    figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.02, h_pad=0.02, wspace=0.01, hspace=0.01))
+    plan = figure.add_gridspec(n_rows + 1, n_columns, height_ratios=[1] * n_rows + [0.07])
+    grid = np.array([[figure.add_subplot(plan[i, k]) for k in range(n_columns)] for i in range(n_rows)])
+    reference = Row(caption="reference\neffective\nspectrum", volume=truth.references["effective"])
+    for i, row in enumerate([reference, *rows]):
+        _slices(grid[i], row.volume, truth, at, look)
+        grid[i, 0].set_ylabel(row.caption, rotation=0, ha="right", va="center", fontsize=8)
+        if i:
+            _errors(grid[i, len(PLANES) :], row.volume, truth, at, look)
+        if i and worked:
+            _worked(grid[i, -2:], row.shown, truth, at, look)
+    if view is not None and measured is not None:
+        _projection(grid[0, -2], measured, shadow, look)
+        grid[0, -2].set_title(f"measured, view {view}", fontsize=8)
+        grid[0, -2].set_xlabel("as backprojected", fontsize=8)
+    _heads(grid, at, worked)
+    _bars(figure, plan, grid, look)
+    figure.suptitle(_title(stored, truth, look, worked), fontsize=8)
     return figure
 
 
+def _measured(stored: Stored, view: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return −ln(counts/open) of a view, and where the true metal's shadow lies (Joseph's rule), both [v, u]."""
+    from reconstruct.log import line_integrals
+    from reconstruct.projector import forward_columns
+
+    metal = np.ascontiguousarray((np.asarray(stored.metal) > 0).transpose(1, 2, 0), np.float32)
+    return line_integrals(stored.scan, view)[0].numpy(), forward_columns(metal, stored.geometry, [view])[0] > 0
+
+
+def _slices(axes: NDArray[Any], volume: NDArray[Any], truth: Truth, at: tuple[int, int, int], look: Look) -> None:
+    for k, (axis, _) in enumerate(PLANES):
+        _slice(axes[k], np.take(volume, at[axis], axis), truth, axis, at[axis], (0.0, look.top, "gray"))
+
+
+def _errors(axes: NDArray[Any], volume: NDArray[Any], truth: Truth, at: tuple[int, int, int], look: Look) -> None:
+    """Show a volume minus the reference; the metal is not judged, and grey."""
+    for k, (axis, _) in enumerate(PLANES):
+        image, reference, metal = (
+            np.take(v, at[axis], axis) for v in (volume, truth.references["effective"], truth.metal)
+        )
+        error = np.ma.masked_where(metal, image - reference)
+        _slice(axes[k], error, truth, axis, at[axis], (-look.error, look.error, "RdBu_r"))
+
+
 def _slice(
-    axes: Any, volume: NDArray[Any], truth: Truth, axis: int, index: int, look: tuple[float, float, str]
+    axes: Axes, image: NDArray[Any], truth: Truth, axis: int, index: int, look: tuple[float, float, str]
 ) -> None:
     """Show one slice at true proportions, the metal's outline over it; row 0 is at the bottom."""
     low, high, colours = look
     d_v, d_u = (d for a, d in enumerate(truth.d_voxel) if a != axis)
-    image = np.take(volume, index, axis)
     axes.imshow(image, cmap=colours, vmin=low, vmax=high, origin="lower", aspect=d_v / d_u, interpolation="nearest")
-    metal = np.take(truth.metal, index, axis)
-    if metal.any() and not metal.all() and min(metal.shape) >= 2:
-        axes.contour(metal, levels=[0.5], colors="#ffb000", linewidths=0.7)
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set_facecolor(UNJUDGED)
+    _outline(axes, np.take(truth.metal, index, axis))
+    axes.set(xticks=[], yticks=[])
+
+
+def _outline(axes: Axes, mask: NDArray[np.bool_]) -> None:
+    if mask.any() and not mask.all() and min(mask.shape) >= 2:
+        axes.contour(mask, levels=[0.5], colors=METAL, linewidths=0.6)
+
+
+def _projection(axes: Axes, image: NDArray[Any], trace: NDArray[np.bool_], look: Look) -> None:
+    axes.imshow(image, cmap="gray", vmin=0.0, vmax=look.projection, origin="lower", interpolation="nearest")
+    _outline(axes, trace)
+    axes.set(xticks=[], yticks=[])
+
+
+def _worked(axes: NDArray[Any], shown: Intermediates, truth: Truth, at: tuple[int, int, int], look: Look) -> None:
+    """Show the projection that a method backprojected, its trace outlined, and its prior; nothing where it has none."""
+    if "projection" in shown:
+        _projection(axes[0], shown["projection"], shown.get("trace", np.zeros((1, 1), bool)), look)
+    else:
+        axes[0].axis("off")
+    if "prior" in shown:
+        _slice(axes[1], np.take(shown["prior"], at[0], 0), truth, 0, at[0], (0.0, look.top, "gray"))
+    else:
+        axes[1].axis("off")
+
+
+def _heads(grid: NDArray[Any], at: tuple[int, int, int], worked: bool) -> None:
+    """Head the columns; where the reference has nothing to show, its cell holds the head of what follows below."""
+    heads = {len(PLANES) + k: f"error, normal to {name}" for k, (_, name) in enumerate(PLANES)}
+    if worked:
+        heads |= {} if grid[0, -2].images else {2 * len(PLANES): "as backprojected"}
+        heads[2 * len(PLANES) + 1] = f"prior, normal to {PLANES[0][1]}"
+    for k, text in heads.items():
+        grid[0, k].axis("off")
+        grid[0, k].text(0.5, 0.0, text, transform=grid[0, k].transAxes, ha="center", va="bottom", fontsize=8)
+    for k, (axis, name) in enumerate(PLANES):
+        grid[0, k].set_title(f"slice {at[axis]} normal to {name}", fontsize=8)
+
+
+def _bars(figure: Figure, plan: Any, grid: NDArray[Any], look: Look) -> None:
+    """Draw one colourbar under the volumes, one under the errors and one under the projections."""
+    n = len(PLANES)
+    spans = [(grid[0, 0], plan[-1, :n], False), (grid[1, n], plan[-1, n : 2 * n], True)]
+    for axes, place, signed in spans:
+        cell = figure.add_subplot(place)
+        bar = figure.colorbar(axes.images[0], cax=cell, orientation="horizontal", extend="both")
+        bar.ax.tick_params(labelsize=7)
+        bar.set_label(f"{'error' if signed else 'attenuation'} ({'1/mm' if look.water is None else 'HU'})", fontsize=8)
+        if look.water is not None:
+            water, shift = look.water, 0 if signed else 1000
+            step = 500
+            low, high = (1000 * edge / water - shift for edge in bar.mappable.get_clim())
+            ticks = np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step
+            bar.set_ticks(
+                [(t + shift) * water / 1000 for t in ticks],
+                labels=[f"{t:+.0f}".replace("-", "−") if t else "0" for t in ticks],
+            )
+    images = [axes.images[0] for axes in grid[:, 2 * n] if axes.images] if grid.shape[1] > 2 * n else []
+    if images:
+        bar = figure.colorbar(
+            images[0], cax=figure.add_subplot(plan[-1, 2 * n]), orientation="horizontal", extend="max"
+        )
+        bar.ax.tick_params(labelsize=7)
+        bar.set_label("−ln(I/I₀)", fontsize=8)
+
+
+def _title(stored: Stored, truth: Truth, look: Look, worked: bool) -> str:
+    water = "" if look.water is None else f" · water {look.water:.4f} 1/mm"
+    trace = "; in projections its trace" if worked else ""
+    return (
+        f"{stored.name} · protocol tissue: reference effective spectrum behind {truth.l0:.1f} mm of water{water}\n"
+        f"one window and one error scale for all · metal outlined{trace}; grey in the errors: metal, not judged"
+    )

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from benchmarks import artefact, records
+from benchmarks import artefact, intermediates, records
 from benchmarks.host import commit, host, measured
 from benchmarks.isolate import Outcome, run_apart
 from benchmarks.judge import Judge, Twin
@@ -229,20 +229,21 @@ def describe(error: BaseException) -> str:
 def attempt(method: Method, scan: "Scan", device: str, warm_up_seconds: float) -> Outcome:
     """Run a method in this process and turn whatever happens into an outcome."""
     cost: dict[str, Any] = {"device": device, "warm_up": warm_up_seconds}
-    values = None
+    values, shown = None, {}
     with measured() as usage:
         try:
             volume = method.reconstruct(scan, device)
             status, reason = str(volume.status), volume.reason
             values = np.asarray(volume.values.detach().cpu().numpy(), np.float32)
             cost["view_updates"] = int(volume.details.get("view_updates", scan.geometry.n_views))
+            shown = intermediates.taken(volume.details, scan.geometry)
         except MemoryError as error:
             status, reason = "out_of_memory", describe(error)
         except Exception as error:  # a method's failure is a result
             log.debug("method %s failed", method.name, exc_info=True)
             out_of_memory = type(error).__name__ == "OutOfMemoryError"  # torch's, for devices
             status, reason = "out_of_memory" if out_of_memory else "error", describe(error)
-    outcome = Outcome(status=status, reason=reason, values=values)
+    outcome = Outcome(status=status, reason=reason, values=values, intermediates=shown)
     outcome.cost = Cost(wall=usage.wall, cpu=usage.cpu, peak_bytes=usage.peak_bytes, **{"view_updates": 0, **cost})
     return checked(outcome, scan.geometry.n_voxel)
 
@@ -307,6 +308,9 @@ def _record(task: Task, outcome: Outcome, by: tuple[Judge, Twin], results: Path,
     if outcome.values is not None and options.keep_volumes:
         kept = f"volumes/{task.file_name}"
         write_volume(results / kept, outcome.values, run.identity)
+        if outcome.intermediates:
+            beside = intermediates.path_of(results / kept)
+            intermediates.write(beside, outcome.intermediates, run.identity)
     return Record(
         identity=run.identity,
         run=run,

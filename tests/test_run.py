@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import artefact, cli, cli_run, methods, records, run
-from benchmarks.panels import cut, write_panels
+from benchmarks import artefact, cli, cli_run, intermediates, methods, records, run
+from benchmarks.panels import Row, cut, draw, write_panels
+from benchmarks.protocol import truth_of
+from benchmarks.volumes import write_volume
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.types import Scan, Volume
@@ -188,11 +190,78 @@ def test_the_tiny_scan_keeps_slices_and_memory():
     assert small.counts.data_ptr() == scan.counts.data_ptr() and small.counts.stride() == scan.counts.stride()
 
 
+def shows(scan, *, device, entries=("view", "trace", "projection", "prior")):
+    g = scan.geometry
+    trace = np.zeros(g.n_detector, bool)
+    trace[6:9, 7:11] = True
+    found = {"view": 1, "trace": trace, "projection": torch.full(g.n_detector, 0.7), "prior": torch.ones(g.n_voxel)}
+    found["wide"] = np.zeros((3, 3))
+    return Volume(values=good(scan, device=device).values, details={"intermediates": {k: found[k] for k in entries}})
+
+
+def kept(results, record):
+    return intermediates.read(intermediates.path_of(results / record.volume), record.identity)
+
+
+def images(figure):
+    return [axes for axes in figure.axes if axes.images]
+
+
 def test_panels_show_every_kept_volume(tmp_path):
     record = once("good", tmp_path)
     (path,) = write_panels([record], [double(tmp_path)], tmp_path)
     assert path.name == "box.png" and path.stat().st_size > 10_000
     assert cut(np.asarray(double(tmp_path).metal) > 0, np.ones(GEOMETRY.n_voxel, bool)) == (5, 6, 7)
+    write_volume(tmp_path / record.volume, np.zeros(GEOMETRY.n_voxel, np.float32), "another run")
+    assert write_panels([record], [double(tmp_path)], tmp_path) == []
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_what_a_method_worked_with_is_kept_beside_its_volume(tmp_path, isolate):
+    record = once("shows", tmp_path, isolate=isolate)
+    assert record.status == "ok" and record.cost.isolated == isolate
+    found = kept(tmp_path, record)
+    assert found["view"] == 1 and found["trace"].sum() == 12 and found["trace"].dtype == bool
+    assert (found["projection"] == np.float32(0.7)).all() and (found["prior"] == 1).all()
+    assert intermediates.read(tmp_path / "volumes" / "box__test_run_shows.npz", "another run") == {}
+    assert kept(tmp_path, once("good", tmp_path)) == {}
+    (tmp_path / "volumes" / "box__test_run_shows.npz").write_bytes(b"PK damaged")
+    with pytest.raises(InputError, match="cannot be read"):
+        kept(tmp_path, record)
+
+
+def test_panels_hold_what_each_method_gave():
+    stored = double(Path())
+    truth = truth_of(stored)
+    reference = truth.references["effective"]
+    rows = [Row(caption="fdk", volume=reference + np.float32(0.001))]
+    plain = images(draw(stored, truth, rows))
+    # the reference has two slices, the method two and their errors
+    assert len(plain) == 2 + 4
+    error = plain[4].images[0]
+    assert np.ma.allclose(error.get_array(), 0.001, atol=1e-8) and error.get_array().mask.sum() == 4
+    # errors are signed on one scale around 0; the window is 2.5 times the body's 0.02, whatever a method gave
+    clims = np.array([a.images[0].get_clim() for a in plain])
+    assert clims == pytest.approx(np.array([[0, 0.05]] * 4 + [[-0.02, 0.02]] * 2), abs=1e-8)
+    found = intermediates.taken(shows(stored.scan, device="cpu").details, GEOMETRY)
+    all_axes = images(draw(stored, truth, [*rows, Row(caption="nmar", volume=reference, shown=found)]))
+    measured, bridged = (a for a in all_axes if a.images[0].get_array().shape == GEOMETRY.n_detector)
+    assert np.allclose(measured.images[0].get_array(), np.log(2.0), atol=1e-6)  # 1000 counts of 2000
+    assert np.allclose(bridged.images[0].get_array(), 0.7) and len(bridged.collections) == 1  # the trace's outline
+    assert len(all_axes) == 2 + 4 + 4 + 2 + 1
+
+
+@pytest.mark.parametrize(
+    ("entries", "words"),
+    [(("trace",), "needs its 'view'"), (("view", "wide"), "no entry 'wide'")],
+)
+def test_intermediates_that_cannot_be_drawn_are_an_error(tmp_path, entries, words):
+    method = methods.find("test_run:shows", {"entries": entries})
+    outcome = run.attempt(method, double(tmp_path).scan, "cpu", 0.0)
+    assert outcome.status == "error" and words in outcome.reason
+    for wrong in ({"view": 6}, {"view": -1}, {"prior": np.zeros((2, 2, 2))}, {"view": 0, "trace": np.zeros((5, 5))}):
+        with pytest.raises(InputError):
+            intermediates.taken({"intermediates": wrong}, GEOMETRY)
 
 
 def command(monkeypatch, capsys, *arguments):
