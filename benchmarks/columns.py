@@ -36,8 +36,18 @@ COLUMNS: dict[str, dict[str, Column]] = {
         "roi_std": Column("ROI std (HU)", 1, "min"),
         "cupping": Column("excess cupping (points)", 2, "min"),
         "streak": Column("streak (HU)", 1, "min"),
+        "rmse": Column("RMSE (HU)", 1, "min"),
         "rmse_near": Column("RMSE ≤ 5 mm (HU)", 1, "min"),
         "rmse_far": Column("RMSE > 5 mm (HU)", 1, "min"),
+    },
+    "projection": {
+        "noise_free/body": Column("P", 4, "min"),
+        "noise_free/outside": Column("P, outside trace", 4, "min"),
+        "noise_free/trace": Column("P, in trace", 3, "min"),
+        "effective/outside": Column("effective, outside trace", 4, "min"),
+        "effective/trace": Column("effective, in trace", 3, "min"),
+        "50kev/outside": Column("50 keV, outside trace", 4, "min"),
+        "50kev/trace": Column("50 keV, in trace", 3, "min"),
     },
     "against": {
         "over_fdk": Column("over FDK (dB)", 2, "max"),

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.artefact import NO_TWIN, Layout, artefact_score, layout_of
+from benchmarks.projection import HeldOut, held_out, projection_score, with_floor
 from benchmarks.protocol import Score, Stored, Truth, evaluate, truth_of
 
 
@@ -24,16 +25,20 @@ class Judge:
 
     truth: Truth
     layout: Layout
+    views: HeldOut | str
 
     @classmethod
     def of(cls, stored: Stored) -> "Judge":
         """Load a scan's references and choose where its artefacts are measured."""
         truth = truth_of(stored)
-        return cls(truth=truth, layout=layout_of(stored, truth))
+        views = with_floor(held_out(stored), truth)
+        return cls(truth=truth, layout=layout_of(stored, truth), views=views)
 
     def scores(self, values: NDArray[Any], variant: str, twin: Twin) -> dict[str, Score]:
         """Score a volume under every protocol; of the metal-free `variant` only what compares has a meaning."""
         scores = evaluate(values, self.truth, anchor=variant != "metal")
+        if variant == "metal":
+            scores["projection"] = projection_score(values, self.views)
         if variant == "metal" and self.truth.metal.any():
             scores["artefact"] = artefact_score(values, twin.values, self.layout, self.truth, twin.reason)
         return scores

@@ -20,10 +20,11 @@ if TYPE_CHECKING:
     from ctsim.geometry import Geometry
     from ctsim.types import Scan
 
-VERSION = 2
+VERSION = 3
 """Part of every run's identity: a change of the protocol's meaning counts it up.
 
 1: tissue, aligned, paper, metal, cost. 2: every method runs on the metal-free twin too, for `artefact`.
+3: `projection`, and `rmse` of `artefact`.
 """
 
 METAL_MARGIN = 2

@@ -115,7 +115,8 @@ def once(name, results, stored=None, **options):
 def test_a_run_is_scored_timed_kept_and_recorded(tmp_path):
     record = once("good", tmp_path)
     assert record.status == "ok" and record.run.seed == 3 and record.run.params == {"level": 0.018}
-    assert set(record.scores) == {"tissue", "aligned", "aligned_50kev", "paper", "metal", "artefact"}
+    assert set(record.scores) == {"tissue", "aligned", "aligned_50kev", "paper", "metal", "projection", "artefact"}
+    assert "without scene.toml" in record.scores["projection"].note
     assert record.scores["artefact"].note == artefact.NOT_ASKED
     assert set(record.scores["artefact"].values.values()) == {None}
     assert record.cost.view_updates == 12 and record.cost.peak_bytes > 0 and not record.cost.isolated
