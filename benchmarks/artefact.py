@@ -24,7 +24,7 @@ ROI_MARGIN = 2
 MIN_VOXELS = 64
 MAX_PIECES = 32
 BINS = 3
-METRICS = ("roi_std", "cupping", "streak", "rmse_near", "rmse_far")
+METRICS = ("roi_std", "cupping", "streak", "rmse", "rmse_near", "rmse_far")
 REGION = (
     "homogeneous ROIs, lines between metal pieces, and the tissue within 5 mm of the metal and beyond, "
     "all outside the metal dilated by 2 voxels"
@@ -225,6 +225,7 @@ def artefact_score(
         found = {
             **_roi_metrics(values, twin, difference, layout),
             "streak": rms([line_mean(difference, line) for line in layout.lines]),
+            "rmse": _rmse(difference[truth.tissue]),
             "rmse_near": _rmse(difference[layout.near]),
             "rmse_far": _rmse(difference[layout.far]),
         }

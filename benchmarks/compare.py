@@ -13,7 +13,7 @@ ANCHORED = {
     "tissue": ("rmse", "ssim3d"),
     "aligned": ("rmse", "ssim3d"),
     "aligned_50kev": ("rmse", "ssim3d"),
-    "artefact": ("roi_std", "cupping", "streak", "rmse_near", "rmse_far"),
+    "artefact": ("roi_std", "cupping", "streak", "rmse", "rmse_near", "rmse_far"),
 }
 """The metrics that have an anchored score; of `artefact` FDK's error without the metal is 0 by definition."""
 

@@ -66,6 +66,14 @@ def test_a_shift_is_the_same_everywhere():
     assert values["cupping"] == pytest.approx(0, abs=1e-9)
 
 
+def test_the_rmse_is_that_of_near_and_far_together():
+    truth, layout = scene()
+    values = scored(np.where(layout.near, 0.3 * WATER, -0.1 * WATER))
+    near = layout.near.sum() / truth.tissue.sum()
+    assert 0 < near < 1 and (values["rmse_near"], values["rmse_far"]) == pytest.approx((300, 100), rel=1e-9)
+    assert values["rmse"] == pytest.approx(math.sqrt(near * 300**2 + (1 - near) * 100**2), rel=1e-9)
+
+
 def test_a_bar_between_two_pieces_is_a_streak():
     bar = np.zeros(SHAPE)
     bar[15, 18, :] = -0.05 * WATER
@@ -225,7 +233,7 @@ def test_the_std_of_a_checkerboard():
 def test_the_twins_own_texture_does_not_count():
     twin = WATER * (1 + 0.3 * np.random.default_rng(1).standard_normal(SHAPE))
     values = scored(np.zeros(SHAPE), twin=twin)
-    assert [values[m] for m in artefact.METRICS] == [0.0] * 5
+    assert [values[m] for m in artefact.METRICS] == [0.0] * 6
 
 
 def test_thirds_are_by_distance_to_the_rois_outside():
