@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks import peer_rtk
+from benchmarks import peer_rtk, peer_xcist
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.plan import present_materials
@@ -34,7 +34,8 @@ from phantoms.recipes import build_recipe
 from phantoms.scanners import preset
 from reconstruct.fdk import fdk as ours_fdk
 
-OURS, RTK = "ctsim", "itk-rtk"
+OURS, RTK, XCIST = "ctsim", peer_rtk.NAME, peer_xcist.NAME
+PEERS = {RTK: peer_rtk, XCIST: peer_xcist}
 SIZE = 60.0  # edge of the scenes' cube in mm
 FULL, SMALL = 256, 32  # side of grids and detectors
 KEV = np.array([50.0])
@@ -42,12 +43,12 @@ KEV = np.array([50.0])
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setup:
-    """How large the cases are: grid and detector side `n`, counted runs, threads, and whether RTK is there."""
+    """How large the cases are: grid and detector side `n`, counted runs, threads, and which of PEERS are there."""
 
     n: int = 256
     repeats: int = 5
     threads: int = 2
-    rtk: bool = True
+    present: frozenset[str] = frozenset(PEERS)
 
     def views(self, full: int) -> int:
         """Return the number of views, fewer on small grids."""
@@ -93,10 +94,13 @@ def in_turns(
     return {name: (s[0], tuple(s[1:])) for name, s in seconds.items()}
 
 
-def absent(case: str, scene: str) -> Measurement:
-    """Return the row that says that RTK is not there."""
-    reason = "itk-rtk is not installed (pip install 'ctsim[peers]')"
-    return Measurement(case=case, scene=scene, contender=RTK, status="absent", reason=reason)
+def absent(setup: Setup, case: str, scene: str, *peers: str) -> list[Measurement]:
+    """Return the rows that say which of a case's peers are not there, and how to install them."""
+    missing = [name for name in peers if name not in setup.present]
+    return [
+        Measurement(case=case, scene=scene, contender=name, status="absent", reason=PEERS[name].INSTALL)
+        for name in missing
+    ]
 
 
 def relative(p: NDArray, exact: NDArray) -> float:
@@ -130,7 +134,7 @@ def path_scenes(n: int) -> dict[str, Phantom]:
 def paths(setup: Setup) -> list[Measurement]:
     """Case 1: path lengths in all materials at once against Joseph's projector on one material."""
     geometry = setup.scanner(setup.views(90)).geometry
-    rtk = peer_rtk.Rtk(geometry, setup.threads) if setup.rtk else None
+    rtk = peer_rtk.Rtk(geometry, setup.threads) if RTK in setup.present else None
     out = []
     for scene, phantom in path_scenes(setup.n).items():
         contenders: dict[str, Callable[[], object]] = {OURS: partial(_trace_all, Tracer.of(phantom), geometry)}
@@ -141,7 +145,7 @@ def paths(setup: Setup) -> list[Measurement]:
         for name, (first, seconds) in in_turns(contenders, setup.repeats).items():
             timed = {"seconds": seconds, "views": geometry.n_views, "warm_up": first}
             out.append(Measurement(case="paths", scene=scene, contender=name, note=notes[name], **timed))
-        out += [] if setup.rtk else [absent("paths", scene)]
+        out += absent(setup, "paths", scene, RTK)
     return out
 
 
@@ -203,16 +207,21 @@ def exact(setup: Setup) -> list[Measurement]:
         integrals: dict[str, NDArray] = {
             name: _integrals(Tracer.of(p), geometry, weights) for name, p in variants.items()
         }
-        if setup.rtk:
+        volume = attenuation_volume(phantom, geometry, mu)
+        if RTK in setup.present:
             rtk = peer_rtk.Rtk(geometry, setup.threads)
-            integrals[RTK] = rtk.project(rtk.volume(attenuation_volume(phantom, geometry, mu)))
+            integrals[RTK] = rtk.project(rtk.volume(volume))
+        if XCIST in setup.present:
+            one = np.ones(1)
+            integrals[XCIST] = peer_xcist.Xcist(geometry, [volume], one[:, None], KEV, one).project()
         shared = {"case": "exact", "scene": f"{metal} rods in water", "views": geometry.n_views}
         kind = "relative RMS of line integrals"
+        notes = {RTK: "Joseph", XCIST: "distance-driven, which averages over the pixel"}
         out += [
-            Measurement(contender=name, error=relative(p, truth), error_kind=kind, **shared)
+            Measurement(contender=name, error=relative(p, truth), error_kind=kind, note=notes.get(name, ""), **shared)
             for name, p in integrals.items()
         ]
-        out += [] if setup.rtk else [absent("exact", shared["scene"])]
+        out += absent(setup, "exact", shared["scene"], RTK, XCIST)
     return out
 
 
@@ -272,7 +281,7 @@ def fdk(setup: Setup) -> list[Measurement]:
         last[OURS] = ours_fdk(torch.from_numpy(p), geometry).numpy()
 
     contenders: Mapping[str, Callable[[], object]] = {OURS: run_ours}
-    if setup.rtk:
+    if RTK in setup.present:
         rtk = peer_rtk.Rtk(geometry, setup.threads)
         stack = rtk.stack(p)
 
@@ -285,4 +294,4 @@ def fdk(setup: Setup) -> list[Measurement]:
     for name, (first, seconds) in in_turns(contenders, setup.repeats).items():
         error = float(np.sqrt(np.mean((last[name][seen] - truth[seen]) ** 2, dtype=np.float64)))
         out.append(Measurement(contender=name, seconds=seconds, warm_up=first, error=error, **shared))
-    return out + ([] if setup.rtk else [absent("fdk", shared["scene"])])
+    return out + absent(setup, "fdk", shared["scene"], RTK)

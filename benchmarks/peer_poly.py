@@ -8,8 +8,20 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import host, peer_rtk
-from benchmarks.peer_cases import OURS, RTK, SIZE, Measurement, Setup, absent, in_turns, relative, voxelised
+from benchmarks import host, peer_rtk, peer_xcist
+from benchmarks.peer_cases import (
+    OURS,
+    PEERS,
+    RTK,
+    SIZE,
+    XCIST,
+    Measurement,
+    Setup,
+    absent,
+    in_turns,
+    relative,
+    voxelised,
+)
 from ctsim.materials import attenuation
 from ctsim.plan import make_plan
 from ctsim.project import Response, Tracer, transmit
@@ -90,12 +102,9 @@ class Contenders:
     def rtk(self) -> Callable[[], NDArray[np.float32]]:
         """Prepare Joseph's projector on each material's volume share, and 80 bins in NumPy."""
         rtk = peer_rtk.Rtk(self.geometry, self.setup.threads)
-        share = fractions(self.phantom, self.geometry)
-        volumes = [rtk.volume(share[m]) for m in self.phantom.materials[1:]]
-        del share
-        energies, weights = eighty_bins(full_rule(spectrum(self.scanner.tube), self.scanner.detector))
-        mu = np.stack([attenuation(m, energies) for m in self.phantom.materials[1:]], 1).astype(np.float32)
-        w = weights.astype(np.float32)
+        volumes = [rtk.volume(v) for v in self._shares()]
+        _, weights, mu = self._bins()
+        w, mu = weights.astype(np.float32), mu.astype(np.float32)
 
         def run() -> NDArray[np.float32]:
             lengths = np.stack([rtk.project(v) for v in volumes], 1)  # [view, material, v, u]
@@ -104,17 +113,33 @@ class Contenders:
 
         return run
 
+    def xcist(self) -> Callable[[], NDArray[np.float32]]:
+        """Prepare XCIST on each material's volume share, with the same bins and attenuation."""
+        energies, weights, mu = self._bins()
+        return peer_xcist.Xcist(self.geometry, self._shares(), mu, energies, weights).project
+
     def prepare(self, contender: str) -> Callable[[], NDArray[np.float32]]:
         """Prepare a contender by its name in the table."""
-        return self.rtk() if contender == RTK else self.ours(voxels="voxels" in contender)
+        peers = {RTK: self.rtk, XCIST: self.xcist}
+        return peers[contender]() if contender in peers else self.ours(voxels="voxels" in contender)
+
+    def _shares(self) -> list[NDArray[np.float32]]:
+        share = fractions(self.phantom, self.geometry)
+        return [share[m] for m in self.phantom.materials[1:]]
+
+    def _bins(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Energies (keV) and signal shares [bin], attenuation (1/mm) [bin, material]."""
+        energies, weights = eighty_bins(full_rule(spectrum(self.scanner.tube), self.scanner.detector))
+        return energies, weights, np.stack([attenuation(m, energies) for m in self.phantom.materials[1:]], 1)
 
 
-POLY = (f"{OURS}, exact metal in voxels", f"{OURS}, exact solids", RTK)
+POLY = (f"{OURS}, exact metal in voxels", f"{OURS}, exact solids", *PEERS)
 
 NOTES = {
     POLY[0]: "water and bone from voxels, metal exact, sub-rays",
     POLY[1]: "all solids exact, sub-rays",
     RTK: f"Joseph per material, {BINS} bins in NumPy",
+    XCIST: f"distance-driven per material in one thread, {BINS} bins, no oversampling, our attenuation",
 }
 
 
@@ -123,7 +148,7 @@ def poly(setup: Setup) -> list[Measurement]:
     contenders = Contenders(setup)
     n_views = contenders.geometry.n_views
     checked = tuple(round((k + 0.5) * n_views / CHECKED) % n_views for k in range(CHECKED))
-    runs = {name: contenders.prepare(name) for name in POLY if setup.rtk or name != RTK}
+    runs = {name: contenders.prepare(name) for name in POLY if name not in PEERS or name in setup.present}
     timed = in_turns(runs, setup.repeats)
     oracle = measured_pixel(contenders.phantom, contenders.scanner, checked)
     out = []
@@ -143,7 +168,7 @@ def poly(setup: Setup) -> list[Measurement]:
                 note=NOTES[name],
             )
         )
-    return out + ([] if setup.rtk else [absent("poly", "water, bone, Fe")])
+    return out + absent(setup, "poly", "water, bone, Fe", *PEERS)
 
 
 def peak(n: int, threads: int, contender: str) -> int:

@@ -16,6 +16,9 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.interop import Library, angles_to, volume_from, volume_to
 
+NAME = "itk-rtk"
+INSTALL = "itk-rtk is not installed (pip install 'ctsim[peers]')"
+
 
 def version() -> str | None:
     """Return the version of itk-rtk, None where it is not installed."""

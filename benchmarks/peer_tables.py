@@ -1,20 +1,20 @@
 """Records of `run-benchmark peers`, their table, and what they say about the targets."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
 
 import msgspec
 
 from benchmarks.host import Host
-from benchmarks.peer_cases import FULL, OURS, RTK, Measurement
+from benchmarks.peer_cases import FULL, OURS, PEERS, Measurement
 
 MEGA = 1e6
 
 
 class PeerRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One measurement with its provenance; `side` is that of the grids, `rtk` the version of itk-rtk.
+    """One measurement with its provenance; `side` is that of the grids, `rtk` and `xcist` the peers' versions.
 
     `run` is when the command was started: it tells the runs in one file apart.
     """
@@ -22,6 +22,7 @@ class PeerRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     measurement: Measurement
     side: int
     rtk: str
+    xcist: str = "not measured"
     host: Host
     commit: str
     time: str
@@ -29,13 +30,14 @@ class PeerRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
-    """A target: what was measured, the limit it has to stay within, and on which scene."""
+    """A target: what was measured, the limit it has to stay within, on which scene, and against which peer."""
 
     case: str
     scene: str
     quantity: str
     value: float
     limit: float
+    against: str = ""
 
     @property
     def met(self) -> bool:
@@ -78,47 +80,59 @@ def time_ratio(ours: Measurement, theirs: Measurement) -> float:
 
 
 def verdicts(measurements: Sequence[Measurement]) -> list[Verdict]:
-    """Compare with the targets; those that need RTK are left out where it is absent."""
+    """Compare with the targets; those that need a peer are left out where none is there.
+
+    Time is held against the fastest peer and error against the most accurate, be they two.
+    """
     out: list[Verdict] = []
     for m in measurements:
-        peers = [p for p in measurements if (p.case, p.scene, p.contender) == (m.case, m.scene, RTK)]
-        peer = next((p for p in peers if p.status == "ok"), None)
-        if m.status == "ok" and m.contender != RTK:
-            out += _targets(m, peer)
+        peers = [p for p in measurements if (p.case, p.scene) == (m.case, m.scene) and p.contender in PEERS]
+        if m.status == "ok" and m.contender not in PEERS:
+            out += _targets(m, [p for p in peers if p.status == "ok"])
     return out
 
 
-def _targets(m: Measurement, peer: Measurement | None) -> list[Verdict]:
+def _targets(m: Measurement, peers: Sequence[Measurement]) -> list[Verdict]:
     """Return the targets of one measurement of ours."""
-    limits: list[tuple[str, float | None, float]] = []
     who = m.contender.removeprefix(OURS).removeprefix(", ")
-    if m.case == "paths" and peer:
-        limits = [("time / RTK's", time_ratio(m, peer), 0.25)]
+    named = {"case": m.case, "scene": f"{m.scene} ({who})" if who else m.scene}
+    limits: list[tuple[str, float | None, float]] = []
+    out: list[Verdict] = []
+    if m.case == "paths":
+        out = _beside(m, peers, named, time=0.25)
     elif m.case == "exact" and who == "exact solids":
         limits = [("relative RMS", m.error, 1e-4)]
     elif m.case == "paper":
         limits = [("seconds", median(m.seconds), 60.0), ("peak GB", _scaled(m.peak_bytes, 1e9), 2.0)]
-    elif m.case == "fdk" and peer:
+    elif m.case == "fdk":
         # 2 %: what interpolation of the filtered rows may differ by
-        limits = [("time / RTK's", time_ratio(m, peer), 1 / 3), ("RMSE / RTK's", _ratio(m, peer), 1.02)]
+        out = _beside(m, peers, named, time=1 / 3, error=1.02)
     elif m.case == "poly":
         limits = [("peak GB", _scaled(m.peak_bytes, 1e9), 0.5)]
-        if peer:
-            limits += [("time / RTK's", time_ratio(m, peer), 0.2), ("error / RTK's", _ratio(m, peer), 0.2)]
-    scene = f"{m.scene} ({who})" if who else m.scene
-    return [
-        Verdict(case=m.case, scene=scene, quantity=quantity, value=value, limit=limit)
-        for quantity, value, limit in limits
-        if value is not None
-    ]
+        out = _beside(m, peers, named, time=0.2, error=0.2)
+    own = [Verdict(quantity=q, value=value, limit=limit, **named) for q, value, limit in limits if value is not None]
+    return own + out
+
+
+def _beside(
+    m: Measurement, peers: Sequence[Measurement], named: Mapping[str, str], *, time: float, error: float | None = None
+) -> list[Verdict]:
+    """Return the targets relative to the best peer in time, and to the best in error where that has a limit."""
+    out: list[Verdict] = []
+    fastest = min((p for p in peers if p.seconds), key=lambda p: median(p.seconds), default=None)
+    if fastest and m.seconds:
+        ratio = time_ratio(m, fastest)
+        out.append(Verdict(quantity="time ratio", value=ratio, limit=time, against=fastest.contender, **named))
+    errors = {p.contender: p.error for p in peers if p.error}
+    if error is not None and m.error is not None and errors:
+        closest = min(errors, key=errors.__getitem__)
+        ratio = m.error / errors[closest]
+        out.append(Verdict(quantity="error ratio", value=ratio, limit=error, against=closest, **named))
+    return out
 
 
 def _scaled(value: float | None, unit: float) -> float | None:
     return None if value is None else value / unit
-
-
-def _ratio(m: Measurement, peer: Measurement) -> float | None:
-    return m.error / peer.error if m.error is not None and peer.error else None
 
 
 def render(records: Sequence[PeerRecord]) -> str:
@@ -134,12 +148,14 @@ def render(records: Sequence[PeerRecord]) -> str:
             "Grids this small are all overhead: they prove the command, not the speed, and meet or miss no target.",
         ]
     elif found:
-        out += ["", "| case | scene | quantity | reached | target | met |", "|---|---|---|--:|--:|---|"]
-        out += [
-            f"| {v.case} | {v.scene} | {v.quantity} | {v.value:.3g} | ≤ {v.limit:.3g} | {'yes' if v.met else 'NO'} |"
-            for v in found
-        ]
+        out += ["", "| case | scene | quantity | best peer | reached | target | met |", "|---|---|---|---|--:|--:|---|"]
+        out += ["| " + " | ".join(_judged(v)) + " |" for v in found]
     return "\n".join(out) + "\n"
+
+
+def _judged(v: Verdict) -> tuple[str, ...]:
+    met = "yes" if v.met else "NO"
+    return v.case, v.scene, v.quantity, v.against or "–", f"{v.value:.3g}", f"≤ {v.limit:.3g}", met
 
 
 def _cells(m: Measurement) -> tuple[str, ...]:
@@ -167,6 +183,6 @@ def _provenance(record: PeerRecord) -> str:
     return (
         f"{record.time}, commit {record.commit[:12]}{'+changes' if record.commit.endswith('+changes') else ''}, "
         f"{h.cpu}, {h.cores} cores, {h.threads} threads, Python {h.python}, numba {h.versions.get('numba', '?')}, "
-        f"itk-rtk {record.rtk}; grids of side {record.side}. Medians of interleaved runs; "
-        "ratios are medians over pairs."
+        f"itk-rtk {record.rtk}, gecatsim {record.xcist}; grids of side {record.side}. Medians of interleaved runs; "
+        "ratios of time are medians over pairs, each to the peer that is best in that quantity."
     )

@@ -1,4 +1,4 @@
-"""`run-benchmark peers RESULTS`: speed and error side by side with RTK, in one process, in turns.
+"""`run-benchmark peers RESULTS`: speed and error side by side with RTK and XCIST, in one process, in turns.
 
 Records go to RESULTS/peers.jsonl, one line per contender and scene; the table, RESULTS/peers.md, shows the
 last of each, so that cases can be measured one by one.
@@ -26,9 +26,9 @@ NAME = "peers.jsonl"
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Measure speed and error against itk-rtk (pip install 'ctsim[peers]'), on the same threads, in turns.
+    """Measure speed and error against itk-rtk and XCIST (pip install 'ctsim[peers]'), in one process, in turns.
 
-    Without itk-rtk ours is measured alone. The machine should have nothing else to do.
+    Peers that are not installed are left out. The machine should have nothing else to do.
     """
 
     results: tyro.conf.Positional[Path]
@@ -38,7 +38,7 @@ class Arguments:
     case: Annotated[tyro.conf.UseAppendAction[tuple[Case, ...]], tyro.conf.arg(metavar="CASE")] = ()
     """Only this case (paths, exact, paper, fdk, poly); may be given several times (default: all)."""
     threads: int = 2
-    """Threads of every contender."""
+    """Threads of every contender; XCIST's voxelised projector has one."""
     small: tyro.conf.FlagCreatePairsOff[bool] = False
     """Tiny grids that prove the command and say nothing about speed; leaves out the case paper."""
 
@@ -66,14 +66,15 @@ def _measure(given: Arguments, wanted: tuple[Case, ...]) -> "list[PeerRecord]":
     import numba
     import torch
 
-    from benchmarks import host, peer_cases, peer_poly, peer_rtk, peer_tables
+    from benchmarks import host, peer_cases, peer_poly, peer_tables
 
     threads = min(given.threads, numba.get_num_threads())
     numba.set_num_threads(threads)
     torch.set_num_threads(threads)
-    rtk = peer_rtk.version()
+    versions = {name: module.version() for name, module in peer_cases.PEERS.items()}
     side = peer_cases.SMALL if given.small else peer_cases.FULL
-    setup = peer_cases.Setup(n=side, repeats=given.repeats, threads=threads, rtk=rtk is not None)
+    present = frozenset(name for name, version in versions.items() if version)
+    setup = peer_cases.Setup(n=side, repeats=given.repeats, threads=threads, present=present)
     cases = {
         "paths": peer_cases.paths,
         "exact": peer_cases.exact,
@@ -91,7 +92,8 @@ def _measure(given: Arguments, wanted: tuple[Case, ...]) -> "list[PeerRecord]":
             record = peer_tables.PeerRecord(
                 measurement=measurement,
                 side=side,
-                rtk=rtk or "not installed",
+                rtk=versions[peer_cases.RTK] or "not installed",
+                xcist=versions[peer_cases.XCIST] or "not installed",
                 host=host.host(),
                 commit=host.commit(),
                 time=datetime.now(UTC).isoformat(timespec="seconds"),

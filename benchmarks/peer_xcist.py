@@ -1,0 +1,204 @@
+"""XCIST (the PyPI package gecatsim) behind one function: polychromatic P of voxel volumes.
+
+A view goes through XCIST's own stages (gantry, voxelised distance-driven projector, energy-integrating
+detection) with one source point, one sub-view, no noise and no scatter; reading the phantom and the open
+beam are prepared when an `Xcist` is made. Spectrum and attenuation are the caller's, so that P is the same
+quantity as every contender's. Wu et al., Phys. Med. Biol. 67, 2022, doi:10.1088/1361-6560/ac9174.
+"""
+
+import copy
+import ctypes
+import json
+import os
+import tempfile
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib import import_module, metadata
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+
+NAME = "xcist"
+INSTALL = "gecatsim is not installed (pip install 'ctsim[peers]')"
+_MODELS = ("detector", "source", "gantry", "ray_angles", "filters", "flux", "phantom")
+_NEVER = -1  # a view number that no view has: XCIST prepares at its first view and frees its memory at its last
+
+
+def version() -> str | None:
+    """Return the version of gecatsim, None where it is not installed."""
+    try:
+        return metadata.version("gecatsim")
+    except metadata.PackageNotFoundError:
+        return None
+
+
+class Xcist:
+    """XCIST set up for one circular scan, with its phantom loaded.
+
+    `volumes` are volume shares [z, y, x] on the geometry's grid, one a material; `mu` [bin, material] is
+    1/mm, `energies` [bin] keV, `weights` [bin] the shares of the signal of the open beam. The library holds one
+    phantom a process, so that making another `Xcist` ends the one before.
+    Raises InputError for poses, voxels that are not square in x and y, and a detector shifted along u.
+    """
+
+    _loaded: ClassVar["Xcist | None"] = None
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        volumes: Sequence[NDArray[np.float32]],
+        mu: NDArray[np.float64],
+        energies: NDArray[np.float64],
+        weights: NDArray[np.float64],
+    ) -> None:
+        if geometry.poses is not None:
+            raise InputError("XCIST's geometry here is a circular orbit: give angles instead of poses")
+        if geometry.d_voxel[1] != geometry.d_voxel[2]:
+            raise InputError(f"XCIST's voxels are square in x and y, got {geometry.d_voxel[:0:-1]} mm")
+        if geometry.off_detector[1] != 0:
+            raise InputError(f"XCIST turns a detector that is shifted along u, got {geometry.off_detector[1]} mm")
+        table = np.ascontiguousarray(mu, np.float32)
+        if table.shape != (len(energies), len(volumes)):
+            raise InputError(f"mu must be [bin, material], {(len(energies), len(volumes))}, got {table.shape}")
+        if Xcist._loaded is not None:
+            Xcist._loaded.close()
+        self.geometry = geometry
+        with _undisturbed(), tempfile.TemporaryDirectory(prefix="ctsim-xcist-") as folder:
+            package: Any = import_module("gecatsim")
+            self._run_models: Any = import_module("gecatsim.pyfiles.RunModels").RunModels
+            self._project: Any = import_module("gecatsim.pyfiles.C_Projector_Voxelized").C_Projector_Voxelized
+            self._detect: Any = import_module("gecatsim.pyfiles.Detection_EI").Detection_EI
+            self._cfg = package.CatSim().get_current_cfg()
+            ctypes.c_int.in_dll(self._cfg.clib, "PrintReportOutput").value = 0
+            _configure(self._cfg, geometry)
+            self._spectrum(energies, weights)
+            self._cfg.phantom.filename = _write_phantom(Path(folder), geometry, volumes)
+            self._open = self._first_views()
+        Xcist._loaded = self
+        # theirs is from another table of cross-sections, and knows materials by other compositions
+        self._cfg.clib.set_material_info_vox(len(volumes), len(energies), table)
+
+    def project(self) -> NDArray[np.float32]:
+        """Measure all views: P [view, v, u], 0 for the open beam."""
+        if Xcist._loaded is not self:
+            raise InputError("this Xcist is closed: the library holds the phantom of another one")
+        return -np.log(np.stack([self._view(k) for k in range(self.geometry.n_views)]) / self._open)
+
+    def close(self) -> None:
+        """Free the library's phantom."""
+        if Xcist._loaded is self:
+            self._cfg.sim.stopViewId = 0  # it frees after the view that it takes for the last
+            self._view(0)
+            Xcist._loaded = None
+
+    def _spectrum(self, energies: NDArray[np.float64], weights: NDArray[np.float64]) -> None:
+        """Put in photons a bin in such numbers that times energy they are the weights."""
+        cfg, n_pixels = self._cfg, int(np.prod(self.geometry.n_detector))
+        cfg.spec.nEbin = len(energies)
+        cfg.spec.Evec = cfg.sim.Evec = np.asarray(energies, np.float32)
+        cfg.spec.Ivec = np.tile(np.asarray(weights / energies, np.float32), (n_pixels, 1))
+
+    def _first_views(self) -> NDArray[np.float32]:
+        """Run what XCIST does once, with a view of the open beam, which is returned [v, u]; load the phantom."""
+        cfg = self._cfg
+        cfg.sim.startViewId, cfg.sim.stopViewId = 0, _NEVER
+        cfg.sim.isPhantomScan = False
+        cfg.protocol.startAngle = self._angle(0)
+        self._run_models(cfg, 0, 0, _MODELS)
+        cfg.thisSubView = copy.copy(cfg.detFlux)
+        opened = self._image(self._detect(cfg, 0, 0))
+        cfg.sim.isPhantomScan = True
+        self._run_models(cfg, 0, 0, ("phantom",))
+        cfg.sim.startViewId = _NEVER
+        return opened
+
+    def _view(self, k: int) -> NDArray[np.float32]:
+        """Return the signal of one view, [v, u]: the body of XCIST's loop over views, less its files."""
+        cfg = self._cfg
+        cfg.protocol.startAngle = self._angle(k)
+        self._run_models(cfg, k, 0, _MODELS)  # the gantry alone, all else stays
+        cfg.thisSubView = copy.copy(cfg.detFlux)
+        return self._image(self._detect(self._project(cfg, k, 0), k, 0))
+
+    def _angle(self, k: int) -> float:
+        """Return a view's angle in degrees as theirs, from +y counter-clockwise seen from +z."""
+        return float(np.degrees(self.geometry.angles[k])) - 90.0
+
+    def _image(self, cfg: Any) -> NDArray[np.float32]:
+        """Return the view that was detected, [v, u]: theirs runs down columns, and along −u."""
+        n_v, n_u = self.geometry.n_detector
+        return np.asarray(cfg.thisView, np.float32).reshape(n_u, n_v).T[:, ::-1]
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Ignore the warnings of XCIST's start (unclosed files, numpy.matlib), and keep it from changing PATH."""
+    path = os.environ["PATH"]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        os.environ["PATH"] = path
+
+
+def _configure(cfg: Any, geometry: Geometry) -> None:
+    """Set the scanner, the physics and the scan in XCIST's terms."""
+    (n_v, n_u), (d_v, d_u) = geometry.n_detector, geometry.d_detector
+    _assign(
+        cfg.scanner,
+        # a third-generation detector of a single module is flat
+        detectorCallback="Detector_ThirdgenCurved",
+        detectorRowCount=n_v,
+        detectorRowsPerMod=n_v,
+        detectorColCount=n_u,
+        detectorColsPerMod=n_u,
+        detectorRowSize=d_v,
+        detectorColSize=d_u,
+        detectorRowOffset=geometry.off_detector[0] / d_v,
+        detectorColOffset=0.0,
+        detectorPrefilter=[],
+        detectorDepth=1e9,  # absorbs everything, whatever the energy
+        detectionCallback="Detection_EI",
+        detectionGain=1.0,
+        focalspotShape="Uniform",
+        sid=geometry.dso,
+        sdd=geometry.dsd,
+    )
+    samples = ("colSampleCount", "rowSampleCount", "srcXSampleCount", "srcYSampleCount", "viewSampleCount")
+    _assign(cfg.physics, **dict.fromkeys(samples, 1), scatterCallback="")
+    _assign(cfg.protocol, flatFilter=[], bowtie="")
+    _assign(cfg.sim, isOffsetScan=False, subViewCount=1, enableQuantumNoise=0, eNoise=0.0)
+    cfg.time = 0.0  # the gantry stands at startAngle
+
+
+def _assign(target: Any, **values: object) -> None:
+    for name, value in values.items():
+        setattr(target, name, value)
+
+
+def _write_phantom(folder: Path, geometry: Geometry, volumes: Sequence[NDArray[np.float32]]) -> str:
+    """Write volumes as XCIST's voxelised phantom, rows from +y down; return the path of its JSON file."""
+    names = [f"{k}.raw" for k in range(len(volumes))]
+    for name, volume in zip(names, volumes, strict=True):
+        np.ascontiguousarray(volume[:, ::-1], np.float32).tofile(folder / name)
+    phantom: dict[str, object] = {
+        "n_materials": len(volumes),
+        "mat_name": ["water"] * len(volumes),  # any that it knows, since the attenuation is replaced
+        "volumefractionmap_filename": names,
+        "volumefractionmap_datatype": ["float"] * len(volumes),
+    }
+    axes = zip("zyx", ("slices", "rows", "cols"), geometry.n_voxel, geometry.d_voxel, geometry.off_origin, strict=True)
+    for axis, count, n, d, offset in axes:
+        phantom[count] = [n] * len(volumes)
+        phantom[f"{axis}_size"] = [d] * len(volumes)
+        phantom[f"{axis}_offset"] = [(n + 1) / 2 - offset / d] * len(volumes)  # of the isocentre, counted from 1
+    path = folder / "phantom.json"
+    path.write_text(json.dumps(phantom), encoding="utf-8")
+    return str(path)
