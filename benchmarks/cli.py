@@ -5,6 +5,7 @@ Everything heavy is imported after the command line is understood, so that --hel
 
 import importlib
 import os
+import signal
 import sys
 from collections.abc import Callable
 
@@ -28,13 +29,14 @@ def run_benchmark() -> int:
 def guarded(name: str, module: str, arguments: list[str]) -> int:
     """Call `main(arguments) -> int` of a module; say the user's errors in one sentence, exit code 2.
 
-    Ctrl-C ends with 130; what was recorded until then stays. Other exceptions are ours and keep
-    their traceback.
+    Ctrl-C ends with 130, and so does SIGTERM, by which schedulers stop a job; what was recorded until then
+    stays. Other exceptions are ours and keep their traceback.
     """
     import msgspec
 
     from ctsim.errors import InputError
 
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         main: Callable[[list[str]], int] = importlib.import_module(module).main
         return main(arguments)
@@ -49,6 +51,8 @@ def guarded(name: str, module: str, arguments: list[str]) -> int:
     except KeyboardInterrupt:
         print(f"\n{name}: interrupted; what was finished is kept, run the same command to go on", file=sys.stderr)
         return EXIT_INTERRUPTED
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _complain(name: str, sentence: str) -> int:

@@ -74,7 +74,9 @@ def main(arguments: list[str]) -> int:
 def _compute(given: Arguments) -> int:
     """Run what is missing, then render tables and panels from all records, also after Ctrl-C."""
     from benchmarks import records, run
+    from benchmarks.devices import check_device
 
+    check_device(given.device)
     options = run.Options(
         device=given.device,
         isolate=given.isolate,

@@ -1,0 +1,91 @@
+"""How the commands end: by a signal, or at once where the device is not there."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from conftest import SMALLEST
+
+from benchmarks import cli, make_dataset, records
+from benchmarks.devices import check_device
+from ctsim.errors import InputError
+from ctsim.store import list_scans, open_scan
+
+WAITING = """
+import time
+from pathlib import Path
+from reconstruct.fdk import reconstruct as fdk
+
+def reconstruct(scan, *, device):
+    if not Path("go").exists():
+        Path("waiting").touch()
+        time.sleep(60)
+    return fdk(scan, device=device)
+"""
+
+
+def stopped(command, arguments, folder, begun):
+    """Start a command in `folder`, send it SIGTERM once `begun()` is true, and return its exit code and last words."""
+    code = f"import sys; from benchmarks.cli import {command}; sys.argv[0] = '{command}'; sys.exit({command}())"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments)], cwd=folder, stderr=subprocess.PIPE, text=True
+    ) as child:
+        end = time.monotonic() + 60
+        while not begun() and child.poll() is None and time.monotonic() < end:
+            time.sleep(0.005)
+        child.send_signal(signal.SIGTERM)
+        _, said = child.communicate(timeout=60)
+    return child.returncode, said
+
+
+def test_a_terminated_make_dataset_goes_on_to_the_same_bytes(tmp_path):
+    scene, data = tmp_path / "scene.toml", tmp_path / "data"
+    scene.write_text(SMALLEST.replace("n_views = 12", "n_views = 3000"), encoding="utf-8")
+    code, said = stopped("make_dataset", (scene, data), tmp_path, lambda: any(data.glob(".*.partial/*")))
+    assert code == 130 and "interrupted" in said and "Traceback" not in said
+    assert not (data / "index.jsonl").exists()
+    for folder in (data, tmp_path / "undisturbed"):
+        assert make_dataset.main([str(scene), str(folder)]) == 0
+    hashes = {open_scan(list_scans(folder)[0]).content_hash for folder in (data, tmp_path / "undisturbed")}
+    assert len(hashes) == 1
+
+
+@pytest.mark.parametrize("isolate", [(), ("--isolate",)])
+def test_a_terminated_run_benchmark_keeps_its_records_and_goes_on(smallest, tmp_path, isolate, monkeypatch, capsys):
+    (tmp_path / "waiting_method.py").write_text(WAITING, encoding="utf-8")
+    arguments = [smallest, tmp_path / "r", "--method", "fdk", "--method", "waiting_method:reconstruct", *isolate]
+    code, said = stopped("run_benchmark", arguments, tmp_path, (tmp_path / "waiting").exists)
+    assert code == 130 and "interrupted" in said and "Traceback" not in said
+    assert [r.label for r in records.read(tmp_path / "r" / records.NAME)[0]] == ["fdk", "fdk"]  # the twin and the scan
+    (tmp_path / "go").touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["run-benchmark", *map(str, arguments)])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    assert cli.run_benchmark() == 0 and "waiting_method" in capsys.readouterr().out
+    found, torn = records.read(tmp_path / "r" / records.NAME)
+    assert len(found) == 4 and {r.status for r in found} == {"ok"} and torn is None
+
+
+def test_the_signals_handler_is_put_back(smallest, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["run-benchmark", str(smallest), str(tmp_path), "--table"])
+    before = signal.getsignal(signal.SIGTERM)
+    assert cli.run_benchmark() == 2  # there are no records
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize("device", ["cuda:99", "gpu", "meta", "cuda:x", "mps"])
+def test_a_device_that_is_not_there_is_one_sentence_before_any_run(smallest, tmp_path, monkeypatch, capsys, device):
+    monkeypatch.setattr(sys, "argv", ["run-benchmark", str(smallest), str(tmp_path / "r"), "--device", device])
+    assert cli.run_benchmark() == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"run-benchmark: --device {device}") or f"--device '{device}'" in said
+    assert said.count("\n") == 1 and "expected cpu" in said and len(said) < 300
+    assert not (tmp_path / "r").exists()
+
+
+def test_the_cpu_is_always_there():
+    check_device("cpu")
+    with pytest.raises(InputError, match="no such kind"):
+        check_device("abacus")
