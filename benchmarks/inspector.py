@@ -60,33 +60,35 @@ class Convention:
 
 
 BASE = Convention(title="protocol tissue")
+
+
+def _each(name: str, titles: dict[str, Any]) -> tuple[Convention, ...]:
+    """Return the protocol `tissue` with one field changed to each value, under its title."""
+    return tuple(replace(BASE, title=title, **{name: value}) for title, value in titles.items())
+
+
 SINGLE: dict[str, tuple[Convention, ...]] = {
-    "region": (
-        replace(BASE, title="all voxels", region="all"),
-        replace(BASE, title="body with its metal", region="body"),
-        replace(BASE, title="metal only", region="metal"),
-    ),
-    "reference": (replace(BASE, title="50 keV", reference="50kev"),),
-    "range": (
-        replace(BASE, title="max of the whole reference", data_range="max"),
-        replace(BASE, title="max − min of the whole reference", data_range="maxmin"),
-        replace(BASE, title="max of the reconstruction", data_range="found"),
-        replace(BASE, title="1 (peak of a unit volume)", data_range="1"),
-        replace(BASE, title="2 (scikit-image's for floats)", data_range="2"),
+    "region": _each("region", {"all voxels": "all", "body with its metal": "body", "metal only": "metal"}),
+    "reference": _each("reference", {"50 keV": "50kev"}),
+    "range": _each(
+        "data_range",
+        {
+            "max of the whole reference": "max",
+            "max − min of the whole reference": "maxmin",
+            "max of the reconstruction": "found",
+            "1 (peak of a unit volume)": "1",
+            "2 (scikit-image's for floats)": "2",
+        },
     ),
     "alignment": (
-        replace(BASE, title="one gain", alignment="gain"),
-        replace(BASE, title="gain and offset", alignment="gain_offset"),
+        *_each("alignment", {"one gain": "gain", "gain and offset": "gain_offset"}),
         replace(BASE, title="both scaled to [0, 1] by min and max", alignment="minmax", data_range="1"),
     ),
-    "clipping": (
-        replace(BASE, title="negatives set to 0", clip="zero"),
-        replace(BASE, title="to [0, max of the reference]", clip="reference"),
-        replace(BASE, title="to [0, 1] 1/mm", clip="one"),
+    "clipping": _each(
+        "clip", {"negatives set to 0": "zero", "to [0, max of the reference]": "reference", "to [0, 1] 1/mm": "one"}
     ),
-    "window": (
-        replace(BASE, title="Gaussian, zeros beyond the border", window="gauss_zero"),
-        replace(BASE, title="uniform 7³, sample covariance", window="uniform7"),
+    "window": _each(
+        "window", {"Gaussian, zeros beyond the border": "gauss_zero", "uniform 7³, sample covariance": "uniform7"}
     ),
 }
 WHOLE: tuple[Convention, ...] = (
@@ -311,10 +313,12 @@ def _kept(given: Arguments, stored: "Stored") -> tuple[Volume, str]:
 def _made(given: Arguments, stored: "Stored") -> tuple[Volume, str]:
     """Reconstruct the scan."""
     from benchmarks import methods
+    from benchmarks.devices import check_device
     from benchmarks.run import attempt, scan_for
 
     if given.method is None:
         raise InputError("expected a results folder or --method NAME")
+    check_device(given.device)
     method = methods.find(given.method)
     scan = scan_for(method, stored, "metal")
     if reason := method.skip(scan):
