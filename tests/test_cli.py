@@ -42,7 +42,7 @@ def stopped(command, arguments, folder, begun):
 
 def test_a_terminated_make_dataset_goes_on_to_the_same_bytes(tmp_path):
     scene, data = tmp_path / "scene.toml", tmp_path / "data"
-    scene.write_text(SMALLEST.replace("n_views = 12", "n_views = 3000"), encoding="utf-8")
+    scene.write_text(SMALLEST.replace("n_views = 12", "n_views = 200"), encoding="utf-8")
     code, said = stopped("make_dataset", (scene, data), tmp_path, lambda: any(data.glob(".*.partial/*")))
     assert code == 130 and "interrupted" in said and "Traceback" not in said
     assert not (data / "index.jsonl").exists()
