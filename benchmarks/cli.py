@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Callable
 
+OTHERS = {"inspect": "inspector", "peers": "peers", "reproduce": "reproduce"}
 EXIT_USER, EXIT_INTERRUPTED = 2, 130
 
 
@@ -18,11 +19,10 @@ def make_dataset() -> int:
 
 
 def run_benchmark() -> int:
-    """Run `run-benchmark`, `run-benchmark inspect` or `run-benchmark peers`; return the exit code."""
+    """Run `run-benchmark` or one of its subcommands `inspect`, `peers` and `reproduce`; return the exit code."""
     arguments = sys.argv[1:]
-    others = {"inspect": "benchmarks.inspector", "peers": "benchmarks.peers"}
-    if arguments and arguments[0] in others:
-        return guarded(f"run-benchmark {arguments[0]}", others[arguments[0]], arguments[1:])
+    if arguments and arguments[0] in OTHERS:
+        return guarded(f"run-benchmark {arguments[0]}", f"benchmarks.{OTHERS[arguments[0]]}", arguments[1:])
     return guarded("run-benchmark", "benchmarks.cli_run", arguments)
 
 

@@ -25,7 +25,8 @@ class Arguments:
 
     What RESULTS already holds is not run again, unless the data, the method's parameters or its code
     have changed or the run failed. `run-benchmark inspect` shows what a score's conventions are worth,
-    `run-benchmark peers` compares with other libraries.
+    `run-benchmark peers` compares with other libraries, `run-benchmark reproduce` checks what is claimed of FDK,
+    LIMAR and NMAR.
     """
 
     data: tyro.conf.Positional[Path]

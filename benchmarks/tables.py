@@ -206,12 +206,12 @@ def _lines(columns: list[tuple[str, str]], rows: list[list[Any]], protocol: str,
     return lines
 
 
-def render(records: list[Record], form: Format) -> str:
-    """Render all tables as Markdown or LaTeX (booktabs); failures and skips follow with their reasons."""
+def render(records: list[Record], form: Format, protocols: Iterable[str] = tuple(COLUMNS)) -> str:
+    """Render the protocols' tables as Markdown or LaTeX (booktabs); failures and skips follow with their reasons."""
     left_out, records = outdated(records), latest(records)
     table = summary(records)
     parts = []
-    for protocol in COLUMNS:
+    for protocol in protocols:
         columns, rows = _grid(table, protocol, records)
         if not columns:
             continue
