@@ -48,14 +48,16 @@ def test_commands_in_the_pages_are_understood():
     from benchmarks.cli_run import Arguments
     from benchmarks.inspector import Arguments as Inspect
     from benchmarks.make_dataset import Options
+    from benchmarks.reproduce import Arguments as Reproduce
 
     parsed = 0
     for kind, text in (p.values for p in BLOCKS):
         for line in re.split(r"\n|&&", text.replace("\\\n", " ")) if kind == "bash" else ():
             name, *words = shlex.split(line, comments=True) or [""]
             form = {"make-dataset": Options, "run-benchmark": Arguments}.get(name.rpartition("/")[2])
-            if form is Arguments and words[:1] == ["inspect"]:
-                form, words = Inspect, words[1:]
+            others = {"inspect": Inspect, "reproduce": Reproduce}
+            if form is Arguments and words and words[0] in others:
+                form, words = others[words[0]], words[1:]
             if form and words[:1] != ["peers"]:
                 tyro.cli(form, args=words)
                 parsed += 1
