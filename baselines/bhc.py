@@ -10,12 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from baselines.limar import check, finished, interpolated, uncorrected
-from baselines.metal import Trace, find_metal, reinsert, water_value
+from baselines.limar import check_insert, finished, uncorrected
+from baselines.metal import Trace, find_metal, reinsert
 from baselines.morphology import dilate
-from baselines.nmar import PRIORS, RING, tissue_prior
-from baselines.nmar import choose_prior as choose_prior
-from ctsim.errors import InputError
+from baselines.prior import RING, check_prior, choose_prior
 from ctsim.types import Scan, Status, Volume
 from reconstruct.fdk import fdk_stream
 from reconstruct.fdk import reconstruct as fdk
@@ -35,37 +33,29 @@ def bhc_poly(
     device: str = "cpu",
     mask: str = "oracle",
     prior: str = "auto",
-    margin: float = 0.9,
     insert: str = "fdk",
 ) -> Volume:
     """Reconstruct `scan` less a polynomial in metal and tissue length that is fitted to what metal adds to it.
 
-    q are the projections of a tissue prior (`baselines.nmar.tissue_prior`) that has water in place of the metal; how P
+    q are the projections of a tissue prior (`baselines.prior.tissue_prior`) that has water in place of the metal; how P
     of tissue alone bends with q is fitted on a ring around the trace. What P exceeds that by in the trace is
     regressed on `TERMS`, leaving out clamped pixels, and the fit, where it is positive, is subtracted from P.
-    `prior` and `margin` are those of `baselines.nmar.reconstruct`, `mask` and `insert` of
-    `baselines.limar.reconstruct`. Without metal, where the mask is not to be relied on, and where nothing can be
-    fitted, the result is FDK's to the last bit. Raises InputError as LIMAR does.
+    `prior` is that of `baselines.nmar.Settings`, `mask` and `insert` those of `baselines.limar.Bridging`. Without
+    metal, where the mask is not to be relied on, and where nothing can be fitted, the result is FDK's to the last
+    bit. Raises InputError as LIMAR does.
     """
-    check("rows", insert, 0)
-    if prior not in PRIORS:
-        raise InputError(f"prior must be one of {', '.join(PRIORS)}, got {prior!r}")
-    if not 0 < margin < math.inf:
-        raise InputError(f"margin must be positive, got {margin}")
+    check_insert(insert)
+    check_prior(prior)
     first = fdk(scan, device=device)
     x_0 = first.values.numpy()
     metal = find_metal(scan, x_0, mask)
     if first.status is not Status.OK or not metal.found:
         return uncorrected(first, metal)
-    trace, water = Trace(metal, scan.geometry), water_value(x_0)
-    if water <= 0:
+    trace = Trace(metal, scan.geometry)
+    choice = choose_prior(scan, trace, metal, x_0, prior)
+    if choice is None:
         return _left(uncorrected(first, metal), "nothing stands out from air")
-    volumes = {"fdk": x_0}
-    if prior != "fdk":
-        volumes["limar"] = interpolated(scan, trace, "rows")[0].numpy()
-    priors = {name: tissue_prior(x, metal, water) for name, x in volumes.items()}
-    chosen, misfit, _ = choose_prior(scan, trace, priors, prior, margin)
-    fit = _fit(scan, trace, priors[chosen], water)
+    fit = _fit(scan, trace, choice.columns, choice.water)
     if not fit.pixels:
         return _left(uncorrected(first, metal), "no pixel of the trace has a signal")
     negative = 0
@@ -73,7 +63,9 @@ def bhc_poly(
     def read(views: slice) -> Array:
         nonlocal negative
         p = line_integrals(scan, views)[0].numpy()
-        for k, held, metal_length, tissue in _along(fit.columns, water, trace, range(views.start, views.stop)):
+        for k, held, metal_length, tissue in _along(
+            choice.columns, choice.water, trace, range(views.start, views.stop)
+        ):
             added = _terms(metal_length[held], tissue[held]) @ fit.coefficients
             negative += int((added < 0).sum())
             p[k - views.start][held] -= np.maximum(added, 0).astype(np.float32)
@@ -82,24 +74,20 @@ def bhc_poly(
     values = fdk_stream(read, scan.geometry)
     reinsert(values, x_0, metal, insert)
     counted = {
-        "prior": chosen,
-        "prior_misfit": misfit,
         "negative_pixels": negative,
-        "view_updates": (1 + len(volumes)) * scan.geometry.n_views,
+        "view_updates": (2 + choice.view_updates) * scan.geometry.n_views,
     }
-    return finished(values, first, metal, fit.details() | counted)
+    return finished(values, first, metal, fit.details() | choice.details() | counted)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
-    """What metal adds to P, by a prior `columns` [y, x, z] and its value of `water` (1/mm).
+    """What metal adds to P.
 
     `coefficients` are those of `TERMS`; `tissue` those of t and t²; `before` and `after` the RMS of
     what metal adds and of what the fit leaves of it.
     """
 
-    columns: Array
-    water: float
     coefficients: NDArray[np.float64]
     tissue: NDArray[np.float64]
     pixels: int
@@ -109,7 +97,6 @@ class Fit:
     def details(self) -> dict[str, object]:
         """Return what a result says of its fit."""
         return {
-            "water_per_mm": self.water,
             "coefficients": dict(zip(TERMS, self.coefficients.tolist(), strict=True)),
             "tissue_coefficients": self.tissue.tolist(),
             "fitted_pixels": self.pixels,
@@ -118,9 +105,8 @@ class Fit:
         }
 
 
-def _fit(scan: Scan, trace: Trace, prior: Array, water: float) -> Fit:
+def _fit(scan: Scan, trace: Trace, columns: Array, water: float) -> Fit:
     """Fit what metal adds over the trace in some views; what tissue alone gives is fitted on a ring around it."""
-    columns = np.ascontiguousarray(prior.transpose(1, 2, 0))
     n_views = scan.geometry.n_views
     views = np.unique(np.linspace(0, n_views - 1, min(FIT_VIEWS, n_views)).round().astype(int)).tolist()
     around, within = Normal(2), Normal(len(TERMS) + 2)
@@ -137,7 +123,7 @@ def _fit(scan: Scan, trace: Trace, prior: Array, water: float) -> Fit:
     c = off.solve(RIDGE)
     zero = np.zeros(len(TERMS))
     return Fit(
-        columns=columns, water=water, coefficients=c, tissue=alone, pixels=off.n,
+        coefficients=c, tissue=alone, pixels=off.n,
         before=off.misfit(zero), after=off.misfit(c),
     )  # fmt: skip
 

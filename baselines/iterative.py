@@ -10,6 +10,7 @@ import contextvars
 import math
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,12 @@ import torch
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from baselines.beyond import seen_beyond
+from baselines.metal import Trace, auto_mask
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.types import Scan, Status, Volume
+from reconstruct.fdk import reconstruct as fdk
 from reconstruct.log import line_integrals
 from reconstruct.projector import Views, adjoint_columns, forward_columns
 from reconstruct.redundancy import ray_weights
@@ -27,7 +31,7 @@ from reconstruct.redundancy import ray_weights
 Array = NDArray[np.float32]
 OnUpdate = Callable[[int, float, torch.Tensor], None]
 Weights = str | torch.Tensor
-WEIGHTS = ("none", "exp(-p)")
+WEIGHTS = ("none", "trace", "exp(-l)")
 WORST = 1.5  # a relative residual that no fit of pure noise reaches: one view fitted to another's gives √2
 
 _watcher: contextvars.ContextVar[OnUpdate | None] = contextvars.ContextVar("watcher", default=None)
@@ -46,28 +50,48 @@ def watch(on_update: OnUpdate) -> Iterator[None]:
         _watcher.reset(token)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Iterations:
+    """What all iterative methods are given; a method adds its own and may set other defaults.
+
+    `weights` of the rays is "none" (all 1), "trace" (0 in the trace of the metal that `baselines.metal.auto_mask`
+    finds in FDK's volume, else 1), "exp(-l)" (the share of photons that came through a line integral l, hence the
+    inverse variance of l up to a factor), or a tensor [view, v, u] of one's own.
+    """
+
+    iterations: int = 10
+    weights: Weights = "none"
+
+    def __post_init__(self) -> None:
+        check_count("iterations", self.iterations)
+        if isinstance(self.weights, str) and self.weights not in WEIGHTS:
+            raise InputError(f"weights must be one of {', '.join(WEIGHTS)}, got {self.weights!r}")
+
+
 class System:
     """A scan's linear system: data, ray weights, and the projector restricted to the unknowns.
 
-    `data` and `weights` are float32 [view, v, u], `support` is bool [y, x, z]. Counts the views projected
-    and backprojected. `weights` is "none" (all 1), "exp(-p)" (the share of photons that came through, hence
-    the inverse variance of p up to a factor) or a tensor [view, v, u] of one's own.
+    `data`, `weights` and `lengths` of rays through the unknowns (mm) are float32 [view, v, u], `support` is bool
+    [y, x, z]. Counts the views projected
+    and backprojected. `given` are the weights as in `Iterations`.
     """
 
-    def __init__(self, scan: Scan, device: str, weights: Weights = "none") -> None:
+    def __init__(self, scan: Scan, device: str, given: Weights = "none") -> None:
         if torch.device(device).type != "cpu":
             raise InputError(f"the iterative methods run on device 'cpu' only, got {device!r}")
         self.geometry = scan.geometry
         data, clamped = line_integrals(scan, slice(None))
         self.data: Array = data.numpy()
         self.clamped = int(clamped.sum())
-        self.weights = _weights(weights, self.data)
+        self.weights, self.about_weights = _weights(given, scan, self.data)
         self.views_projected = self.views_backprojected = 0
         n_z, n_y, n_x = self.geometry.n_voxel
         self.support = np.ones((n_y, n_x, n_z), np.bool_)
         self.support &= _within_field_of_view(self.geometry)[:, :, None]
         self.support &= self.adjoint(np.ones_like(self.data)) > 0
         self.scale = weighted_norm(self.data, self.weights) or 1.0
+        self.lengths = self.forward(self.support.astype(np.float32))
+        self.beyond = seen_beyond(self.data, self.lengths, self.geometry, scan.i0, _radius(self.geometry))
 
     def empty(self) -> Array:
         """Return the volume that all methods start from."""
@@ -125,13 +149,13 @@ def finish(system: System, course: Course, x: Array, **details: Any) -> Volume:
     if not finite:
         values = np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
     residual = system.residual(x) if finite else math.inf
-    reason = course.reason
+    reason, beyond = course.reason, system.beyond.sentence
     if not reason and not residual <= 1 + 1e-3:
         reason = f"the final data residual is {residual:.3g}, an empty volume's 1"
     return Volume(
         values=torch.from_numpy(values),
         status=Status.DIVERGED if reason else Status.OK,
-        reason=reason,
+        reason="; ".join(filter(None, (reason, beyond, str(system.about_weights.get("mask_reason", ""))))),
         details={
             "view_updates": course.view_updates,
             "residual": residual if finite else None,
@@ -139,6 +163,8 @@ def finish(system: System, course: Course, x: Array, **details: Any) -> Volume:
             "views_projected": system.views_projected,
             "views_backprojected": system.views_backprojected,
             "clamped_pixels": system.clamped,
+            **system.beyond.details(),
+            **system.about_weights,
             **details,
         },
     )
@@ -190,20 +216,31 @@ def _dot_by_row(a, b, weights, sums):
         sums[row] = total
 
 
-def _weights(given: Weights, data: Array) -> Array:
+def _weights(given: Weights, scan: Scan, data: Array) -> tuple[Array, dict[str, object]]:
+    """Return the weights and what a result says of them."""
     if isinstance(given, torch.Tensor):
         weights = np.array(given.detach().cpu().numpy(), np.float32)
         if weights.shape != data.shape or not np.isfinite(weights).all() or weights.min() < 0 or weights.max() == 0:
             raise InputError(f"weights must be {data.shape}, finite, not negative and not all zero")
-        return weights
-    if given not in WEIGHTS:
-        raise InputError(f"weights must be one of {', '.join(WEIGHTS)}, got {given!r}")
-    return np.ones_like(data) if given == "none" else np.exp(-np.maximum(data, 0), dtype=np.float32)
+        return weights, {}
+    if given == "exp(-l)":
+        return np.exp(-np.maximum(data, 0), dtype=np.float32), {}
+    weights, about = np.ones_like(data), {}
+    if given == "trace":
+        metal = auto_mask(fdk(scan).values.numpy())
+        about = metal.details()
+        if metal.found:
+            trace = Trace(metal, scan.geometry)
+            for view in range(scan.geometry.n_views):
+                weights[view][trace.view(view)] = 0
+    return weights, about
 
 
 def _within_field_of_view(geometry: Geometry) -> NDArray[np.bool_]:
     """Mark the voxel columns [y, x] that FDK reconstructs as well; with poses given, all of them."""
     _, y, x = geometry.voxel_centres()
-    if geometry.poses is not None:
-        return np.ones((y.size, x.size), np.bool_)
-    return np.add.outer(y**2, x**2) <= ray_weights(geometry).radius ** 2
+    return np.add.outer(y**2, x**2) <= _radius(geometry) ** 2
+
+
+def _radius(geometry: Geometry) -> float:
+    return math.inf if geometry.poses is not None else ray_weights(geometry).radius

@@ -18,7 +18,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from baselines.metal import auto_mask, water_value
-from baselines.nmar import BONE, LUNG
+from baselines.prior import BONE, LUNG
 from ctsim.detector import Detector
 from ctsim.errors import InputError
 from ctsim.materials import E_MIN, attenuation, material

@@ -1,28 +1,37 @@
 """Conjugate gradients on the weighted normal equations Aᵀ W A x = Aᵀ W p (CGLS)."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
-from baselines.iterative import Course, System, Weights, check_count, finish, weighted_dot, weighted_norm
+from baselines.iterative import Course, Iterations, System, finish, weighted_dot, weighted_norm
+from baselines.settings import keywords
 from ctsim.types import Scan, Volume
 
 
-def cgls(scan: Scan, *, device: str = "cpu", iterations: int = 15, weights: Weights = "none") -> Volume:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cgls(Iterations):
+    """As `Iterations`."""
+
+    iterations: int = 15
+
+
+@keywords(Cgls)
+def cgls(scan: Scan, settings: Cgls, device: str) -> Volume:
     """Reconstruct by CGLS; stopping early is the only regularisation, and values may be negative.
 
-    Hestenes and Stiefel, J. Res. Natl. Bur. Stand. 49, 1952, doi:10.6028/jres.049.044. Ends before
-    `iterations` where rounding lets the residual fall no more. `weights` as in `baselines.iterative.System`.
-    Raises InputError for wrong parameters and another device than the CPU.
+    Hestenes and Stiefel, J. Res. Natl. Bur. Stand. 49, 1952, doi:10.6028/jres.049.044. Ends before `iterations` where
+    rounding lets the residual fall no more. Keywords are those of `Cgls`. Raises InputError for wrong parameters
+    and another device than the CPU.
     """
-    check_count("iterations", iterations)
-    system, course = System(scan, device, weights), Course()
+    system, course = System(scan, device, settings.weights), Course()
     x, lacking, steps = system.empty(), system.data.copy(), []
     ones = np.ones_like(x)
     gradient = system.adjoint(lacking * system.weights)
     square, direction = weighted_dot(gradient, gradient, ones), gradient.copy()
     last = weighted_norm(lacking, system.weights)
-    for _ in range(iterations):
+    for _ in range(settings.iterations):
         image = system.forward(direction)
         length = weighted_dot(image, image, system.weights)
         if not length > 0 or not math.isfinite(length):

@@ -4,12 +4,15 @@ Kalender, Hebel and Ebersberger, Radiology 164, 1987, doi:10.1148/radiology.164.
 cut out of the projections and bridged, the rest is reconstructed, the metal is put back.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from baselines.inpaint import FILLS, Filled, fill
 from baselines.metal import INSERTS, Metal, Trace, find_metal, reinsert
+from baselines.settings import keywords
 from ctsim.errors import InputError
 from ctsim.types import Scan, Status, Volume
 from reconstruct.fdk import fdk_stream
@@ -17,40 +20,50 @@ from reconstruct.fdk import reconstruct as fdk
 from reconstruct.log import line_integrals
 
 
-def reconstruct(
-    scan: Scan,
-    *,
-    device: str = "cpu",
-    mask: str = "oracle",
-    interpolation: str = "rows",
-    insert: str = "fdk",
-    dilation: int = 0,
-) -> Volume:
-    """Reconstruct `scan` with the metal trace interpolated.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bridging:
+    """Where the metal is, how its trace is bridged, and how it comes back.
 
     `mask` is "oracle", "auto" or a TIFF file (`baselines.metal.find_metal`); `interpolation` "rows" or "harmonic"
     (`baselines.inpaint.fill`); `insert` "fdk", "mean" or "none" (`baselines.metal.reinsert`); `dilation` widens the
-    trace by so many pixels. Without metal, or where the mask is not to be relied on, the result is FDK's to the last
-    bit and nothing is projected. Raises InputError as these do, and as FDK does.
+    trace by so many pixels, None by as many as the mask's edge may be off (`baselines.metal.reach`).
     """
-    check(interpolation, insert, dilation)
+
+    mask: str = "oracle"
+    interpolation: str = "rows"
+    insert: str = "fdk"
+    dilation: int | None = None
+
+    def __post_init__(self) -> None:
+        check_insert(self.insert)
+        if self.interpolation not in FILLS:
+            raise InputError(f"interpolation must be one of {', '.join(FILLS)}, got {self.interpolation!r}")
+        if self.dilation is not None and self.dilation < 0:
+            raise InputError(f"dilation must be 0 or more pixels, got {self.dilation}")
+
+
+@keywords(Bridging)
+def reconstruct(scan: Scan, settings: Bridging, device: str) -> Volume:
+    """Reconstruct `scan` with the metal trace interpolated; keywords are those of `Bridging`.
+
+    Without metal, or where the mask is not to be relied on, the result is FDK's to the last bit and nothing is
+    projected. Raises InputError as `find_metal` and FDK do, and for settings that are not there.
+    """
     first = fdk(scan, device=device)
-    metal = find_metal(scan, first.values.numpy(), mask)
+    metal = find_metal(scan, first.values.numpy(), settings.mask)
     if first.status is not Status.OK or not metal.found:
         return uncorrected(first, metal)
-    values, filled = interpolated(scan, Trace(metal, scan.geometry, dilation), interpolation)
-    reinsert(values, first.values.numpy(), metal, insert)
-    return finished(values, first, metal, {"view_updates": 2 * scan.geometry.n_views, **filled.details()})
+    trace = Trace(metal, scan.geometry, settings.dilation)
+    values, filled = interpolated(scan, trace, settings.interpolation)
+    reinsert(values, first.values.numpy(), metal, settings.insert)
+    details: dict[str, object] = {"view_updates": 2 * scan.geometry.n_views, "dilation": trace.dilation}
+    return finished(values, first, metal, details | filled.details())
 
 
-def check(interpolation: str, insert: str, dilation: int) -> None:
-    """Refuse settings before an hour is spent; raises InputError."""
-    if interpolation not in FILLS:
-        raise InputError(f"interpolation must be one of {', '.join(FILLS)}, got {interpolation!r}")
+def check_insert(insert: str) -> None:
+    """Raise InputError unless `insert` is a way to put metal back."""
     if insert not in INSERTS:
         raise InputError(f"insert must be one of {', '.join(INSERTS)}, got {insert!r}")
-    if dilation < 0:
-        raise InputError(f"dilation must be 0 or more pixels, got {dilation}")
 
 
 def interpolated(scan: Scan, trace: Trace, how: str) -> tuple[torch.Tensor, Filled]:

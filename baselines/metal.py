@@ -1,5 +1,6 @@
 """Where the metal is: masks in the volume, and the trace that they leave in the projections."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -133,11 +134,25 @@ def water_value(volume: NDArray[np.float32]) -> float:
     return float((edges[at] + edges[at + 1]) / 2)
 
 
-class Trace:
-    """The mask's shadow: for every view the pixels whose central ray crosses 0.05 voxels of metal or more."""
+def reach(geometry: Geometry) -> int:
+    """Return how many pixels beyond a mask's shadow metal may still be seen.
 
-    def __init__(self, metal: Metal, geometry: Geometry, dilation: int = 0) -> None:
-        self.geometry, self.dilation = geometry, dilation
+    A voxel belongs to the mask from half its volume on, so metal ends up to half a voxel beyond, and a pixel
+    averages over its own width: half a voxel, magnified, and half a pixel, rounded.
+    """
+    voxel = max(geometry.d_voxel) * geometry.dsd / geometry.dso
+    return math.floor(0.5 * voxel / min(geometry.d_detector) + 1.0)
+
+
+class Trace:
+    """The mask's shadow: for every view the pixels whose central ray crosses 0.05 voxels of metal or more.
+
+    It is widened by `dilation` pixels (None: `reach`). Without, what the mask's edge leaves of the metal made two
+    thirds to all of the error on iron.
+    """
+
+    def __init__(self, metal: Metal, geometry: Geometry, dilation: int | None = None) -> None:
+        self.geometry, self.dilation = geometry, reach(geometry) if dilation is None else dilation
         self.tracer = Tracer.of(
             Phantom(
                 labels=metal.mask.astype(np.uint8),

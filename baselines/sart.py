@@ -7,6 +7,7 @@ Imaging 6, 1984, doi:10.1177/016173468400600107; ordered subsets: Hudson and Lar
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
@@ -14,77 +15,83 @@ from numba import njit, prange
 from baselines.iterative import (
     Array,
     Course,
+    Iterations,
     System,
-    Weights,
     check_count,
     check_positive,
     finish,
     visiting_order,
     weighted_dot,
 )
+from baselines.settings import keywords
 from ctsim.types import Scan, Volume
 
 CACHE_BYTES = 1 << 30  # voxel sums of the subsets are kept up to this size, else made anew on each visit
 
 
-def sart(
-    scan: Scan,
-    *,
-    device: str = "cpu",
-    iterations: int = 10,
-    relaxation: float = 0.5,
-    weights: Weights = "none",
-    positivity: bool = True,
-) -> Volume:
-    """Reconstruct by SART: `iterations` passes over the views, one view at a time.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sart(Iterations):
+    """`iterations` are passes over all views; `relaxation` is λ; `positivity` cuts negative values to zero."""
 
-    `weights` as in `baselines.iterative.System`. Details hold view updates, residuals (by pass, each view's
-    taken before its update, and that of the result) and step sizes. Raises InputError for wrong parameters
-    and another device than the CPU.
+    relaxation: float = 0.5
+    positivity: bool = True
+
+    def __post_init__(self) -> None:
+        Iterations.__post_init__(self)
+        check_positive("relaxation", self.relaxation)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OsSart(Sart):
+    """As `Sart`, with the views in `subsets` interleaved subsets (at most one a view)."""
+
+    relaxation: float = 1.0
+    subsets: int = 20
+
+    def __post_init__(self) -> None:
+        Sart.__post_init__(self)
+        check_count("subsets", self.subsets)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sirt(Sart):
+    """As `Sart`."""
+
+    iterations: int = 100
+    relaxation: float = 1.9
+
+
+@keywords(Sart)
+def sart(scan: Scan, settings: Sart, device: str) -> Volume:
+    """Reconstruct by SART, one view at a time; keywords are those of `Sart`.
+
+    Details hold view updates, residuals (by pass, each view's taken before its update, and that of the result) and
+    step sizes. The reason says where the object goes on beyond the grid or the detector. Raises InputError for wrong
+    parameters and another device than the CPU.
     """
-    return _run(scan, device, iterations, scan.geometry.n_views, relaxation, weights, positivity)
+    return _run(scan, device, settings, scan.geometry.n_views)
 
 
-def os_sart(
-    scan: Scan,
-    *,
-    device: str = "cpu",
-    iterations: int = 10,
-    subsets: int = 20,
-    relaxation: float = 1.0,
-    weights: Weights = "none",
-    positivity: bool = True,
-) -> Volume:
-    """Reconstruct by OS-SART: as `sart`, with the views in `subsets` interleaved subsets (at most one a view)."""
-    check_count("subsets", subsets)
-    return _run(scan, device, iterations, min(subsets, scan.geometry.n_views), relaxation, weights, positivity)
+@keywords(OsSart)
+def os_sart(scan: Scan, settings: OsSart, device: str) -> Volume:
+    """Reconstruct by OS-SART: as `sart`, a subset of the views at a time; keywords are those of `OsSart`."""
+    return _run(scan, device, settings, min(settings.subsets, scan.geometry.n_views))
 
 
-def sirt(
-    scan: Scan,
-    *,
-    device: str = "cpu",
-    iterations: int = 100,
-    relaxation: float = 1.9,
-    weights: Weights = "none",
-    positivity: bool = True,
-) -> Volume:
+@keywords(Sirt)
+def sirt(scan: Scan, settings: Sirt, device: str) -> Volume:
     """Reconstruct by SIRT: as `sart`, with all views at once; the residual in the norm W M falls in each iteration."""
-    return _run(scan, device, iterations, 1, relaxation, weights, positivity)
+    return _run(scan, device, settings, 1)
 
 
-def _run(
-    scan: Scan, device: str, iterations: int, subsets: int, relaxation: float, weights: Weights, positivity: bool
-) -> Volume:
-    check_count("iterations", iterations)
-    check_positive("relaxation", relaxation)
-    system, course = System(scan, device, weights), Course()
+def _run(scan: Scan, device: str, settings: Sart, subsets: int) -> Volume:
+    system, course = System(scan, device, settings.weights), Course()
     passes, x = Passes(system, subsets), system.empty()
-    for _ in range(iterations):
-        residual = passes.run(x, relaxation, positivity)
+    for _ in range(settings.iterations):
+        residual = passes.run(x, settings.relaxation, settings.positivity)
         if not course.note(x, scan.geometry.n_views, residual):
             break
-    return finish(system, course, x, subsets=subsets, step_sizes=[relaxation] * len(course.residuals))
+    return finish(system, course, x, subsets=subsets, step_sizes=[settings.relaxation] * len(course.residuals))
 
 
 class Passes:
@@ -94,7 +101,7 @@ class Passes:
         self.system = system
         n_views = system.geometry.n_views
         self.subsets = [np.arange(first, n_views, subsets) for first in visiting_order(subsets)]
-        sums = system.forward(system.support.astype(np.float32))
+        sums = system.lengths
         # A ray that meets less than half a voxel says next to nothing of it, and would be divided by little.
         met = sums > 0.5 * min(system.geometry.d_voxel)
         self.weights = system.weights * met

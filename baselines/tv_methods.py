@@ -1,12 +1,14 @@
 """Reconstruction with total variation: FISTA-TV, ASD-POCS and AwPCSD."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from baselines.iterative import (
     Array,
     Course,
+    Iterations,
     System,
     Weights,
     check_count,
@@ -16,6 +18,7 @@ from baselines.iterative import (
     weighted_norm,
 )
 from baselines.sart import Passes
+from baselines.settings import keywords
 from baselines.tv import Denoiser, axis_ratios, descend, total_variation
 from ctsim.errors import InputError
 from ctsim.types import Scan, Volume
@@ -27,40 +30,80 @@ LARGEST_RATIO = 0.95
 OPPOSED = -0.99
 
 
-def fista_tv(
-    scan: Scan,
-    *,
-    device: str = "cpu",
-    iterations: int = 50,
-    tv: float = 0.002,
-    tv_iterations: int = 20,
-    weights: Weights = "none",
-    positivity: bool = True,
-) -> Volume:
-    """Minimise ½‖A x − p‖²_W + τ TV(x) by FISTA.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FistaTv(Iterations):
+    """`tv` is how large ripples a step flattens, in units of the mean attenuation; `tv_iterations` denoise in each."""
+
+    iterations: int = 50
+    tv: float = 0.002
+    tv_iterations: int = 20
+    positivity: bool = True
+
+    def __post_init__(self) -> None:
+        Iterations.__post_init__(self)
+        check_count("tv_iterations", self.tv_iterations)
+        if not (math.isfinite(self.tv) and self.tv >= 0):
+            raise InputError(f"tv must not be negative, got {self.tv!r}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Descent(Iterations):
+    """SART passes in turn with `tv_steps` steps down TV, each of `alpha` of the first pass's change at first."""
+
+    tv_steps: int = 20
+    alpha: float = 0.02
+
+    def __post_init__(self) -> None:
+        Iterations.__post_init__(self)
+        check_count("tv_steps", self.tv_steps)
+        check_positive("alpha", self.alpha)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AsdPocs(Descent):
+    """As `Descent`; `epsilon` is the relative residual to keep to, None that of photon noise."""
+
+    epsilon: float | None = None
+
+    def __post_init__(self) -> None:
+        Descent.__post_init__(self)
+        if self.epsilon is not None:
+            check_positive("epsilon", self.epsilon)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AwPcsd(Descent):
+    """As `Descent`; `delta`, in units of the mean attenuation, the step between voxels from which an edge is spared."""
+
+    delta: float = 0.25
+
+    def __post_init__(self) -> None:
+        Descent.__post_init__(self)
+        check_positive("delta", self.delta)
+
+
+@keywords(FistaTv)
+def fista_tv(scan: Scan, settings: FistaTv, device: str) -> Volume:
+    """Minimise ½‖A x − p‖²_W + τ TV(x) by FISTA; keywords are those of `FistaTv`.
 
     Beck and Teboulle, SIAM J. Imaging Sci. 2, 2009, doi:10.1137/080716542, with their denoiser as proximal map.
     The step is 1/L with a proven bound L of ‖Aᵀ W A‖; τ is `tv` · L · the mean attenuation (of the uniform volume
     that fits best), so a step flattens ripples of about `tv` of that. Details hold step sizes, τ and the TV
     reached. Raises InputError for wrong parameters and another device than the CPU.
     """
-    check_count("iterations", iterations)
-    check_count("tv_iterations", tv_iterations)
-    if not (math.isfinite(tv) and tv >= 0):
-        raise InputError(f"tv must not be negative, got {tv!r}")
-    system, course = System(scan, device, weights), Course()
+    system, course = System(scan, device, settings.weights), Course()
     ratios = axis_ratios(scan.geometry)
     largest, mean = _largest_curvature(system)
-    denoiser = Denoiser(system.support, ratios, positivity)
+    denoiser = Denoiser(system.support, ratios, settings.positivity)
     x = ahead = system.empty()
     image = image_ahead = np.zeros_like(system.data)
     t = 1.0
-    for _ in range(iterations):
+    for _ in range(settings.iterations):
         lacking = (system.data - image_ahead) * system.weights
         moved = system.adjoint(lacking)
         moved *= np.float32(1 / largest)
         moved += ahead
-        after = denoiser.run(moved, tv * abs(mean), tv_iterations)
+        after = denoiser.run(moved, settings.tv * abs(mean), settings.tv_iterations)
         # A is linear, so the image of the point ahead needs no projection of its own.
         image_after = system.forward(after)
         t, t_before = (1 + math.sqrt(1 + 4 * t * t)) / 2, t
@@ -71,41 +114,32 @@ def fista_tv(
         residual = weighted_norm(image - system.data, system.weights) / system.scale
         if not course.note(x, scan.geometry.n_views, residual):
             break
-    details = {"tau": tv * abs(mean) * largest, "tv": total_variation(x, ratios)}
+    details = {"tau": settings.tv * abs(mean) * largest, "tv": total_variation(x, ratios)}
     return finish(system, course, x, step_sizes=[1 / largest] * len(course.residuals), **details)
 
 
-def asd_pocs(
-    scan: Scan,
-    *,
-    device: str = "cpu",
-    iterations: int = 10,
-    tv_steps: int = 20,
-    alpha: float = 0.02,
-    epsilon: float | None = None,
-    weights: Weights = "none",
-) -> Volume:
+@keywords(AsdPocs)
+def asd_pocs(scan: Scan, settings: AsdPocs, device: str) -> Volume:
     """Lower TV subject to ‖A x − p‖_W ≤ ε ‖p‖_W and x ≥ 0, by SART passes and steepest descent in turn.
 
     Adaptive steepest descent, Sidky and Pan, Phys. Med. Biol. 53, 2008, doi:10.1088/0031-9155/53/17/021, with
-    SART for ART. `alpha` is the first TV step in units of the first pass's change; steps shrink while TV moves
-    the volume more than the data do and the residual is above `epsilon` (None: that of photon noise). Ends early
-    where the two moves oppose each other at a residual below. Raises InputError as `fista_tv`.
+    SART for ART. TV steps shrink while TV moves the volume more than the data do and the residual is above ε. Ends
+    early where the two moves oppose each other at a residual below. Keywords are those of `AsdPocs`. Raises
+    InputError as `fista_tv`.
     """
-    system, course, passes = _begin(scan, device, weights, (iterations, tv_steps), alpha)
-    aim = _photon_noise(scan, system) if epsilon is None else epsilon
-    check_positive("epsilon", aim)
+    system, course, passes = _begin(scan, device, settings.weights)
+    aim = _photon_noise(scan, system) if settings.epsilon is None else settings.epsilon
     ratios, x, ones = axis_ratios(scan.geometry), system.empty(), np.ones(system.support.shape, np.float32)
     relaxation, length, steps = 1.0, 0.0, []
-    for k in range(iterations if aim < 1 else 0):  # else the empty volume is the answer
+    for k in range(settings.iterations if aim < 1 else 0):  # else the empty volume is the answer
         before = x.copy()
         passes.run(x, relaxation, True)
         by_data = x - before
         moved, residual = weighted_norm(by_data, ones), system.residual(x)
         if k == 0:
-            length = alpha * moved
+            length = settings.alpha * moved
         before = x.copy()
-        descend(x, length, tv_steps, ratios)
+        descend(x, length, settings.tv_steps, ratios)
         x *= system.support
         steps.append(length)
         if not course.note(x, scan.geometry.n_views, residual):
@@ -121,41 +155,31 @@ def asd_pocs(
     return finish(system, course, x, step_sizes=steps, epsilon=aim, tv=total_variation(x, ratios))
 
 
-def awpcsd(
-    scan: Scan,
-    *,
-    device: str = "cpu",
-    iterations: int = 10,
-    tv_steps: int = 20,
-    alpha: float = 0.02,
-    delta: float = 0.25,
-    weights: Weights = "none",
-) -> Volume:
+@keywords(AwPcsd)
+def awpcsd(scan: Scan, settings: AwPcsd, device: str) -> Volume:
     """Lower adaptive-weighted TV with steps that follow the data residual, between SART passes.
 
     Projection-controlled steepest descent, Lohvithee, Biguri and Soleimani, Phys. Med. Biol. 62, 2017,
     doi:10.1088/1361-6560/aa93d3: the TV step is `alpha` · the first pass's change, times the residual before a
-    pass over that after the first; passes stop while the residual is below photon noise. `delta`, in units of
-    the mean attenuation, is the difference between voxels above which an edge is spared. Raises InputError as
-    `fista_tv`.
+    pass over that after the first; passes stop while the residual is below photon noise. Keywords are those of
+    `AwPcsd`. Raises InputError as `fista_tv`.
     """
-    check_positive("delta", delta)
-    system, course, passes = _begin(scan, device, weights, (iterations, tv_steps), alpha)
+    system, course, passes = _begin(scan, device, settings.weights)
     aim, ratios, x = _photon_noise(scan, system), axis_ratios(scan.geometry), system.empty()
-    edge = delta * max(abs(_mean_attenuation(system)), 1e-30)
+    edge = settings.delta * max(abs(_mean_attenuation(system)), 1e-30)
     ones = np.ones_like(x)
     relaxation, first_residual, first_step, steps = 1.0, 1.0, 0.0, []
     residual = 1.0
-    for k in range(iterations if aim < 1 else 0):  # else the empty volume is the answer
+    for k in range(settings.iterations if aim < 1 else 0):  # else the empty volume is the answer
         before, updates = x.copy(), 0
         if residual > aim:
             passes.run(x, relaxation, True)
             updates = scan.geometry.n_views
         if k == 0:
-            first_residual, first_step = system.residual(x), alpha * weighted_norm(x - before, ones)
+            first_residual, first_step = system.residual(x), settings.alpha * weighted_norm(x - before, ones)
         length = first_step * (1.0 if k == 0 else residual / max(first_residual, 1e-30))
         by_data, before = x - before, x.copy()
-        descend(x, length, tv_steps, ratios, edge)
+        descend(x, length, settings.tv_steps, ratios, edge)
         x *= system.support
         np.maximum(x, 0, out=x)
         residual = system.residual(x)
@@ -168,12 +192,7 @@ def awpcsd(
     return finish(system, course, x, step_sizes=steps, epsilon=aim, tv=total_variation(x, ratios))
 
 
-def _begin(
-    scan: Scan, device: str, weights: Weights, counts: tuple[int, int], alpha: float
-) -> tuple[System, Course, Passes]:
-    check_count("iterations", counts[0])
-    check_count("tv_steps", counts[1])
-    check_positive("alpha", alpha)
+def _begin(scan: Scan, device: str, weights: Weights) -> tuple[System, Course, Passes]:
     system, course = System(scan, device, weights), Course()
     return system, course, Passes(system, scan.geometry.n_views)
 
@@ -200,7 +219,7 @@ def _largest_curvature(system: System, steps: int = 3) -> tuple[float, float]:
 
 
 def _mean_attenuation(system: System) -> float:
-    return _fitted(system, system.forward(system.support.astype(np.float32)))
+    return _fitted(system, system.lengths)
 
 
 def _fitted(system: System, image: Array) -> float:

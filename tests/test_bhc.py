@@ -223,7 +223,6 @@ def test_a_named_metal_is_a_material_of_its_own(starving):
         ("bhc-poly", {"mask": "somewhere.tif"}, "no file somewhere.tif"),
         ("bhc-poly", {"insert": "gold"}, "insert must be one of"),
         ("bhc-poly", {"prior": "x"}, "prior must be one of"),
-        ("bhc-poly", {"margin": 0.0}, "margin must be positive"),
         ("ibhc", {"iterations": 0}, "iterations must be within"),
         ("ibhc", {"bone": "bonne"}, "bone: "),
         ("ibhc", {"bone": ""}, "bone: "),

@@ -139,7 +139,7 @@ def matrix(geometry):
     return np.stack(columns, 1)
 
 
-@pytest.mark.parametrize("weights", ["none", "exp(-p)"])
+@pytest.mark.parametrize("weights", ["none", "exp(-l)"])
 @pytest.mark.parametrize("iterations", [1, 2, 5, 8])
 def test_cgls_equals_lsqr(weights, iterations):
     scan = tiny()
@@ -224,7 +224,7 @@ def transposed(field, ratios):
         for k in range(n - 1):
             at = np.take(field[axis], k, axis) * ratios[axis]
             for place, sign in ((k, -1), (k + 1, 1)):
-                where = [slice(None)] * 3
+                where: list[int | slice] = [slice(None)] * 3
                 where[axis] = place
                 found[tuple(where)] += sign * at
     return found
@@ -305,7 +305,7 @@ def test_weightless_rays_change_nothing():
 def test_named_weights():
     scan = tiny()
     data = torch.from_numpy(System(scan, "cpu").data)
-    by_name, by_hand = (os_sart(scan, weights=w).values for w in ("exp(-p)", torch.exp(-data.clamp(min=0))))
+    by_name, by_hand = (os_sart(scan, weights=w).values for w in ("exp(-l)", torch.exp(-data.clamp(min=0))))
     torch.testing.assert_close(by_name, by_hand, rtol=0, atol=2e-6)  # two exponentials, values up to 1
 
 
@@ -373,6 +373,45 @@ def test_tilted_poses_and_shifted_detectors():
         assert values[distance() < RADIUS - 2].mean() == pytest.approx(MU, rel=0.005)
 
 
+def cut(**changes):
+    """Sentence and details of a method on the sphere, with another grid or detector."""
+    volume = os_sart(sphere(msgspec.structs.replace(GEOMETRY, **changes)), iterations=1, subsets=4)
+    assert volume.status is Status.OK
+    return volume.reason, volume.details
+
+
+def test_what_goes_on_beyond_the_grid_or_the_detector_is_said():
+    reason, details = cut()
+    assert not reason and details["attenuated_rays_beyond"] == 0 and details["attenuated_edges"] == {}
+    # the sphere's centre lies at (1, −2, 0.5) mm and its radius is 10: 14 mm wide, the grid cuts it on all sides
+    reason, details = cut(n_voxel=(28, 14, 14))
+    assert "rays miss the reconstruction grid" in reason and details["attenuated_rays_beyond"] > 100
+    # 16 pixels of 2 mm at magnification 2 hold 8 mm to either side of the axis, in u and then in v
+    reason, details = cut(n_detector=(36, 16))
+    assert "wrong towards the border" in reason and set(details["attenuated_edges"]) == {"first column", "last column"}
+    reason, details = cut(n_detector=(16, 38), n_voxel=(12, 29, 31))
+    assert set(details["attenuated_edges"]) == {"first row", "last row"}
+    # the same detector with a grid that no ray leaves upwards: what is measured is explained where it arose
+    assert not cut(n_detector=(16, 38))[0]
+
+
+def test_weights_by_trace_leave_out_the_shadow_of_metal():
+    """A ball of metal in the sphere: only its shadow has no weight."""
+    inner, r = 3.0, distance()
+    truth = np.where(r < inner, 40 * MU, np.where(r < RADIUS, MU, 0)).astype(np.float32)
+    scan = scan_of(forward(torch.from_numpy(truth), GEOMETRY), GEOMETRY)
+    system = System(scan, "cpu", "trace")
+    shadow = forward(torch.from_numpy((r < inner).astype(np.float32)), GEOMETRY).numpy()
+    assert system.about_weights["mask_status"] == "ok"
+    assert set(np.unique(system.weights)) == {0, 1}
+    assert (system.weights[shadow > 1] == 0).all()
+    # the trace is wider than the ball by a pixel for its edge, and by what half of FDK's peak adds
+    wide = forward(torch.from_numpy((r < inner + 2.5).astype(np.float32)), GEOMETRY).numpy()
+    assert (system.weights[wide == 0] == 1).all()
+    volume = cgls(sphere(), iterations=1, weights="trace")  # nothing but water: no trace, and it is said
+    assert "times water" in volume.reason and volume.details["mask_status"] == "mask_unreliable"
+
+
 def test_visiting_order_visits_all_once_and_jumps():
     for n in (1, 2, 3, 12, 20, 60, 97):
         order = visiting_order(n)
@@ -388,7 +427,7 @@ def test_visiting_order_visits_all_once_and_jumps():
         (lambda scan: sart(scan, iterations=1.5), "iterations"),
         (lambda scan: os_sart(scan, subsets=0), "subsets"),
         (lambda scan: sirt(scan, relaxation=-1), "relaxation"),
-        (lambda scan: cgls(scan, weights="trace"), "exp"),
+        (lambda scan: cgls(scan, weights="exp(-p)"), "exp"),
         (lambda scan: cgls(scan, weights=torch.ones(2, 2)), "weights"),
         (lambda scan: fista_tv(scan, tv=-1), "tv"),
         (lambda scan: asd_pocs(scan, alpha=float("nan")), "alpha"),

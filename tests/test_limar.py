@@ -9,7 +9,10 @@ import torch
 
 from baselines import limar, nmar
 from baselines.inpaint import Filled, fill, harmonic
-from baselines.metal import Metal, Trace, auto_mask, find_metal, reinsert, water_value
+from baselines.metal import Metal, Trace, auto_mask, find_metal, reach, reinsert, water_value
+from baselines.morphology import dilate
+from baselines.prior import tissue_prior
+from benchmarks.methods import find
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.noise import Noise
@@ -67,7 +70,7 @@ def iron():
 def tissue_error(volume, twin, scan):
     """RMS difference from FDK of the metal-free twin, away from the metal, in the unit of the volume."""
     z = slice(4, 10)
-    far = ~np.asarray(nmar.dilate(scan.metal.numpy() != 0, 2))[z]
+    far = ~np.asarray(dilate(scan.metal.numpy() != 0, 2))[z]
     return float(np.sqrt(np.mean((volume.values.numpy() - twin.values.numpy())[z][far] ** 2)))
 
 
@@ -89,6 +92,7 @@ def test_without_metal_the_result_is_fdk_to_the_last_bit_and_nothing_is_projecte
     first = fdk(bare)
     monkeypatch.setattr("baselines.metal.Tracer.background", None)
     monkeypatch.setattr("baselines.nmar.forward_columns", None)
+    monkeypatch.setattr("baselines.prior.forward_columns", None)
     volume = METHODS[name](bare, mask=mask)
     assert torch.equal(volume.values, first.values) and not volume.details["corrected"]
     # bone is the densest there is: the automatic mask finds it, and says that it is not to be relied on
@@ -111,7 +115,7 @@ def test_only_rows_that_hold_metal_are_touched(iron):
     scan, _ = iron
     metal = find_metal(scan, fdk(scan).values.numpy(), "oracle")
     short = dataclasses.replace(metal, mask=metal.mask & (np.arange(14) < 4)[:, None, None])
-    trace = Trace(short, scan.geometry)
+    trace = Trace(short, scan.geometry, dilation=0)
     seen = np.stack([trace.view(k) for k in range(scan.geometry.n_views)])
     assert seen.any() and not seen[:, 14:].any()
     values, filled = limar.interpolated(scan, trace, "rows")
@@ -155,13 +159,45 @@ def test_the_automatic_mask_finds_iron(iron):
 def test_the_trace_is_where_the_mask_has_length(iron):
     scan, _ = iron
     metal = Metal(mask=scan.metal.numpy() != 0, source="oracle")
-    trace = Trace(metal, scan.geometry)
+    trace = Trace(metal, scan.geometry, dilation=0)
     phantom = Phantom(labels=metal.mask.astype(np.uint8), materials=("air", "Fe"), d_voxel=GEOMETRY.d_voxel)
     for view in (0, 17):
         length = path_lengths(Tracer.of(phantom), scan.geometry, view)[1]
         assert np.array_equal(trace.view(view), length > 0.05 * np.prod(GEOMETRY.d_voxel) ** (1 / 3))
         wide = Trace(metal, scan.geometry, dilation=1).view(view)
         assert wide.sum() > trace.view(view).sum() and wide[trace.view(view)].all()
+
+
+def test_metal_that_the_mask_leaves_out_is_within_reach(iron):
+    """With the metal-free readings put into the trace, what is left is the metal that the trace does not cover."""
+    scan, bare = iron
+    first, twin = fdk(scan), fdk(bare)
+    metal = find_metal(scan, first.values.numpy(), "oracle")
+
+    def left(dilation):
+        trace = Trace(metal, scan.geometry, dilation)
+        held = torch.from_numpy(np.stack([trace.view(k) for k in range(scan.geometry.n_views)]))
+        mended = dataclasses.replace(scan, counts=torch.where(held, bare.counts, scan.counts))
+        return tissue_error(fdk(mended), twin, scan)
+
+    # rods of 3 voxels across, of which the mask leaves out up to half a voxel all around
+    assert left(None) < 0.02 * tissue_error(first, twin, scan) < 0.1 * left(0)
+
+
+def test_the_reach_grows_with_the_pixels_that_a_voxel_covers():
+    # half a voxel is 1.5 mm on the detector, 0.75 of its pixels: with half a pixel 1.25; then 3.0, and 0.65
+    assert reach(GEOMETRY) == 1
+    assert reach(msgspec.structs.replace(GEOMETRY, d_detector=(0.6, 0.6))) == 3
+    assert reach(msgspec.structs.replace(GEOMETRY, d_detector=(10.0, 10.0))) == 1
+
+
+def test_voxels_that_hold_blurred_metal_do_not_pass_for_bone(iron):
+    scan, _ = iron
+    values = fdk(scan).values.numpy()
+    metal, water = find_metal(scan, values, "oracle"), water_value(values)
+    skin = dilate(metal.mask, 1, corners=True)
+    assert values[skin & ~metal.mask].max() > 1.5 * water
+    assert (tissue_prior(values, metal, water)[skin] == np.float32(water)).all()
 
 
 HARD = {
@@ -226,6 +262,16 @@ def test_wrong_settings_are_refused_by_name(iron, name, setting, words):
     for wrong, said in (({"prior": "x"}, "prior"), ({"floor": 0.0}, "floor"), ({"normalisation": "x"}, "normalis")):
         with pytest.raises(InputError, match=said):
             nmar.reconstruct(iron[0], **wrong)
+
+
+def test_settings_are_set_by_name_and_carry_their_defaults():
+    assert find("limar").params == {"mask": "oracle", "interpolation": "rows", "insert": "fdk", "dilation": None}
+    method = find("nmar", {"normalisation": "ratio", "mask": "auto"})
+    assert method.params == {
+        **find("limar").params, "mask": "auto", "prior": "auto", "normalisation": "ratio", "floor": None,
+    }  # fmt: skip
+    with pytest.raises(InputError, match="no parameter 'margin': expected one of mask, interp"):
+        find("nmar", {"margin": 0.9})
 
 
 def test_a_mask_file_serves_as_well_as_the_oracle(iron, tmp_path):

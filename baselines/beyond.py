@@ -1,0 +1,64 @@
+"""Whether the object goes on where the unknowns end: beyond the detector's edge or the reconstruction grid.
+
+Iterative methods explain all of a ray's attenuation within the grid and the field of view. What lies beyond is
+then put into voxels that do not hold it, and the residual need not show it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.geometry import Geometry
+
+SIGMAS, LEAST = 5.0, 0.02  # a ray is attenuated above so many standard deviations of photon noise, and above this
+SHARE = 1e-3  # of a side's pixels; a tenth of that, of all rays, where they miss the grid
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Beyond:
+    """Attenuated rays that miss all unknowns, and the attenuated pixels by the detector's edge.
+
+    `sides` holds only the edges where the object leaves what is reconstructed.
+    """
+
+    missing: int
+    sides: dict[str, int]
+
+    @property
+    def sentence(self) -> str:
+        """What is wrong, or nothing."""
+        parts = [f"{self.missing} attenuated rays miss the reconstruction grid"] if self.missing else []
+        parts += [f"the object reaches over the detector's {' and '.join(self.sides)}"] if self.sides else []
+        return f"{' and '.join(parts)}, so values are wrong towards the border" if parts else ""
+
+    def details(self) -> dict[str, object]:
+        """Return the counts for a result's details."""
+        return {"attenuated_rays_beyond": self.missing, "attenuated_edges": dict(self.sides)}
+
+
+def seen_beyond(
+    data: NDArray[np.float32], lengths: NDArray[np.float32], geometry: Geometry, i0: float, radius: float
+) -> Beyond:
+    """Count attenuated rays beyond the unknowns.
+
+    `data` are the line integrals [view, v, u], `lengths` those through the unknowns in mm, `radius` of the field of
+    view in mm. The first and last row count where rays leave the grid upwards or downwards at all.
+    """
+    lit = data > np.maximum(LEAST, SIGMAS * np.sqrt(np.exp(np.maximum(data, 0)) / np.float32(i0)))
+    missing = int((lit & (lengths == 0)).sum())
+    edges = {"first column": lit[:, :, 0], "last column": lit[:, :, -1]}
+    if _leaves_through_the_ends(geometry, radius):
+        edges |= {"first row": lit[:, 0], "last row": lit[:, -1]}
+    return Beyond(
+        missing=missing if missing > 0.1 * SHARE * data.size else 0,
+        sides={name: int(edge.sum()) for name, edge in edges.items() if edge.sum() > SHARE * edge.size},
+    )
+
+
+def _leaves_through_the_ends(geometry: Geometry, radius: float) -> bool:
+    if geometry.poses is not None:
+        return True
+    n_v, d_v = geometry.n_detector[0], geometry.d_detector[0]
+    highest = (n_v / 2 * d_v + abs(geometry.off_detector[0])) * (geometry.dso + radius) / geometry.dsd
+    return highest > geometry.n_voxel[0] / 2 * geometry.d_voxel[0] - abs(geometry.off_origin[0])

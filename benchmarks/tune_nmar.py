@@ -1,0 +1,105 @@
+"""How well NMAR chooses its prior, and what the trace's margin is worth: `python -m benchmarks.tune_nmar DATA OUT`.
+
+DATA is a dataset of scenes that stand in no table (`make-dataset tune DATA`), each with its metal-free twin. For
+every scene and dilation a line of OUT/nmar.csv holds the error of LIMAR and of NMAR with either prior (RMS difference
+from FDK of the twin in the tissue, HU), the misfits that `auto` judges by, its choice, and the regret: what the
+choice costs over the better prior. `mended` is FDK with the twin's readings in the trace: what the trace misses.
+"""
+
+import csv
+import dataclasses
+import functools
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from baselines import nmar
+from baselines.limar import interpolated
+from baselines.metal import Metal, Trace, find_metal
+from baselines.prior import choose_prior
+from benchmarks.artefact import water_attenuation
+from benchmarks.cli import guarded
+from benchmarks.protocol import truth_of
+from ctsim.errors import InputError
+from ctsim.store import StoredScan, list_scans, open_scan
+from ctsim.types import Scan
+from reconstruct.fdk import reconstruct as fdk
+
+DILATIONS = (0, None, 2)
+PRIORS = ("fdk", "limar")
+
+
+def main(arguments: list[str]) -> int:
+    """Write the table, a scene at a time; return 0."""
+    if len(arguments) != 2:
+        raise InputError("expected DATA and OUT")
+    out = Path(arguments[1])
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / "nmar.csv").open("w", encoding="utf-8", newline="") as file:
+        writer = None
+        for folder in list_scans(Path(arguments[0])):
+            for row in rows(open_scan(folder)):
+                writer = writer or csv.DictWriter(file, list(row))
+                if not file.tell():
+                    writer.writeheader()
+                writer.writerow(row)
+                file.flush()
+                sys.stdout.write(", ".join(f"{k} {v}" for k, v in row.items()) + "\n")
+    return 0
+
+
+def rows(stored: StoredScan) -> list[dict[str, object]]:
+    """Measure a scene with every dilation."""
+    water, free = water_attenuation(stored), stored.metal_free
+    if free is None or water is None:
+        raise InputError(f"{stored.name}: expected a scene with its spectrum and its metal-free twin")
+    mask, bare = np.asarray(stored.metal) > 0, free.scan
+    scan = dataclasses.replace(stored.scan, metal=torch.from_numpy(mask))
+    first, twin = fdk(scan).values.numpy(), fdk(bare).values.numpy()
+    tissue = truth_of(stored).tissue
+    metal = find_metal(scan, first, "oracle")
+
+    def error(values: torch.Tensor) -> float:
+        off = (values.numpy() - twin)[tissue].astype(np.float64)
+        return round(1000 / water * float(np.sqrt(np.mean(off**2))), 1)
+
+    found: list[dict[str, object]] = []
+    for dilation in DILATIONS:
+        trace = Trace(metal, scan.geometry, dilation)
+        mended = dataclasses.replace(scan, counts=torch.where(_held(trace), bare.counts, scan.counts))
+        values, misfit = by_prior(scan, trace, metal, first)
+        errors = {name: error(v) for name, v in values.items()}
+        chosen = min(misfit, key=lambda name: misfit[name])
+        found.append({
+            "scene": stored.name, "dilation": trace.dilation, "fdk": error(torch.from_numpy(first)),
+            "mended": error(fdk(mended).values), "limar": error(interpolated(scan, trace, "rows")[0]),
+            **{f"nmar_{name}": e for name, e in errors.items()},
+            "misfit_ratio": round(misfit["limar"] / misfit["fdk"], 3), "chosen": chosen,
+            "regret": round(errors[chosen] - min(errors.values()), 1),
+        })  # fmt: skip
+    return found
+
+
+def by_prior(
+    scan: Scan, trace: Trace, metal: Metal, first: np.ndarray
+) -> tuple[dict[str, torch.Tensor], dict[str, float]]:
+    """Return NMAR's volume with either prior, and its misfit on the ring."""
+    values, misfit = {}, {}
+    for name in PRIORS:
+        choice = choose_prior(scan, trace, metal, first, name)
+        if choice is None:
+            raise InputError("nothing stands out from air: there is no prior to choose")
+        bridge = functools.partial(nmar.Normalise().fill, largest=choice.largest, how="rows")
+        values[name], _ = nmar.normalised(scan, trace, choice.columns, bridge)
+        misfit[name] = choice.misfit[name]
+    return values, misfit
+
+
+def _held(trace: Trace) -> torch.Tensor:
+    return torch.from_numpy(np.stack([trace.view(k) for k in range(trace.geometry.n_views)]))
+
+
+if __name__ == "__main__":
+    sys.exit(guarded("tune_nmar", "benchmarks.tune_nmar", sys.argv[1:]))
