@@ -1,0 +1,1 @@
+"""Reconstruction by Gaussian splats with a polychromatic response."""
