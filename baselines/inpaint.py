@@ -13,13 +13,27 @@ from ctsim.errors import InputError
 
 @dataclass(slots=True, kw_only=True)
 class Filled:
-    """What was filled: pixels, rows, gaps that touch the detector's edge, rows without any pixel left, and views."""
+    """What was filled: pixels, rows, gaps that touch the detector's edge, rows without any pixel left, and views.
+
+    Of view `shown` the filled `projection` is kept.
+    """
 
     pixels: int = 0
     rows: int = 0
     edge_gaps: int = 0
     full_rows: int = 0
     views: int = 0
+    shown: int = 0
+    projection: NDArray[np.float32] | None = None
+
+    def keep(self, p: NDArray[np.float32], views: slice) -> None:
+        """Keep view `shown` of filled projections [view, v, u], which pictures show."""
+        if views.start <= self.shown < views.stop:
+            self.projection = p[self.shown - views.start].copy()
+
+    def intermediates(self, trace: NDArray[np.bool_]) -> dict[str, object]:
+        """Return what pictures show: the view, its trace [v, u] and its projection as filled."""
+        return {"view": self.shown, "trace": trace, "projection": self.projection}
 
     def details(self) -> dict[str, int]:
         """Return the counts for a result's details."""

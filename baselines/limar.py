@@ -57,6 +57,7 @@ def reconstruct(scan: Scan, settings: Bridging, device: str) -> Volume:
     values, filled = interpolated(scan, trace, settings.interpolation)
     reinsert(values, first.values.numpy(), metal, settings.insert)
     details: dict[str, object] = {"view_updates": 2 * scan.geometry.n_views, "dilation": trace.dilation}
+    details["intermediates"] = filled.intermediates(trace.view(filled.shown))
     return finished(values, first, metal, details | filled.details())
 
 
@@ -68,12 +69,13 @@ def check_insert(insert: str) -> None:
 
 def interpolated(scan: Scan, trace: Trace, how: str) -> tuple[torch.Tensor, Filled]:
     """Return FDK of the projections with the trace interpolated, and what was filled."""
-    filled = Filled()
+    filled = Filled(shown=scan.geometry.n_views // 4)
 
     def read(views: slice) -> NDArray[np.float32]:
         p = line_integrals(scan, views)[0].numpy()
         for k, view in enumerate(range(views.start, views.stop)):
             fill(p[k], trace.view(view), how, filled)
+        filled.keep(p, views)
         return p
 
     return fdk_stream(read, scan.geometry), filled

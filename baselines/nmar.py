@@ -111,6 +111,8 @@ def reconstruct(scan: Scan, settings: Settings, device: str) -> Volume:
     values, filled = normalised(scan, trace, choice.columns, bridge)
     reinsert(values, x_0, metal, settings.insert)
     details: dict[str, object] = {"dilation": trace.dilation, "largest_prior": choice.largest}
+    shown = filled.intermediates(trace.view(filled.shown))
+    details["intermediates"] = shown | {"prior": choice.columns.transpose(2, 0, 1)}
     details |= {"view_updates": (2 + choice.view_updates) * scan.geometry.n_views}
     return finished(values, first, metal, details | choice.details() | filled.details())
 
@@ -124,7 +126,7 @@ def normalised(scan: Scan, trace: Trace, columns: NDArray[np.float32], bridge: B
     The prior is stored as `columns` [y, x, z]. `bridge(p, q, trace, filled)` gets the rows [v, u] of a view that hold
     metal; only those are projected.
     """
-    filled = Filled()
+    filled = Filled(shown=scan.geometry.n_views // 4)
 
     def read(views: slice) -> NDArray[np.float32]:
         p = line_integrals(scan, views)[0].numpy()
@@ -138,6 +140,7 @@ def normalised(scan: Scan, trace: Trace, columns: NDArray[np.float32], bridge: B
             at = np.flatnonzero(wanted[k])
             rows = slice(at[0], at[-1] + 1)
             p[k, rows] = bridge(p[k, rows], q[k, rows], traces[k, rows], filled)
+        filled.keep(p, views)
         return p
 
     return fdk_stream(read, scan.geometry), filled

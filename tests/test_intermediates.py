@@ -1,0 +1,31 @@
+"""What LIMAR and NMAR attach to their volumes is what they worked with."""
+
+import numpy as np
+import pytest
+
+from benchmarks import intermediates, methods, run
+from ctsim.store import list_scans, open_scan
+from reconstruct.log import line_integrals
+
+
+@pytest.mark.parametrize("name", ["limar", "nmar"])
+def test_the_bridged_view_is_the_measured_one_but_for_the_trace(smallest, name):
+    stored = open_scan(list_scans(smallest)[0])
+    method = methods.find(name)
+    found = run.attempt(method, run.scan_for(method, stored, "metal"), "cpu", 0.0).intermediates
+    assert found.keys() == ({"view", "trace", "projection"} | ({"prior"} if name == "nmar" else set()))
+    trace, bridged = found["trace"], found["projection"]
+    measured = line_integrals(stored.scan, int(found["view"]))[0].numpy()
+    assert trace.any() and (bridged[~trace] == measured[~trace]).all()
+    assert bridged[trace].mean() < measured[trace].mean()  # the metal is gone
+    if name == "nmar":
+        metal, prior = np.asarray(stored.metal) > 0, found["prior"]
+        assert len(np.unique(prior[metal])) == 1 and 0 < prior[metal][0] < 0.1  # water in place of the metal
+
+
+def test_without_metal_nothing_is_attached(smallest):
+    stored = open_scan(list_scans(smallest)[0])
+    method = methods.find("nmar")
+    outcome = run.attempt(method, run.scan_for(method, stored, "metal_free"), "cpu", 0.0)
+    assert outcome.status == "ok" and outcome.intermediates == {}
+    assert intermediates.taken({}, stored.geometry) == {}
