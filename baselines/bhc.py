@@ -51,7 +51,7 @@ def bhc_poly(
     metal = find_metal(scan, x_0, mask)
     if first.status is not Status.OK or not metal.found:
         return uncorrected(first, metal)
-    trace = Trace(metal, scan.geometry)
+    trace = Trace(metal, scan)
     choice = choose_prior(scan, trace, metal, x_0, prior)
     if choice is None:
         return _left(uncorrected(first, metal), "nothing stands out from air")

@@ -230,7 +230,7 @@ def _weights(given: Weights, scan: Scan, data: Array) -> tuple[Array, dict[str, 
         metal = auto_mask(fdk(scan).values.numpy())
         about = metal.details()
         if metal.found:
-            trace = Trace(metal, scan.geometry)
+            trace = Trace(metal, scan)
             for view in range(scan.geometry.n_views):
                 weights[view][trace.view(view)] = 0
     return weights, about

@@ -26,7 +26,7 @@ class Bridging:
 
     `mask` is "oracle", "auto" or a TIFF file (`baselines.metal.find_metal`); `interpolation` "rows" or "harmonic"
     (`baselines.inpaint.fill`); `insert` "fdk", "mean" or "none" (`baselines.metal.reinsert`); `dilation` widens the
-    trace by so many pixels, None by as many as the mask's edge may be off (`baselines.metal.reach`).
+    trace by so many pixels, None by what the mask's edge leaves out of it (`baselines.metal.Trace`).
     """
 
     mask: str = "oracle"
@@ -53,10 +53,10 @@ def reconstruct(scan: Scan, settings: Bridging, device: str) -> Volume:
     metal = find_metal(scan, first.values.numpy(), settings.mask)
     if first.status is not Status.OK or not metal.found:
         return uncorrected(first, metal)
-    trace = Trace(metal, scan.geometry, settings.dilation)
+    trace = Trace(metal, scan, settings.dilation)
     values, filled = interpolated(scan, trace, settings.interpolation)
     reinsert(values, first.values.numpy(), metal, settings.insert)
-    details: dict[str, object] = {"view_updates": 2 * scan.geometry.n_views, "dilation": trace.dilation}
+    details: dict[str, object] = {"view_updates": 2 * scan.geometry.n_views, "dilation": settings.dilation}
     details["intermediates"] = filled.intermediates(trace.view(filled.shown))
     return finished(values, first, metal, details | filled.details())
 

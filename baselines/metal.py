@@ -14,6 +14,7 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.project import Tracer
 from ctsim.types import Phantom, Scan
+from reconstruct.log import line_integrals
 
 PEAK, HALF, SMALLEST = 0.25, 0.5, 8  # of the maximum; of the metal's value; voxels
 FACTORS = (8.0, 1.5)  # metal must exceed this many times water, and this many times the body's 99.9th percentile
@@ -145,29 +146,44 @@ def reach(geometry: Geometry) -> int:
 
 
 class Trace:
-    """The mask's shadow: for every view the pixels whose central ray crosses 0.05 voxels of metal or more.
+    """The metal's shadow, by view: where the central ray crosses 0.05 voxels of the mask, and what its edge leaves out.
 
-    It is widened by `dilation` pixels (None: `reach`). Without, what the mask's edge leaves of the metal made two
-    thirds to all of the error on iron.
+    A pixel within `reach` of the shadow belongs to it where it is darker than all around that are out of reach, as
+    metal only darkens. What the edge left out made up to all of NMAR's error on iron, while bridging pixels that hold
+    no metal cost up to a sixth of LIMAR's. `dilation` widens the shadow by so many pixels instead.
     """
 
-    def __init__(self, metal: Metal, geometry: Geometry, dilation: int | None = None) -> None:
-        self.geometry, self.dilation = geometry, reach(geometry) if dilation is None else dilation
+    def __init__(self, metal: Metal, scan: Scan, dilation: int | None = None) -> None:
+        self.scan, self.geometry, self.dilation = scan, scan.geometry, dilation
         self.tracer = Tracer.of(
             Phantom(
                 labels=metal.mask.astype(np.uint8),
                 materials=("air", "metal"),
-                d_voxel=geometry.d_voxel,
-                off_origin=geometry.off_origin,
+                d_voxel=self.geometry.d_voxel,
+                off_origin=self.geometry.off_origin,
             )
         )
-        self.thinnest = THINNEST * float(np.prod(geometry.d_voxel)) ** (1 / 3)
-        self._lengths = np.zeros((2, *geometry.n_detector), np.float32)
+        self.thinnest = THINNEST * float(np.prod(self.geometry.d_voxel)) ** (1 / 3)
+        self._lengths = np.zeros((2, *self.geometry.n_detector), np.float32)
+        self._kept: dict[int, NDArray[np.uint8]] = {}  # a bit a pixel
 
     def view(self, view: int) -> NDArray[np.bool_]:
         """Return the trace in one view, [v, u]."""
+        shape = self.geometry.n_detector
+        if view not in self._kept:
+            self._kept[view] = np.packbits(self._find(view))
+        return np.unpackbits(self._kept[view], count=shape[0] * shape[1]).reshape(shape).astype(np.bool_)
+
+    def _find(self, view: int) -> NDArray[np.bool_]:
         self.tracer.background(self.geometry, view, self._lengths)
-        return dilate(self._lengths[1] > self.thinnest, self.dilation)
+        shadow = self._lengths[1] > self.thinnest
+        if self.dilation is not None or not shadow.any():
+            return dilate(shadow, self.dilation or 0)
+        pixels = reach(self.geometry)
+        near = dilate(shadow, pixels)
+        p = line_integrals(self.scan, view)[0].numpy()
+        around = scipy.ndimage.maximum_filter(np.where(near, -np.inf, p), 2 * pixels + 3)
+        return shadow | (near & (p > around))
 
     def lengths(self, view: int) -> NDArray[np.float32]:
         """Return the length in metal in one view in mm, [v, u]."""

@@ -103,14 +103,14 @@ def reconstruct(scan: Scan, settings: Settings, device: str) -> Volume:
     metal = find_metal(scan, x_0, settings.mask)
     if first.status is not Status.OK or not metal.found:
         return uncorrected(first, metal)
-    trace = Trace(metal, scan.geometry, settings.dilation)
+    trace = Trace(metal, scan, settings.dilation)
     choice = choose_prior(scan, trace, metal, x_0, settings.prior, settings.interpolation)
     if choice is None:
         return uncorrected(first, metal)
     bridge = functools.partial(settings.rule.fill, largest=choice.largest, how=settings.interpolation)
     values, filled = normalised(scan, trace, choice.columns, bridge)
     reinsert(values, x_0, metal, settings.insert)
-    details: dict[str, object] = {"dilation": trace.dilation, "largest_prior": choice.largest}
+    details: dict[str, object] = {"dilation": settings.dilation, "largest_prior": choice.largest}
     shown = filled.intermediates(trace.view(filled.shown))
     details["intermediates"] = shown | {"prior": choice.columns.transpose(2, 0, 1)}
     details |= {"view_updates": (2 + choice.view_updates) * scan.geometry.n_views}

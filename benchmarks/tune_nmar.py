@@ -1,4 +1,6 @@
-"""How well NMAR chooses its prior, and what the trace's margin is worth: `python -m benchmarks.tune_nmar DATA OUT`.
+"""How well NMAR chooses its prior, and what the trace's margin is worth.
+
+    python -m benchmarks.tune_nmar DATA OUT [SCENE …]
 
 DATA is a dataset of scenes that stand in no table (`make-dataset tune DATA`), each with its metal-free twin. For
 every scene and dilation a line of OUT/nmar.csv holds the error of LIMAR and of NMAR with either prior (RMS difference
@@ -10,6 +12,7 @@ import csv
 import dataclasses
 import functools
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -27,19 +30,19 @@ from ctsim.store import StoredScan, list_scans, open_scan
 from ctsim.types import Scan
 from reconstruct.fdk import reconstruct as fdk
 
-DILATIONS = (0, None, 2)
+DILATIONS = (0, None, 1)
 PRIORS = ("fdk", "limar")
 
 
 def main(arguments: list[str]) -> int:
     """Write the table, a scene at a time; return 0."""
-    if len(arguments) != 2:
-        raise InputError("expected DATA and OUT")
+    if len(arguments) < 2:
+        raise InputError("expected DATA and OUT, and then names of scenes if not all are meant")
     out = Path(arguments[1])
     out.mkdir(parents=True, exist_ok=True)
     with (out / "nmar.csv").open("w", encoding="utf-8", newline="") as file:
         writer = None
-        for folder in list_scans(Path(arguments[0])):
+        for folder in _chosen(list_scans(Path(arguments[0])), arguments[2:]):
             for row in rows(open_scan(folder)):
                 writer = writer or csv.DictWriter(file, list(row))
                 if not file.tell():
@@ -48,6 +51,14 @@ def main(arguments: list[str]) -> int:
                 file.flush()
                 sys.stdout.write(", ".join(f"{k} {v}" for k, v in row.items()) + "\n")
     return 0
+
+
+def _chosen(folders: Iterable[Path], names: list[str]) -> list[Path]:
+    folders = list(folders)
+    missing = set(names) - {folder.name for folder in folders}
+    if missing:
+        raise InputError(f"there is no scene {', '.join(sorted(missing))}")
+    return [folder for folder in folders if not names or folder.name in names]
 
 
 def rows(stored: StoredScan) -> list[dict[str, object]]:
@@ -67,13 +78,14 @@ def rows(stored: StoredScan) -> list[dict[str, object]]:
 
     found: list[dict[str, object]] = []
     for dilation in DILATIONS:
-        trace = Trace(metal, scan.geometry, dilation)
+        trace = Trace(metal, scan, dilation)
         mended = dataclasses.replace(scan, counts=torch.where(_held(trace), bare.counts, scan.counts))
         values, misfit = by_prior(scan, trace, metal, first)
         errors = {name: error(v) for name, v in values.items()}
         chosen = min(misfit, key=lambda name: misfit[name])
         found.append({
-            "scene": stored.name, "dilation": trace.dilation, "fdk": error(torch.from_numpy(first)),
+            "scene": stored.name, "dilation": "rule" if dilation is None else dilation,
+            "fdk": error(torch.from_numpy(first)),
             "mended": error(fdk(mended).values), "limar": error(interpolated(scan, trace, "rows")[0]),
             **{f"nmar_{name}": e for name, e in errors.items()},
             "misfit_ratio": round(misfit["limar"] / misfit["fdk"], 3), "chosen": chosen,

@@ -115,7 +115,7 @@ def test_only_rows_that_hold_metal_are_touched(iron):
     scan, _ = iron
     metal = find_metal(scan, fdk(scan).values.numpy(), "oracle")
     short = dataclasses.replace(metal, mask=metal.mask & (np.arange(14) < 4)[:, None, None])
-    trace = Trace(short, scan.geometry, dilation=0)
+    trace = Trace(short, scan, dilation=0)
     seen = np.stack([trace.view(k) for k in range(scan.geometry.n_views)])
     assert seen.any() and not seen[:, 14:].any()
     values, filled = limar.interpolated(scan, trace, "rows")
@@ -159,12 +159,12 @@ def test_the_automatic_mask_finds_iron(iron):
 def test_the_trace_is_where_the_mask_has_length(iron):
     scan, _ = iron
     metal = Metal(mask=scan.metal.numpy() != 0, source="oracle")
-    trace = Trace(metal, scan.geometry, dilation=0)
+    trace = Trace(metal, scan, dilation=0)
     phantom = Phantom(labels=metal.mask.astype(np.uint8), materials=("air", "Fe"), d_voxel=GEOMETRY.d_voxel)
     for view in (0, 17):
         length = path_lengths(Tracer.of(phantom), scan.geometry, view)[1]
         assert np.array_equal(trace.view(view), length > 0.05 * np.prod(GEOMETRY.d_voxel) ** (1 / 3))
-        wide = Trace(metal, scan.geometry, dilation=1).view(view)
+        wide = Trace(metal, scan, dilation=1).view(view)
         assert wide.sum() > trace.view(view).sum() and wide[trace.view(view)].all()
 
 
@@ -175,13 +175,15 @@ def test_metal_that_the_mask_leaves_out_is_within_reach(iron):
     metal = find_metal(scan, first.values.numpy(), "oracle")
 
     def left(dilation):
-        trace = Trace(metal, scan.geometry, dilation)
+        trace = Trace(metal, scan, dilation)
         held = torch.from_numpy(np.stack([trace.view(k) for k in range(scan.geometry.n_views)]))
         mended = dataclasses.replace(scan, counts=torch.where(held, bare.counts, scan.counts))
         return tissue_error(fdk(mended), twin, scan)
 
-    # rods of 3 voxels across, of which the mask leaves out up to half a voxel all around
-    assert left(None) < 0.02 * tissue_error(first, twin, scan) < 0.1 * left(0)
+    # rods of 3 voxels across, of which the mask leaves out up to half a voxel all around; a trace widened by a pixel
+    # takes all of that, and the rule all but what is no darker than the densest tissue near
+    assert left(1) < 0.02 * tissue_error(first, twin, scan)
+    assert left(None) < 0.25 * left(0)
 
 
 def test_the_reach_grows_with_the_pixels_that_a_voxel_covers():
