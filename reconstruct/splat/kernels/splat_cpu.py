@@ -21,7 +21,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from reconstruct.splat.kernels.lanes import WIDTH, add, div, exp, fma, load, mul, ramp, spread, sqrt, store, total
+from reconstruct.splat.kernels.lanes import WIDTH, div, exp, fma, load, mul, ramp, spread, sqrt, store, total
 
 CHUNKS = 16  # of splats, each on an image of its own: the sum does not depend on the number of threads
 ROWS = 16  # rows by multiplication before the exponentials are taken anew
