@@ -72,8 +72,8 @@ class Normalise:
 class Settings(Bridging):
     """Those of `baselines.limar.Bridging`; `normalisation` and `floor` as in `Normalise`; and which prior.
 
-    `prior` is segmented from the "fdk" or the "limar" volume, or "auto": from the one whose projections fit the
-    measured ones better around the trace.
+    `prior` is segmented from the "fdk" or the "limar" volume, or "auto": from the latter where its projections
+    fit the measured ones better by a twentieth around the trace (`baselines.prior.choose_prior`).
     """
 
     prior: str = "auto"

@@ -10,7 +10,7 @@ import scipy.ndimage
 from numpy.typing import NDArray
 
 from baselines.limar import interpolated
-from baselines.metal import Metal, Trace, water_value
+from baselines.metal import Metal, Trace, reach, water_value
 from baselines.morphology import dilate, opened
 from ctsim.errors import InputError
 from ctsim.types import Scan
@@ -21,6 +21,7 @@ AIR, LUNG, BONE = 0.5, 0.15, 1.5  # bounds of the classes in multiples of water
 LUNG_SHARE = 0.03  # of the body; with less there is no lung class
 SKIN = 1  # voxels around the mask that hold blurred metal
 CHOICE_VIEWS = 32  # views that decide between the priors
+MARGIN = 0.95  # LIMAR's prior must fit better by this
 RING = 4  # width in pixels of the ring around the trace that the priors are judged on
 PRIORS = ("auto", "fdk", "limar")
 Array = NDArray[np.float32]
@@ -58,23 +59,28 @@ def check_prior(prior: str) -> None:
 def choose_prior(scan: Scan, trace: Trace, metal: Metal, first: Array, prior: str, how: str = "rows") -> Choice | None:
     """Return the prior from FDK's volume `first`, from LIMAR's, or ("auto") the better of both; None where all is air.
 
-    The better one is that whose projections fit the measured ones better on a ring around the trace. What fits
-    neither, such as hardening by bone, spoils both alike: the lower misfit is FDK's as long as least squares of P − q
-    ask for less than half of the step from it to LIMAR's. `how` is LIMAR's interpolation.
+    The better one is LIMAR's where its projections fit the measured ones on a ring around the trace better by a
+    twentieth: at a draw FDK's has the finer detail. `how` is LIMAR's interpolation.
     """
     water = water_value(first)
     if water <= 0:
         return None
     names = PRIORS[1:] if prior == "auto" else (prior,)
-    found = []
+    found: dict[str, tuple[Array, float]] = {}
+    misfit: dict[str, float] = {}
     for name in names:
         volume = first if name == "fdk" else interpolated(scan, trace, how)[0].numpy()
         columns = np.ascontiguousarray(tissue_prior(volume, metal, water).transpose(1, 2, 0))
-        misfit, largest = _misfit(scan, trace, columns)
-        found.append((misfit, name, columns, largest))
-    _, name, columns, largest = min(found, key=lambda one: one[0])
-    misfits = {name: misfit for misfit, name, *_ in found}
-    return Choice(name=name, columns=columns, misfit=misfits, largest=largest, water=water)
+        misfit[name], largest = _misfit(scan, trace, columns)
+        found[name] = columns, largest
+    name = better(misfit) if prior == "auto" else prior
+    columns, largest = found[name]
+    return Choice(name=name, columns=columns, misfit=misfit, largest=largest, water=water)
+
+
+def better(misfit: dict[str, float]) -> str:
+    """Return which of both priors "auto" takes."""
+    return "limar" if misfit["limar"] < MARGIN * misfit["fdk"] else "fdk"
 
 
 def tissue_prior(volume: Array, metal: Metal, water: float) -> Array:
@@ -111,5 +117,6 @@ def _misfit(scan: Scan, trace: Trace, columns: Array) -> tuple[float, float]:
 def _around(scan: Scan, view: int, trace: NDArray[np.bool_], q: Array) -> Array:
     """Return P − q on a ring around the trace of one view; nothing where there is no trace."""
     p, clamped = line_integrals(scan, view)
-    ring = dilate(trace, RING) & ~trace & ~clamped.numpy()
+    inner = dilate(trace, reach(scan.geometry))  # what little metal is left there would be held against both
+    ring = dilate(inner, RING) & ~inner & ~clamped.numpy()
     return (p.numpy() - q)[ring]

@@ -21,7 +21,7 @@ import torch
 from baselines import nmar
 from baselines.limar import interpolated
 from baselines.metal import Metal, Trace, find_metal
-from baselines.prior import choose_prior
+from baselines.prior import better, choose_prior
 from benchmarks.artefact import water_attenuation
 from benchmarks.cli import guarded
 from benchmarks.protocol import truth_of
@@ -30,7 +30,7 @@ from ctsim.store import StoredScan, list_scans, open_scan
 from ctsim.types import Scan
 from reconstruct.fdk import reconstruct as fdk
 
-DILATIONS = (0, None, 1)
+DILATIONS = (0, None)
 PRIORS = ("fdk", "limar")
 
 
@@ -82,7 +82,7 @@ def rows(stored: StoredScan) -> list[dict[str, object]]:
         mended = dataclasses.replace(scan, counts=torch.where(_held(trace), bare.counts, scan.counts))
         values, misfit = by_prior(scan, trace, metal, first)
         errors = {name: error(v) for name, v in values.items()}
-        chosen = min(misfit, key=lambda name: misfit[name])
+        chosen = better(misfit)
         found.append({
             "scene": stored.name, "dilation": "rule" if dilation is None else dilation,
             "fdk": error(torch.from_numpy(first)),
