@@ -30,7 +30,7 @@ from ctsim.store import StoredScan, list_scans, open_scan
 from ctsim.types import Scan
 from reconstruct.fdk import reconstruct as fdk
 
-DILATIONS = (0, None)
+DILATIONS = (0, None, 1)
 PRIORS = ("fdk", "limar")
 
 
