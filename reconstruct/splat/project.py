@@ -32,11 +32,7 @@ class Projector:
     _scratch: dict[int, NDArray[np.float32]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        poses, (n_v, n_u) = self.geometry.pose_array(), self.geometry.n_detector
-        cameras = np.zeros((len(poses), 15))
-        cameras[:, :3], cameras[:, 6:12] = poses[:, :3], poses[:, 6:]
-        corner = poses[:, 3:6] - 0.5 * (n_u - 1) * poses[:, 6:9] - 0.5 * (n_v - 1) * poses[:, 9:]
-        cameras[:, 3:6] = corner - poses[:, :3]
+        cameras = kernels.camera_vectors(self.geometry.pose_array(), self.geometry.n_detector)
         cameras[:, kernels.CUTOFF], cameras[:, kernels.TOLERANCE] = self.cutoff, self.tolerance
         cameras[:, kernels.BOX] = 1 / 12 if self.box else 0.0
         object.__setattr__(self, "cameras", cameras)

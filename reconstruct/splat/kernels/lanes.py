@@ -102,6 +102,23 @@ def ramp(typingctx, first):
     return lanes(types.float32), codegen
 
 
+@intrinsic
+def below(typingctx, first, limit):
+    """Return 1 in the lanes k with first + k < limit, and 0 in the others."""
+
+    def codegen(context, builder, signature, args):
+        inside = []
+        for k in range(WIDTH):
+            at = builder.add(args[0], ir.Constant(args[0].type, k))
+            inside.append(builder.uitofp(builder.icmp_signed("<", at, args[1]), ir.FloatType()))
+        value = ir.Constant(_FLOATS, ir.Undefined)
+        for k, one in enumerate(inside):
+            value = builder.insert_element(value, one, ir.Constant(ir.IntType(32), k))
+        return value
+
+    return lanes(types.intp, types.intp), codegen
+
+
 def _binary(instruction: str, doc: str):
     @intrinsic
     def operation(typingctx, a, b):
