@@ -5,7 +5,8 @@
 DATA is a dataset of scenes that stand in no table (`make-dataset tune DATA`), each with its metal-free twin. For
 every scene and dilation a line of OUT/nmar.csv holds the error of LIMAR and of NMAR with either prior (RMS difference
 from FDK of the twin in the tissue, HU), the misfits that `auto` judges by, its choice, and the regret: what the
-choice costs over the better prior. `mended` is FDK with the twin's readings in the trace: what the trace misses.
+choice costs over the better prior. `nmar_twin` has a prior from the twin, as good as there can be. `mended` is FDK
+with the twin's readings in the trace: what the trace misses.
 """
 
 import csv
@@ -21,7 +22,7 @@ import torch
 from baselines import nmar
 from baselines.limar import interpolated
 from baselines.metal import Metal, Trace, find_metal
-from baselines.prior import better, choose_prior
+from baselines.prior import Choice, better, choose_prior
 from benchmarks.artefact import water_attenuation
 from benchmarks.cli import guarded
 from benchmarks.protocol import truth_of
@@ -82,12 +83,14 @@ def rows(stored: StoredScan) -> list[dict[str, object]]:
         mended = dataclasses.replace(scan, counts=torch.where(_held(trace), bare.counts, scan.counts))
         values, misfit = by_prior(scan, trace, metal, first)
         errors = {name: error(v) for name, v in values.items()}
+        best = choose_prior(scan, trace, metal, twin, "fdk")  # FDK, of the twin
         chosen = better(misfit)
         found.append({
             "scene": stored.name, "dilation": "rule" if dilation is None else dilation,
             "fdk": error(torch.from_numpy(first)),
             "mended": error(fdk(mended).values), "limar": error(interpolated(scan, trace, "rows")[0]),
             **{f"nmar_{name}": e for name, e in errors.items()},
+            "nmar_twin": None if best is None else error(nmar_with(scan, trace, best)),
             "misfit_ratio": round(misfit["limar"] / misfit["fdk"], 3), "chosen": chosen,
             "regret": round(errors[chosen] - min(errors.values()), 1),
         })  # fmt: skip
@@ -103,10 +106,15 @@ def by_prior(
         choice = choose_prior(scan, trace, metal, first, name)
         if choice is None:
             raise InputError("nothing stands out from air: there is no prior to choose")
-        bridge = functools.partial(nmar.Normalise().fill, largest=choice.largest, how="rows")
-        values[name], _ = nmar.normalised(scan, trace, choice.columns, bridge)
+        values[name] = nmar_with(scan, trace, choice)
         misfit[name] = choice.misfit[name]
     return values, misfit
+
+
+def nmar_with(scan: Scan, trace: Trace, choice: Choice) -> torch.Tensor:
+    """Return NMAR's volume with a prior, metal not put back."""
+    bridge = functools.partial(nmar.Normalise().fill, largest=choice.largest, how="rows")
+    return nmar.normalised(scan, trace, choice.columns, bridge)[0]
 
 
 def _held(trace: Trace) -> torch.Tensor:
