@@ -27,9 +27,10 @@ class Beyond:
 
     @property
     def sentence(self) -> str:
-        """What is wrong, or nothing."""
+        """What is wrong, or nothing; rows do not tell an object that ends with the grid from one that goes on."""
         parts = [f"{self.missing} attenuated rays miss the reconstruction grid"] if self.missing else []
-        parts += [f"the object reaches over the detector's {' and '.join(self.sides)}"] if self.sides else []
+        columns = [name for name in self.sides if "column" in name]
+        parts += [f"the object reaches over the detector's {' and '.join(columns)}"] if columns else []
         return f"{' and '.join(parts)}, so values are wrong towards the border" if parts else ""
 
     def details(self) -> dict[str, object]:
