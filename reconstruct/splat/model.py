@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.errors import InputError
+from reconstruct.splat.kernels.rotations_cpu import write_rotations
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,19 +40,8 @@ class Splats:
 
     def shapes(self) -> NDArray[np.float32]:
         """Return what the kernels take: [4, splat] for round splats, [15, splat] for others."""
-        rows = [self.positions.T, self.scales.T]
+        shapes = np.empty((4 if self.rotations is None else 15, len(self)), np.float32)
+        shapes[:3], shapes[3 : 3 + self.scales.shape[1]] = self.positions.T, self.scales.T
         if self.rotations is not None:
-            rows.append(rotation_matrices(self.rotations).reshape(-1, 9).T)
-        return np.ascontiguousarray(np.concatenate(rows), np.float32)
-
-
-def rotation_matrices(quaternions: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Turn quaternions (w, x, y, z) of any length into rotation matrices [splat, 3, 3]."""
-    q = np.asarray(quaternions, np.float64)
-    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
+            write_rotations(self.rotations, shapes[6:])
+        return shapes

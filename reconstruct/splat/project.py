@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from reconstruct.projector import Views, view_indices
 from reconstruct.splat.kernels import splat_cpu as kernels
@@ -21,7 +22,8 @@ class Projector:
     """Projects splats along the rays of `geometry`, any pose or detector offset.
 
     With `box` a pixel measures the mean over its area (to second order), as detectors do; without, the ray through its
-    centre. Images hold eight columns more than the detector; they mean nothing.
+    centre. Images hold eight columns more than the detector; they are zero, and count as such if they are finite.
+    Splats that lie behind the source, are not finite or have no extent are left out.
     """
 
     geometry: Geometry
@@ -29,7 +31,6 @@ class Projector:
     tolerance: float = TOLERANCE
     box: bool = True
     cameras: NDArray[np.float64] = field(init=False)
-    _scratch: dict[int, NDArray[np.float32]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         cameras = kernels.camera_vectors(self.geometry.pose_array(), self.geometry.n_detector)
@@ -40,28 +41,43 @@ class Projector:
     def forward(
         self, shapes: NDArray[np.float32], values: NDArray[np.float32], views: Views = None
     ) -> NDArray[np.float32]:
-        """Sum values [splat, channel] times line integrals (mm) over the splats: float32 [view, channel, v, u + 8]."""
+        """Sum values [splat, channel] times line integrals (mm) over the splats: float32 [view, channel, v, u + 8].
+
+        One or two channels. Raises InputError for wrong shapes, and views that do not exist.
+        """
         chosen = view_indices(self.geometry, views)
         n_v, n_u = self.geometry.n_detector
-        n_c = values.shape[1]
+        n, n_c = values.shape
+        _check("shapes", shapes, [(4, n), (15, n)])
+        _check("values", values, [(n, 1), (n, 2)])
         images = np.zeros((len(chosen), n_c * n_v, n_u + WIDTH), np.float32)
         if len(chosen) >= kernels.CHUNKS:
             kernels.forward_views(shapes, values, self.cameras[chosen], images)
         else:
-            if n_c not in self._scratch:
-                self._scratch[n_c] = np.zeros((kernels.CHUNKS, n_c * n_v, n_u + WIDTH), np.float32)
-            scratch = self._scratch[n_c]
-            for k, view in enumerate(chosen):
-                kernels.forward_view(shapes, values, self.cameras[view], scratch, images[k])
+            table, reach = np.empty((n, kernels.FOOTPRINT)), np.empty((n, 2), np.int32)
+            for view, image in zip(chosen, images, strict=True):
+                kernels.forward_view(shapes, values, self.cameras[view], table, reach, image)
         return images.reshape(len(chosen), n_c, n_v, n_u + WIDTH)
 
     def adjoint(
         self, shapes: NDArray[np.float32], images: NDArray[np.float32], views: Views = None
     ) -> NDArray[np.float32]:
-        """Sum images [view, channel, v, u + 8] times line integrals (mm) over the pixels: float32 [splat, channel]."""
+        """Sum images [view, channel, v, u + 8] times line integrals (mm) over the pixels: float32 [splat, channel].
+
+        One, two or four channels. Raises InputError as `forward` does.
+        """
         chosen = view_indices(self.geometry, views)
-        n_c = images.shape[1]
-        sums = np.zeros((shapes.shape[1], n_c), np.float32)
-        stack = images.reshape(len(chosen), -1, images.shape[3])
+        n_v, n_u = self.geometry.n_detector
+        n, n_c = shapes.shape[1], images.shape[1]
+        _check("shapes", shapes, [(4, n), (15, n)])
+        _check("images", images, [(len(chosen), k, n_v, n_u + WIDTH) for k in (1, 2, 4)])
+        sums = np.zeros((n, n_c), np.float32)
+        stack = np.ascontiguousarray(images).reshape(len(chosen), n_c * n_v, n_u + WIDTH)
         kernels.backward_views(shapes, self.cameras[chosen], stack, sums)
         return sums
+
+
+def _check(name: str, array: NDArray[np.float32], shapes: list[tuple[int, ...]]) -> None:
+    if array.shape not in shapes or array.dtype != np.float32:
+        expected = " or ".join(str(s) for s in shapes)
+        raise InputError(f"{name} must be float32 of shape {expected}, got {array.dtype} {array.shape}")

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 
 from reconstruct.splat.kernels.lanes import WIDTH, below, div, exp, fma, load, mul, ramp, spread, sqrt, store, total
 
-CHUNKS = 16  # of splats, each on an image of its own: the sum does not depend on the number of threads
+CHUNKS = 16  # of splats at least, one a task
+BANDS, BAND = 16, 32  # at most so many bands of rows, each of at least so many: a task adds splats in their order
 ROWS = 16  # rows by multiplication before the exponentials are taken anew
 STEEP = 110.0  # −2 log of the faintest value that multiplication may start from
 HALF = np.float32(-0.5)
@@ -224,21 +225,18 @@ def _start(fp, du, dv, inside):
 
 
 @njit(cache=True, error_model="numpy")
-def add_splat(fp, values, cutoff, image, n_u):
-    """Add values[c]·w to the image of every channel; return the rows that were touched, half-open."""
+def add_splat(fp, values, cutoff, image, n_u, rows):
+    """Add values[c]·w to the image of every channel, one or two, in the half-open range of rows."""
     n_c = values.shape[0]
     n_v = image.shape[0] // n_c
-    first, last = n_v, 0
     if not abs(values[0]) * fp[W0] + abs(values[n_c - 1]) * fp[W0] < LARGEST:
-        return first, last
+        return
     left, right = _columns(fp, cutoff, n_u)
     fall = spread(np.float32(math.exp(-fp[C_VV])))
     a, b = spread(np.float32(values[0] * fp[W0])), spread(np.float32(values[n_c - 1] * fp[W0]))
     for column in range(left, right, WIDTH):
         low, high = _rows(fp, column, cutoff, n_v)
-        if low >= high:
-            continue
-        first, last = min(first, low), max(last, high)
+        low, high = max(low, rows[0]), min(high, rows[1])
         du, inside = ramp(np.float32(column - fp[U0])), below(column, n_u)
         by_rows = fp[EXACT] == 0 and not _is_steep(fp, column, low, high)
         for start in range(low, high, ROWS if by_rows else 1):
@@ -249,7 +247,6 @@ def add_splat(fp, values, cutoff, image, n_u):
                     store(image, n_v + v, column, fma(g, b, load(image, n_v + v, column)))
                 g = mul(g, r)
                 r = mul(r, fall)
-    return first, last
 
 
 @njit(cache=True, error_model="numpy")
@@ -287,14 +284,50 @@ def read_splat(fp, images, cutoff, n_u, sums):
 
 
 @njit(cache=True, error_model="numpy")
-def _forward_chunk(shapes, values, bounds, camera, image, n_u):
-    first, last = image.shape[0], 0
-    fp = np.empty(FOOTPRINT)
+def _footprints(shapes, camera, n_v, bounds, table, reach):
     for i in range(bounds[0], bounds[1]):
+        reach[i, 0], reach[i, 1] = 0, 0
+        if footprint(shapes, i, camera, table[i]):
+            half, centre = camera[CUTOFF] * math.sqrt(table[i, S_VV]), table[i, V0]
+            reach[i, 0] = max(0.0, centre - half)
+            reach[i, 1] = max(0.0, min(n_v, centre + half + 1))
+
+
+@njit(cache=True, error_model="numpy")
+def _add_band(table, reach, values, cutoff, band, image):
+    for i in range(values.shape[0]):
+        if reach[i, 0] < band[1] and reach[i, 1] > band[0]:
+            add_splat(table[i], values[i], cutoff, image, image.shape[1] - WIDTH, band)
+
+
+@njit(cache=True, error_model="numpy", parallel=True)
+def forward_view(shapes, values, camera, table, reach, image):
+    """Project onto one view by all threads; `image` must be zero.
+
+    Values [splat, channel], table float64 [splat, FOOTPRINT] and reach int32 [splat, 2] are scratch.
+    """
+    n, n_v = values.shape[0], image.shape[0] // values.shape[1]
+    for c in prange(CHUNKS):
+        _footprints(shapes, camera, n_v, (c * n // CHUNKS, (c + 1) * n // CHUNKS), table, reach)
+    bands = max(1, min(BANDS, n_v // BAND))
+    for k in prange(bands):
+        _add_band(table, reach, values, camera[CUTOFF], (k * n_v // bands, (k + 1) * n_v // bands), image)
+
+
+@njit(cache=True, error_model="numpy")
+def _forward_all(shapes, values, camera, image):
+    n_v, n_u = image.shape[0] // values.shape[1], image.shape[1] - WIDTH
+    fp = np.empty(FOOTPRINT)
+    for i in range(values.shape[0]):
         if footprint(shapes, i, camera, fp):
-            low, high = add_splat(fp, values[i], camera[CUTOFF], image, n_u)
-            first, last = min(first, low), max(last, high)
-    return first, last
+            add_splat(fp, values[i], camera[CUTOFF], image, n_u, (0, n_v))
+
+
+@njit(cache=True, error_model="numpy", parallel=True)
+def forward_views(shapes, values, cameras, images):
+    """Project onto many views, one a thread: images [view, channel · v, u + 8] must be zero."""
+    for view in prange(cameras.shape[0]):
+        _forward_all(shapes, values, cameras[view], images[view])
 
 
 @njit(cache=True, error_model="numpy")
@@ -304,39 +337,6 @@ def _backward_chunk(shapes, bounds, cameras, images, n_u, sums):
         for i in range(bounds[0], bounds[1]):
             if footprint(shapes, i, cameras[view], fp):
                 read_splat(fp, images[view], cameras[view, CUTOFF], n_u, sums[i])
-
-
-@njit(cache=True, error_model="numpy", parallel=True)
-def forward_view(shapes, values, camera, scratch, image):
-    """Project onto one view: values [splat, channel], scratch [CHUNKS, channel · v, u + 8], image the same of one."""
-    n_c, n = values.shape[1], values.shape[0]
-    n_v, n_u = image.shape[0] // n_c, image.shape[1] - WIDTH
-    touched = np.zeros((CHUNKS, 2), np.int64)
-    for c in prange(CHUNKS):
-        bounds = (c * n // CHUNKS, (c + 1) * n // CHUNKS)
-        first, last = _forward_chunk(shapes, values, bounds, camera, scratch[c], n_u)
-        touched[c, 0], touched[c, 1] = first, last
-    for v in prange(n_v):
-        for k in range(n_c):
-            _collect_row(touched, scratch, v, k * n_v + v, image)
-
-
-@njit(cache=True, error_model="numpy")
-def _collect_row(touched, scratch, v, row, image):
-    """Add the chunks' rows in their order, and clear them for the next view."""
-    image[row] = 0
-    for c in range(CHUNKS):
-        if touched[c, 0] <= v < touched[c, 1]:
-            image[row] += scratch[c, row]
-            scratch[c, row] = 0
-
-
-@njit(cache=True, error_model="numpy", parallel=True)
-def forward_views(shapes, values, cameras, images):
-    """Project onto many views, one a thread: images [view, channel · v, u + 8] must be zero."""
-    for view in prange(cameras.shape[0]):
-        whole = (0, values.shape[0])
-        _forward_chunk(shapes, values, whole, cameras[view], images[view], images.shape[2] - WIDTH)
 
 
 @njit(cache=True, error_model="numpy", parallel=True)

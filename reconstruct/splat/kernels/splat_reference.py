@@ -102,5 +102,17 @@ def shadow(shapes: Array, camera: Array) -> tuple[Array, Array, Array, Array]:
     return (ray - across) @ dual.T, jacobian, ray, tau
 
 
+def rotation_matrices(quaternions: Array) -> Array:
+    """Turn quaternions (w, x, y, z) of any length but zero into rotation matrices [splat, 3, 3]."""
+    q = np.asarray(quaternions, np.float64)
+    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
 def _detector(by_channel: Array) -> tuple[int, int]:
     return by_channel.shape[1], by_channel.shape[2] - WIDTH
