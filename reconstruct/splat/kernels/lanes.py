@@ -5,6 +5,8 @@ type `lanes` is an LLVM vector; on machines with narrower registers LLVM splits 
 """
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from llvmlite import ir
@@ -58,7 +60,12 @@ def _address(context, builder, array_type, array, row, column):
     return builder.bitcast(at, _FLOATS.as_pointer())
 
 
-@intrinsic
+def _operation(function: Callable[..., Any]) -> Any:
+    """Make an intrinsic, whose first argument is numba's own and not the caller's."""
+    return intrinsic(function)
+
+
+@_operation
 def load(typingctx, array, row, column):
     """Read array[row, column : column + 8]."""
 
@@ -70,7 +77,7 @@ def load(typingctx, array, row, column):
     return lanes(array, types.intp, types.intp), codegen
 
 
-@intrinsic
+@_operation
 def store(typingctx, array, row, column, value):
     """Write array[row, column : column + 8]."""
 
@@ -82,7 +89,7 @@ def store(typingctx, array, row, column, value):
     return types.void(array, types.intp, types.intp, lanes), codegen
 
 
-@intrinsic
+@_operation
 def spread(typingctx, number):
     """Return eight copies of a float32."""
 
@@ -92,7 +99,7 @@ def spread(typingctx, number):
     return lanes(types.float32), codegen
 
 
-@intrinsic
+@_operation
 def ramp(typingctx, first):
     """Return first, first + 1, … first + 7."""
 
@@ -102,7 +109,7 @@ def ramp(typingctx, first):
     return lanes(types.float32), codegen
 
 
-@intrinsic
+@_operation
 def below(typingctx, first, limit):
     """Return 1 in the lanes k with first + k < limit, and 0 in the others."""
 
@@ -120,7 +127,7 @@ def below(typingctx, first, limit):
 
 
 def _binary(instruction: str, doc: str):
-    @intrinsic
+    @_operation
     def operation(typingctx, a, b):
         def codegen(context, builder, signature, args):
             return getattr(builder, instruction)(*args)
@@ -136,7 +143,7 @@ mul = _binary("fmul", "a · b")
 div = _binary("fdiv", "a / b")
 
 
-@intrinsic
+@_operation
 def fma(typingctx, a, b, c):
     """Return a·b + c, rounded once."""
 
@@ -146,7 +153,7 @@ def fma(typingctx, a, b, c):
     return lanes(lanes, lanes, lanes), codegen
 
 
-@intrinsic
+@_operation
 def sqrt(typingctx, a):
     """Return √a."""
 
@@ -156,7 +163,7 @@ def sqrt(typingctx, a):
     return lanes(lanes), codegen
 
 
-@intrinsic
+@_operation
 def exp(typingctx, a):
     """Return eᵃ with a clamped to ±79; relative error below 2e-7 + 6e-8·|a|."""
 
@@ -175,7 +182,7 @@ def exp(typingctx, a):
     return lanes(lanes), codegen
 
 
-@intrinsic
+@_operation
 def total(typingctx, a):
     """Return the sum of the eight lanes, by halves."""
 

@@ -29,15 +29,14 @@ CHUNKS = 16  # of splats at least, one a task
 BANDS, BAND = 16, 32  # at most so many bands of rows, each of at least so many: a task adds splats in their order
 ROWS = 16  # rows by multiplication before the exponentials are taken anew
 STEEP = 110.0  # −2 log of the faintest value that multiplication may start from
-HALF = np.float32(-0.5)
 LARGEST = 1e30  # of a line integral: what is longer is not a splat
 # a camera vector: source, detector centre − source, u step, v step, then numbers, and what follows from all these
 SOURCE, ACROSS, STEP_U, STEP_V, CUTOFF, TOLERANCE, BOX = 0, 3, 6, 9, 12, 13, 14
 DEPTH, DUAL_U, DUAL_V, ORIGIN_U, ORIGIN_V, PEAK = 15, 18, 21, 24, 25, 26
 CAMERA = 27
-# a footprint: centre (u, v), C, covariance and amplitude, whether exact, D and E
-U0, V0, C_UU, C_UV, C_VV, S_UU, S_UV, S_VV, W0, EXACT, D_1, E_1 = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 15
-FOOTPRINT = 20
+# a footprint: centre (u, v), C, covariance, peak, whether exact, D and E, and the cutoff's reach in u and v
+U0, V0, C_UU, C_UV, C_VV, S_UU, S_UV, S_VV, W0, EXACT, D_1, E_1, REACH_U, REACH_V = *range(11), 15, 20, 21
+FOOTPRINT = 22
 
 
 def camera_vectors(poses: NDArray[np.float64], n_detector: tuple[int, int]) -> NDArray[np.float64]:
@@ -115,12 +114,13 @@ def footprint(shapes, i, camera, fp):
     s_uu, s_vv = s_uu + box, s_vv + box
     fp[C_UU], fp[C_UV], fp[C_VV] = s_vv / boxed, -s_uv / boxed, s_uu / boxed
     fp[S_UU], fp[S_UV], fp[S_VV] = s_uu, s_uv, s_vv
+    fp[REACH_U], fp[REACH_V] = camera[CUTOFF] * math.sqrt(s_uu), camera[CUTOFF] * math.sqrt(s_vv)
     rr = _dot(ray, ray)
     fp[W0] = camera[PEAK] * s0 * s1 * s2 / (tau * tau) * math.sqrt(rr / boxed)
     fp[EXACT] = 0.0
     if camera[TOLERANCE] < np.inf:
         _write_depths(shapes, i, camera, ray, fp)
-        fp[EXACT] = _departure(fp, camera[CUTOFF]) > camera[TOLERANCE]
+        fp[EXACT] = _departure(fp) > camera[TOLERANCE]
     return 0 < fp[W0] < LARGEST
 
 
@@ -152,12 +152,12 @@ def _write_quadratic(x, y, z, fp, at):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _departure(fp, cutoff):
+def _departure(fp):
     """Bound what EWA leaves out within the cutoff, as a share of the peak.
 
     |d log w| ≤ ½|D/E − 1| + ½Q|D − 1|, and ½Q exp(−½Q) ≤ 1/e.
     """
-    u, v = cutoff * math.sqrt(fp[S_UU]), cutoff * math.sqrt(fp[S_VV])
+    u, v = fp[REACH_U], fp[REACH_V]
     ratio = abs(fp[D_1] - fp[E_1]) * u + abs(fp[D_1 + 1] - fp[E_1 + 1]) * v
     ratio += abs(fp[D_1 + 2] - fp[E_1 + 2]) * u * u + abs(fp[D_1 + 3] - fp[E_1 + 3]) * u * v
     ratio += abs(fp[D_1 + 4] - fp[E_1 + 4]) * v * v
@@ -166,9 +166,9 @@ def _departure(fp, cutoff):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _columns(fp, cutoff, n_u):
+def _columns(fp, n_u):
     """Return the half-open range of columns within the cutoff."""
-    half = min(cutoff * math.sqrt(fp[S_UU]), 1e9)
+    half = min(fp[REACH_U], 1e9)
     centre = min(max(fp[U0], -1e9), 1e9)
     return max(0, int(math.ceil(centre - half))), min(n_u, int(math.floor(centre + half)) + 1)
 
@@ -183,8 +183,8 @@ def _rows(fp, column, cutoff, n_v):
     if left <= 0:
         return 0, 0
     half, slope = math.sqrt(left / fp[C_VV]), fp[S_UV] / fp[S_UU]
-    low = min(max(fp[V0] + min(slope * a, slope * b) - half, -1e9), 1e9)
-    high = min(max(fp[V0] + max(slope * a, slope * b) + half, -1e9), 1e9)
+    low = min(max(fp[V0] + max(min(slope * a, slope * b) - half, -fp[REACH_V]), -1e9), 1e9)
+    high = min(max(fp[V0] + min(max(slope * a, slope * b) + half, fp[REACH_V]), -1e9), 1e9)
     return max(0, int(math.ceil(low))), min(n_v, int(math.floor(high)) + 1)
 
 
@@ -201,12 +201,13 @@ def _is_steep(fp, column, first, last):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _value(fp, du, dv):
+def _value(fp, column, t, dv):
     """Return √(E/D) exp(−Q/2D), or exp(−Q/2) for a splat in its EWA form, in eight lanes."""
-    along = fma(du, spread(np.float32(fp[C_UU])), spread(np.float32(2 * fp[C_UV] * dv)))
-    q = mul(spread(HALF), fma(along, du, spread(np.float32(fp[C_VV] * dv * dv))))
+    falling = mul(t, spread(np.float32(-0.5 * fp[C_UU])))
+    q = fma(falling, t, spread(np.float32(-0.5 * dv * dv / fp[S_VV])))
     if fp[EXACT] == 0:
         return exp(q)
+    du = ramp(np.float32(column - fp[U0]))
     d, e = _quadratic(fp, D_1, du, dv), _quadratic(fp, E_1, du, dv)
     return mul(sqrt(div(e, d)), exp(div(q, d)))
 
@@ -218,10 +219,14 @@ def _quadratic(fp, at, du, dv):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _start(fp, du, dv, inside):
-    """Return the values of a row and what takes them to the next: g, r with g ← g·r, r ← r·exp(−C_vv)."""
-    r = exp(fma(du, spread(np.float32(-fp[C_UV])), spread(np.float32(-fp[C_VV] * (dv + 0.5)))))
-    return mul(inside, _value(fp, du, dv)), r
+def _start(fp, column, dv, n_u):
+    """Return the values of a row and what takes them to the next: g, r with g ← g·r, r ← r·exp(−C_vv).
+
+    With t = du − dv·S_uv/S_vv, Q = C_uu t² + dv²/S_vv: a sum of squares, in which a thin splat's terms do not cancel.
+    """
+    t = ramp(np.float32(column - fp[U0] - dv * fp[S_UV] / fp[S_VV]))
+    r = exp(fma(t, spread(np.float32(-fp[C_UV])), spread(np.float32(-dv / fp[S_VV] - 0.5 * fp[C_VV]))))
+    return mul(below(column, n_u), _value(fp, column, t, dv)), r
 
 
 @njit(cache=True, error_model="numpy")
@@ -231,16 +236,15 @@ def add_splat(fp, values, cutoff, image, n_u, rows):
     n_v = image.shape[0] // n_c
     if not abs(values[0]) * fp[W0] + abs(values[n_c - 1]) * fp[W0] < LARGEST:
         return
-    left, right = _columns(fp, cutoff, n_u)
+    left, right = _columns(fp, n_u)
     fall = spread(np.float32(math.exp(-fp[C_VV])))
     a, b = spread(np.float32(values[0] * fp[W0])), spread(np.float32(values[n_c - 1] * fp[W0]))
     for column in range(left, right, WIDTH):
         low, high = _rows(fp, column, cutoff, n_v)
         low, high = max(low, rows[0]), min(high, rows[1])
-        du, inside = ramp(np.float32(column - fp[U0])), below(column, n_u)
         by_rows = fp[EXACT] == 0 and not _is_steep(fp, column, low, high)
         for start in range(low, high, ROWS if by_rows else 1):
-            g, r = _start(fp, du, start - fp[V0], inside)
+            g, r = _start(fp, column, start - fp[V0], n_u)
             for v in range(start, min(start + ROWS, high) if by_rows else start + 1):
                 store(image, v, column, fma(g, a, load(image, v, column)))
                 if n_c == 2:
@@ -254,16 +258,15 @@ def read_splat(fp, images, cutoff, n_u, sums):
     """Add Σ w·image of every channel, at most four, to `sums`."""
     n_c = sums.shape[0]
     n_v = images.shape[0] // n_c
-    left, right = _columns(fp, cutoff, n_u)
+    left, right = _columns(fp, n_u)
     fall = spread(np.float32(math.exp(-fp[C_VV])))
     zero = spread(np.float32(0))
     s0, s1, s2, s3 = zero, zero, zero, zero
     for column in range(left, right, WIDTH):
         low, high = _rows(fp, column, cutoff, n_v)
-        du, inside = ramp(np.float32(column - fp[U0])), below(column, n_u)
         by_rows = fp[EXACT] == 0 and not _is_steep(fp, column, low, high)
         for start in range(low, high, ROWS if by_rows else 1):
-            g, r = _start(fp, du, start - fp[V0], inside)
+            g, r = _start(fp, column, start - fp[V0], n_u)
             for v in range(start, min(start + ROWS, high) if by_rows else start + 1):
                 s0 = fma(g, load(images, v, column), s0)
                 if n_c > 1:
@@ -288,7 +291,7 @@ def _footprints(shapes, camera, n_v, bounds, table, reach):
     for i in range(bounds[0], bounds[1]):
         reach[i, 0], reach[i, 1] = 0, 0
         if footprint(shapes, i, camera, table[i]):
-            half, centre = camera[CUTOFF] * math.sqrt(table[i, S_VV]), table[i, V0]
+            half, centre = table[i, REACH_V], table[i, V0]
             reach[i, 0] = max(0.0, centre - half)
             reach[i, 1] = max(0.0, min(n_v, centre + half + 1))
 

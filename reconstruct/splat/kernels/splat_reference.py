@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from reconstruct.splat.kernels.lanes import WIDTH
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 
 def forward_views(shapes: Array, values: Array, cameras: Array, images: Array) -> None:
