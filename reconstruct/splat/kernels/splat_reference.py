@@ -75,6 +75,23 @@ def spreads(shapes: Array, camera: Array) -> tuple[Array, Array]:
     return s, s + camera[14] * np.eye(2)
 
 
+def voxelise(shapes: Array, values: Array, grid: Array, size: tuple[int, int, int]) -> Array:
+    """Sum values [splat, channel] times the Gaussians on a grid: [channel, z, y, x]; `grid` is that of the kernel.
+
+    A voxel that is a box has variance d²/12 in each axis: Σ grows by it, and the peak falls so that the mass stays.
+    """
+    spacing, first, (cutoff, box) = grid[:3], grid[3:6], grid[6:]
+    covariance, _, _ = covariances(shapes)
+    boxed = covariance + np.diag(box * spacing[::-1] ** 2)
+    peaks = np.sqrt(np.linalg.det(covariance) / np.linalg.det(boxed))
+    indices = np.meshgrid(*(np.arange(n) for n in size), indexing="ij")
+    points = np.stack([o + i * d for o, i, d in zip(first, indices, spacing, strict=True)][::-1], -1)
+    x = points - np.asarray(shapes[:3], np.float64).T[:, None, None, None]
+    square = np.einsum("izyxa,iab,izyxb->izyx", x, np.linalg.inv(boxed), x)
+    blobs = np.where(square <= cutoff**2, np.exp(-0.5 * square) * peaks[:, None, None, None], 0.0)
+    return np.einsum("ic,izyx->czyx", values, blobs)
+
+
 def covariances(shapes: Array) -> tuple[Array, Array, Array]:
     """Return Σ [splat, 3, 3] in mm², the scales [splat, 3] and the axes [splat, 3, 3], one a column."""
     shapes = np.asarray(shapes, np.float64)
