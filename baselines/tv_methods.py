@@ -19,9 +19,9 @@ from baselines.iterative import (
 )
 from baselines.sart import Passes
 from baselines.settings import keywords
-from baselines.tv import Denoiser, axis_ratios, descend, total_variation
 from ctsim.errors import InputError
 from ctsim.types import Scan, Volume
+from reconstruct.tv import Denoiser, axis_ratios, descend, total_variation
 
 # Sidky and Pan's values
 RELAXATION_FALLS = 0.995

@@ -11,12 +11,12 @@ from scipy.sparse.linalg import lsqr
 from baselines.iterative import System, visiting_order, watch
 from baselines.krylov import cgls
 from baselines.sart import os_sart, sart, sirt
-from baselines.tv import Denoiser, axis_ratios, descend, total_variation
 from baselines.tv_methods import asd_pocs, awpcsd, fista_tv
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.types import Scan, Status
 from reconstruct.projector import forward
+from reconstruct.tv import Denoiser, axis_ratios, descend, total_variation
 
 MU, RADIUS, CENTRE = 0.02, 10.0, np.array([1.0, -2.0, 0.5])  # 1/mm, mm, x y z
 GEOMETRY = Geometry(
