@@ -11,8 +11,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from baselines.iterative import Array, weighted_norm
 from ctsim.geometry import Geometry
+
+Array = NDArray[np.float32]
 
 
 def axis_ratios(geometry: Geometry) -> NDArray[np.float32]:
@@ -64,13 +65,12 @@ def descend(x: Array, length: float, steps: int, ratios: NDArray[np.float32], de
     differences D are weighted by exp(−(D/δ)²), held fixed within a step: adaptive-weighted TV, which spares edges
     (Liu, Ma, Fan and Liang, Phys. Med. Biol. 57, 2012, doi:10.1088/0031-9155/57/23/7923).
     """
-    field, ones = np.empty((3, *x.shape), np.float32), np.ones_like(x)
-    gradient = np.empty_like(x)
+    field, gradient = np.empty((3, *x.shape), np.float32), np.empty_like(x)
     for _ in range(steps):
         least = np.float32(max(1e-4 * float(np.abs(x).max()), 1e-15))
         _normalised_slopes(x, ratios, np.float32(1 / delta), least, field)
         _transposed(field, ratios, gradient)
-        norm = weighted_norm(gradient, ones)
+        norm = math.sqrt(float(np.einsum("ijk,ijk", gradient, gradient, dtype=np.float64)))
         if norm == 0:
             return
         gradient *= np.float32(length / norm)
