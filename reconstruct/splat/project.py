@@ -8,13 +8,31 @@ from numpy.typing import NDArray
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from reconstruct.projector import Views, view_indices
+from reconstruct.splat.kernels import gradient_cpu
 from reconstruct.splat.kernels import splat_cpu as kernels
 from reconstruct.splat.kernels.lanes import WIDTH
+from reconstruct.splat.model import Splats
 
 CUTOFF = 3.5
 """Mahalanobis radius beyond which a splat is zero."""
 TOLERANCE = 1e-3
 """A splat is projected exactly where EWA would leave out more than this share of its peak: 0 always, inf never."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gradient:
+    """How a loss of one view changes with the splats, float32, in the loss's unit; 0 for splats that are left out.
+
+    By `densities` [splat, channel] (1/mm), `positions` [splat, 3] (mm), natural `log_scales` [splat, 1] of round splats
+    and [splat, 3] of others, and `rotations` [splat, 4], at right angles to the quaternion (None for round splats).
+    `centres` [splat] is the length of the gradient by the centre's place on the detector, in pixels.
+    """
+
+    densities: NDArray[np.float32]
+    positions: NDArray[np.float32]
+    log_scales: NDArray[np.float32]
+    rotations: NDArray[np.float32] | None
+    centres: NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,6 +93,29 @@ class Projector:
         stack = np.ascontiguousarray(images).reshape(len(chosen), n_c * n_v, n_u + WIDTH)
         kernels.backward_views(shapes, self.cameras[chosen], stack, sums)
         return sums
+
+    def gradient(self, splats: Splats, images: NDArray[np.float32], view: int) -> Gradient:
+        """Return the gradient of a loss whose derivative by view `view` is `images` [channel, v, u + 8].
+
+        It is that of the EWA form whatever the tolerance is (a Projector of infinite tolerance has no other), and
+        knows no cutoff. One channel a density. Raises InputError for wrong shapes, and a view that does not exist.
+        """
+        (chosen,), (n_v, n_u) = view_indices(self.geometry, [view]), self.geometry.n_detector
+        n, n_c = splats.densities.shape
+        _check("images", images, [(n_c, n_v, n_u + WIDTH)])
+        camera, out = self.cameras[chosen].copy(), np.zeros((n, gradient_cpu.GRADIENT), np.float32)
+        camera[kernels.TOLERANCE] = np.inf
+        image = np.ascontiguousarray(images).reshape(n_c * n_v, n_u + WIDTH)
+        turns = np.ones((n, 4), np.float32) if splats.rotations is None else splats.rotations
+        gradient_cpu.gradient(splats.shapes(), splats.densities, turns, camera, image, out)
+        by_scale = out[:, gradient_cpu.SCALE : gradient_cpu.QUATERNION]
+        return Gradient(
+            densities=out[:, :n_c],
+            positions=out[:, gradient_cpu.POSITION : gradient_cpu.SCALE],
+            log_scales=by_scale.sum(1, keepdims=True) if splats.rotations is None else by_scale,
+            rotations=None if splats.rotations is None else out[:, gradient_cpu.QUATERNION : gradient_cpu.CENTRE],
+            centres=out[:, gradient_cpu.CENTRE],
+        )
 
 
 def _check(name: str, array: NDArray[np.float32], shapes: list[tuple[int, ...]]) -> None:
