@@ -255,6 +255,22 @@ def test_no_splats_and_no_views_give_zeros(kind):
     assert not projector.adjoint(some.shapes(), np.ones((0, 2, 23, 30 + WIDTH), np.float32), []).any()
 
 
+@pytest.mark.parametrize(
+    "name, kind", [("detector offset", "round"), ("7 by 5", "ellipsoids"), ("tilted", "ellipsoids")]
+)
+def test_sums_over_many_splats_and_over_pixels_agree_with_float64(name, kind):
+    projector, given = Projector(geometry=GEOMETRIES[name], tolerance=np.inf, cutoff=6.0), splats(40, kind)
+    there = projector.forward(given.shapes(), given.densities)
+    stack = np.zeros((3, 2 * there.shape[2], there.shape[3]))
+    reference.forward_views(given.shapes(), given.densities, projector.cameras, stack)
+    peak = max(reference.peaks(given.shapes(), camera).max() for camera in projector.cameras)
+    # one splat's error is 1e-5 of its peak at worst, and no more than a few of them meet in a pixel
+    np.testing.assert_allclose(there, stack.reshape(there.shape), rtol=0, atol=3e-5 * peak)
+    back, sums = projector.adjoint(given.shapes(), there), np.zeros((40, 2))
+    reference.backward_views(given.shapes(), projector.cameras, stack, sums)
+    np.testing.assert_allclose(back, sums, rtol=0, atol=1e-5 * sums.max())
+
+
 @pytest.mark.parametrize("tolerance", [0.0, np.inf])
 @pytest.mark.parametrize("channels", [1, 2])
 @pytest.mark.parametrize("name, kind", [("centred", "round"), ("5 by 7", "round"), ("7 by 5", "ellipsoids")])
