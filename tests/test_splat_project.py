@@ -334,6 +334,17 @@ def test_a_long_thin_splat_across_the_pixels_keeps_its_ridge():
             check(Projector(geometry=geometry, tolerance=np.inf, box=box), shapes, 1e-5)
 
 
+def test_a_needle_loses_no_digits():
+    """The determinant of its shadow is 10⁻¹⁴ of the products that it is the difference of."""
+    geometry = with_(n_detector=(23, 31), n_views=1, start_deg=0.0)
+    shapes = one([0, 0, 0], [1e-6, 1e-6, 20], (np.cos(0.39), np.sin(0.39), 0, 0)).shapes()
+    for tolerance in (0.0, np.inf):
+        image = Projector(geometry=geometry, tolerance=tolerance, box=False).forward(
+            shapes, np.ones((1, 1), np.float32)
+        )
+        assert image[0, 0, 11, 15] == pytest.approx(np.sqrt(2 * np.pi) * 1e-6, rel=1e-5)  # across the needle
+
+
 def test_a_tall_splat_is_as_exact_as_others():
     """Rows by multiplication err with the square of their number, so they start anew now and then."""
     geometry = with_(n_detector=(400, 12), d_detector=(0.2, 1.6), n_views=1, start_deg=0.0)

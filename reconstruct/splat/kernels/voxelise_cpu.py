@@ -5,8 +5,9 @@ squares, so nothing cancels: a slice knows ξ_z, a row ξ_y, and along the row �
 1/12 to each of Σ's diagonal, to second order, and the peak falls so that the mass stays. Rows end where |ξ| reaches
 the cutoff, up to seven voxels later.
 
-Shapes are those of `splat_cpu`. Volumes are float32 [channel · z · y, x + 8]; the last 8 columns are scratch. A grid
-vector is (voxel size z, y, x in mm, centre of voxel 0 z, y, x in mm, cutoff, variance of a box in voxels²).
+Shapes are those of `splat_cpu`. Volumes are float32 [channel · z · y, x + 8]; the last 8 columns are scratch,
+and zero where they are read. A grid vector is (voxel size z, y, x in mm, centre of voxel 0 z, y, x in mm, cutoff,
+variance of a box in voxels²).
 """
 
 import math
@@ -14,7 +15,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from reconstruct.splat.kernels.lanes import WIDTH, below, exp, fma, load, mul, ramp, spread, store, total
+from reconstruct.splat.kernels.lanes import WIDTH, exp, fma, load, mul, ramp, spread, store, total
 from reconstruct.splat.kernels.splat_cpu import CHUNKS, LARGEST
 
 SLABS = 16  # at most so many slabs of slices; a task adds splats to a slab in their order
@@ -80,11 +81,11 @@ def _row(b, xi_z, y, left, n_x):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _value(b, square, centre, x, n_x):
-    """Return exp(−½|ξ|²) in eight voxels of a row, and 0 beyond the grid."""
+def _value(b, square, centre, x):
+    """Return exp(−½|ξ|²) in eight voxels of a row."""
     xi = mul(ramp(np.float32(x - centre)), spread(np.float32(1 / b[L_XX])))
     along = mul(xi, spread(HALF))
-    return mul(below(x, n_x), exp(fma(along, xi, spread(np.float32(-0.5 * square)))))
+    return exp(fma(along, xi, spread(np.float32(-0.5 * square))))
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -112,7 +113,7 @@ def add_blob(b, values, cutoff, slices, size, volume):
                 square, centre, x_low, x_high = _row(b, xi_z, y, left, n_x)
                 row = (c * n_z + z) * n_y + y
                 for x in range(x_low, x_high, WIDTH):
-                    g = _value(b, square, centre, x, n_x)
+                    g = _value(b, square, centre, x)
                     store(volume, row, x, fma(g, a, load(volume, row, x)))
 
 
@@ -128,7 +129,7 @@ def read_blob(b, cutoff, size, volume, sums):
             for y in range(y_low, y_high):
                 square, centre, x_low, x_high = _row(b, xi_z, y, left, n_x)
                 for x in range(x_low, x_high, WIDTH):
-                    s = fma(_value(b, square, centre, x, n_x), load(volume, (c * n_z + z) * n_y + y, x), s)
+                    s = fma(_value(b, square, centre, x), load(volume, (c * n_z + z) * n_y + y, x), s)
         sums[c] += np.float32(b[W0]) * total(s)
 
 
