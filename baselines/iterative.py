@@ -155,7 +155,7 @@ def finish(system: System, course: Course, x: Array, **details: Any) -> Volume:
     return Volume(
         values=torch.from_numpy(values),
         status=Status.DIVERGED if reason else Status.OK,
-        reason="; ".join(filter(None, (reason, beyond, str(system.about_weights.get("mask_reason", ""))))),
+        reason=reason,
         details={
             "view_updates": course.view_updates,
             "residual": residual if finite else None,
@@ -166,6 +166,7 @@ def finish(system: System, course: Course, x: Array, **details: Any) -> Volume:
             **system.beyond.details(),
             **system.about_weights,
             **details,
+            **({"limitation": beyond} if beyond else {}),
         },
     )
 

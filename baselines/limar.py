@@ -82,11 +82,11 @@ def interpolated(scan: Scan, trace: Trace, how: str) -> tuple[torch.Tensor, Fill
 
 
 def uncorrected(first: Volume, metal: Metal) -> Volume:
-    """Return FDK's volume as it is, with what is known of the mask."""
+    """Return FDK's volume as it is; the details say what is doubted about the mask."""
     return Volume(
         values=first.values,
         status=first.status,
-        reason=first.reason or metal.doubt,
+        reason=first.reason,
         details=first.details | metal.details() | {"corrected": False},
     )
 

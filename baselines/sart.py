@@ -66,7 +66,7 @@ def sart(scan: Scan, settings: Sart, device: str) -> Volume:
     """Reconstruct by SART, one view at a time; keywords are those of `Sart`.
 
     Details hold view updates, residuals (by pass, each view's taken before its update, and that of the result) and
-    step sizes. The reason says where the object goes on beyond the grid or the detector. Raises InputError for wrong
+    step sizes, and as limitation where the object goes on beyond the grid or the detector. Raises InputError for wrong
     parameters and another device than the CPU.
     """
     return _run(scan, device, settings, scan.geometry.n_views)

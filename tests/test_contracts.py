@@ -1,5 +1,8 @@
 """What every method of the table owes its caller, on the smallest scene."""
 
+import dataclasses
+
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -23,6 +26,7 @@ def test_a_method_gives_a_finite_volume_of_the_scans_grid(name, stored):
         assert isinstance(reason, str)
         pytest.skip(reason)
     volume = method.reconstruct(scan, "cpu")
+    # a reason is for what went wrong; remarks on a volume that is fine stand in its details
     assert volume.status is Status.OK and not volume.reason
     assert volume.values.dtype == torch.float32
     assert tuple(volume.values.shape) == stored.geometry.n_voxel
@@ -31,6 +35,22 @@ def test_a_method_gives_a_finite_volume_of_the_scans_grid(name, stored):
     water = stored.reference("effective")[stored.labels == 1]
     measured = volume.values.numpy()[stored.labels == 1]
     assert np.median(water) / 2 < np.median(measured) < 2 * np.median(water)
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_a_remark_on_a_truncated_scan_is_no_reason(name, stored):
+    """Six columns see 10 mm of an object of three times that, and the mask of no metal is doubted."""
+    method, whole = find(name), scan_for(find(name), stored, "metal")
+    seen = slice(6, 12)
+    geometry = msgspec.structs.replace(whole.geometry, n_detector=(16, 6))
+    scan = dataclasses.replace(whole, geometry=geometry, counts=whole.counts[..., seen], flat=whole.flat[..., seen])
+    doubted = {key: value for key, value in (("mask", "auto"), ("weights", "trace")) if key in method.params}
+    volume = find(name, doubted).reconstruct(scan, "cpu")
+    assert not volume.reason or volume.status is not Status.OK
+    if "weights" in method.params:
+        assert "over the detector" in volume.details["limitation"]
+    if doubted:
+        assert volume.details["mask_status"] == "mask_unreliable" and volume.details["mask_reason"]
 
 
 @pytest.mark.parametrize("name", TABLE)

@@ -145,7 +145,8 @@ def test_the_guard_fires_on_aluminium_beside_bone():
     metal = auto_mask(first.values.numpy())
     assert metal.doubt and not metal.found
     volume = limar.reconstruct(scan, mask="auto")
-    assert torch.equal(volume.values, first.values) and "times" in volume.reason
+    assert torch.equal(volume.values, first.values)
+    assert volume.status is Status.OK and not volume.reason and "times" in volume.details["mask_reason"]
 
 
 def test_the_automatic_mask_finds_iron(iron):
