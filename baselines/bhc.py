@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from baselines.inpaint import Filled
 from baselines.limar import check_insert, finished, uncorrected
 from baselines.metal import Trace, find_metal, reinsert
 from baselines.morphology import dilate
@@ -58,7 +59,7 @@ def bhc_poly(
     fit = _fit(scan, trace, choice.columns, choice.water)
     if not fit.pixels:
         return _left(uncorrected(first, metal), "no pixel of the trace has a signal")
-    negative = 0
+    negative, shown = 0, Filled(shown=scan.geometry.n_views // 4)
 
     def read(views: slice) -> Array:
         nonlocal negative
@@ -69,6 +70,7 @@ def bhc_poly(
             added = _terms(metal_length[held], tissue[held]) @ fit.coefficients
             negative += int((added < 0).sum())
             p[k - views.start][held] -= np.maximum(added, 0).astype(np.float32)
+        shown.keep(p, views)
         return p
 
     values = fdk_stream(read, scan.geometry)
@@ -77,7 +79,9 @@ def bhc_poly(
         "negative_pixels": negative,
         "view_updates": (2 + choice.view_updates) * scan.geometry.n_views,
     }
-    return finished(values, first, metal, fit.details() | choice.details() | counted)
+    held = trace.lengths(shown.shown) > trace.thinnest
+    pictured = {"intermediates": shown.intermediates(held) | {"prior": choice.columns.transpose(2, 0, 1)}}
+    return finished(values, first, metal, fit.details() | choice.details() | counted | pictured)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,6 +10,7 @@ import torch
 
 from baselines import bhc, known_spectrum
 from baselines.known_spectrum import Beam, precorrect
+from benchmarks import intermediates
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
@@ -22,6 +23,7 @@ from ctsim.solids import FRUSTUM, Primitive, Solid
 from ctsim.types import Phantom, Scan, Scanner, Status
 from ctsim.voxelise import metal_mask
 from reconstruct.fdk import reconstruct as fdk
+from reconstruct.log import line_integrals
 
 METHODS = {
     "bhc-poly": bhc.bhc_poly,
@@ -202,6 +204,17 @@ def test_starved_and_empty_readings_stay_finite(starving, name):
         volume = METHODS[name](dataclasses.replace(starving, counts=counts))
         assert volume.status is Status.OK and bool(torch.isfinite(volume.values).all())
         assert volume.values.abs().max() < 20 * first
+
+
+def test_what_pictures_show_is_what_was_backprojected(rods):
+    scan, _ = rods
+    found = intermediates.taken(bhc.bhc_poly(scan).details, scan.geometry)
+    measured = line_integrals(scan, int(found["view"]))[0].numpy()
+    trace, less = found["trace"], found["projection"]
+    assert trace.any() and (less[~trace] == measured[~trace]).all() and (less[trace] <= measured[trace]).all()
+    assert less[trace].mean() < measured[trace].mean()
+    # prior and volume share a grid: there is no metal in it, but water
+    assert 0 < found["prior"][scan.metal.numpy() != 0].max() < 0.05
 
 
 def test_where_no_pixel_of_the_trace_has_a_signal_nothing_is_fitted(starving):
