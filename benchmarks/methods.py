@@ -42,6 +42,7 @@ TABLE: dict[str, tuple[str, str]] = {
     "fista-tv": ("baselines.tv_methods:fista_tv", COUNTS_ONLY),
     "asd-pocs": ("baselines.tv_methods:asd_pocs", COUNTS_ONLY),
     "awpcsd": ("baselines.tv_methods:awpcsd", COUNTS_ONLY),
+    "splat": ("reconstruct.splat.method:reconstruct", COUNTS_ONLY),
 }
 """name -> ("module:function", what it needs beside the counts)."""
 

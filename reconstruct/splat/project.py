@@ -17,6 +17,7 @@ CUTOFF = 3.5
 """Mahalanobis radius beyond which a splat is zero."""
 TOLERANCE = 1e-3
 """A splat is projected exactly where EWA would leave out more than this share of its peak: 0 always, inf never."""
+MANY_VIEWS = 8  # from so many on a thread takes whole views
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,7 +70,7 @@ class Projector:
         _check("shapes", shapes, [(4, n), (15, n)])
         _check("values", values, [(n, 1), (n, 2)])
         images = np.zeros((len(chosen), n_c * n_v, n_u + WIDTH), np.float32)
-        if len(chosen) >= kernels.CHUNKS:
+        if len(chosen) >= MANY_VIEWS:
             kernels.forward_views(shapes, values, self.cameras[chosen], images)
         else:
             table, reach = np.empty((n, kernels.FOOTPRINT)), np.empty((n, 2), np.int32)

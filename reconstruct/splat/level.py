@@ -1,0 +1,129 @@
+"""A scan at one resolution: binned data on a coarser grid, fewer views of it, and back."""
+
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ctsim.geometry import Geometry
+from reconstruct.splat.kernels.lanes import WIDTH
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Data:
+    """Line integrals `p` and their weights, float32 [view, v, u + 8]: the last columns are scratch of weight 0."""
+
+    geometry: Geometry
+    p: NDArray[np.float32]
+    weights: NDArray[np.float32]
+
+
+def padded(geometry: Geometry, p: NDArray[np.float32], valid: NDArray[np.bool_]) -> Data:
+    """Weight line integrals [view, v, u] by the photons that came through, exp(−p), and 0 where not `valid`."""
+    n_u = geometry.n_detector[1]
+    data = Data(geometry=geometry, p=_wide(geometry), weights=_wide(geometry))
+    data.p[..., :n_u] = p
+    data.weights[..., :n_u] = np.where(valid, np.exp(-np.maximum(p, 0)), 0)
+    return data
+
+
+def _wide(geometry: Geometry) -> NDArray[np.float32]:
+    n_v, n_u = geometry.n_detector
+    return np.zeros((geometry.n_views, n_v, n_u + WIDTH), np.float32)
+
+
+def coarser(data: Data) -> Data:
+    """Return every second view, with pixels and voxels of twice the size; intensities are averaged, not their logs.
+
+    An odd last row or column of pixels is left out; an odd number of voxels is rounded up.
+    """
+    fine = data.geometry
+    views = np.arange(0, fine.n_views, 2)
+    n_v, n_u = (max(n // 2, 1) for n in fine.n_detector)
+    step = [1 if n == 1 else 2 for n in fine.n_detector]
+    poses = fine.pose_array()[views]
+    poses[:, 3:6] -= 0.5 * (fine.n_detector[0] - n_v * step[0]) * poses[:, 9:12]
+    poses[:, 3:6] -= 0.5 * (fine.n_detector[1] - n_u * step[1]) * poses[:, 6:9]
+    poses[:, 6:9] *= step[1]
+    poses[:, 9:12] *= step[0]
+    n_voxel = tuple((n + 1) // 2 for n in fine.n_voxel)
+    odd = [0.5 * (2 * m - n) * d for m, n, d in zip(n_voxel, fine.n_voxel, fine.d_voxel, strict=True)]
+    geometry = msgspec.structs.replace(
+        fine,
+        n_voxel=n_voxel,
+        d_voxel=tuple(2 * d for d in fine.d_voxel),
+        off_origin=tuple(o + s for o, s in zip(fine.off_origin, odd, strict=True)),
+        n_detector=(n_v, n_u),
+        d_detector=(fine.d_detector[0] * step[0], fine.d_detector[1] * step[1]),
+        n_views=views.size,
+        angles_deg=None,
+        poses=tuple(tuple(row) for row in poses.tolist()),
+    )
+    shape = (views.size, n_v, step[0], n_u, step[1])
+    p, weights = (a[views, : n_v * step[0], : n_u * step[1]].reshape(shape) for a in (data.p, data.weights))
+    valid = weights > 0
+    n = np.maximum(valid.sum((2, 4)), 1)
+    mean = np.where(valid, np.exp(-p), 0).sum((2, 4)) / n
+    seen = np.asarray(valid.any((2, 4)), np.bool_)
+    return padded(geometry, -np.log(np.where(seen, mean, 1)).astype(np.float32), seen)
+
+
+def refined(values: NDArray[np.float32], fine: Geometry) -> NDArray[np.float32]:
+    """Interpolate a volume on `coarser`'s grid onto the fine grid that it was made of: [z, y, x]."""
+    where = np.meshgrid(*[(np.arange(n) - 0.5) / 2 for n in fine.n_voxel], indexing="ij", sparse=True)
+    full = np.broadcast_arrays(*where)
+    return np.asarray(ndimage.map_coordinates(values, full, order=1, mode="nearest"), np.float32)
+
+
+def carve(data: Data, open_below: float) -> NDArray[np.bool_]:
+    """Return the voxels [z, y, x] that some view sees and none shows to be empty.
+
+    A voxel is empty where a view has its shadow and p of the pixels around that lies below `open_below`. Pixels
+    without weight say nothing.
+    """
+    n_u = data.geometry.n_detector[1]
+    p = np.where(data.weights[..., :n_u] > 0, data.p[..., :n_u], np.inf)
+    near = np.asarray(ndimage.maximum_filter(p, (1, 3, 3))) > open_below
+    z, y, x = data.geometry.voxel_centres()
+    state = np.zeros(data.geometry.n_voxel, np.int8)
+    _carve(data.geometry.pose_array(), near, z, y, x, state)
+    return state == 1
+
+
+@njit(cache=True, parallel=True)
+def _carve(poses, blocked, z, y, x, state):
+    for k in prange(z.size):
+        for view in range(poses.shape[0]):
+            _carve_slice(poses[view], blocked[view], z[k], y, x, state[k])
+
+
+@njit(cache=True)
+def _carve_slice(pose, blocked, z, y, x, state):
+    """Mark voxels as seen (1) or empty (−1): v_c from Cramer's rule on source + t·(p − source) = centre + a·u + b·v."""
+    n_v, n_u = blocked.shape
+    ax, ay, az = pose[3] - pose[0], pose[4] - pose[1], pose[5] - pose[2]
+    nx = pose[7] * pose[11] - pose[8] * pose[10]
+    ny = pose[8] * pose[9] - pose[6] * pose[11]
+    nz = pose[6] * pose[10] - pose[7] * pose[9]
+    height = ax * nx + ay * ny + az * nz
+    uu = pose[6] ** 2 + pose[7] ** 2 + pose[8] ** 2
+    vv = pose[9] ** 2 + pose[10] ** 2 + pose[11] ** 2
+    uv = pose[6] * pose[9] + pose[7] * pose[10] + pose[8] * pose[11]
+    for j in range(y.size):
+        for i in range(x.size):
+            if state[j, i] < 0:
+                continue
+            cx, cy, cz = x[i] - pose[0], y[j] - pose[1], z - pose[2]
+            depth = (cx * nx + cy * ny + cz * nz) / height
+            if depth <= 0:
+                continue
+            ox, oy, oz = cx / depth - ax, cy / depth - ay, cz / depth - az
+            a = ox * pose[6] + oy * pose[7] + oz * pose[8]
+            b = ox * pose[9] + oy * pose[10] + oz * pose[11]
+            u = (a * vv - b * uv) / (uu * vv - uv * uv) + 0.5 * (n_u - 1)
+            v = (b * uu - a * uv) / (uu * vv - uv * uv) + 0.5 * (n_v - 1)
+            if -0.5 <= u < n_u - 0.5 and -0.5 <= v < n_v - 0.5:
+                state[j, i] = 1 if blocked[int(v + 0.5), int(u + 0.5)] else -1

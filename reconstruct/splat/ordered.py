@@ -1,0 +1,134 @@
+"""Weighted least squares by ordered subsets, one unknown a splat, edges kept.
+
+Minimises ½ Σ_rays w (P(u) − p)² + TV with w = exp(−p), the share of photons that came through, so that starved rays
+count for little and no mask is needed. A subset's step is s·F(s·g), g the gradient, s² the inverse of a separable
+majoriser of the Hessian (Erdogan and Fessler, Phys. Med. Biol. 44, 1999, doi:10.1088/0031-9155/44/11/311), and F a ramp
+filter of the transverse frequencies: n views of a subset overlap only below n/π cycles a field of view; above, one
+view alone answers for a frequency, and up to n times the step is stable there. Without F edges take eight times the
+passes.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruct.splat.curve import METAL, MaterialCurve
+from reconstruct.splat.lattice import Lattice
+from reconstruct.splat.level import Data
+from reconstruct.splat.project import Projector
+from reconstruct.splat.response import Response, evaluate
+from reconstruct.splat.volume import voxelise
+
+SUBSET, LEAST_SUBSETS = 10, 8
+"""Views in a subset, fewer where there would be too few subsets."""
+STEEPEST = 0.8
+"""Greatest gain of the ramp, as a share of the views in a subset."""
+SMOOTH_EVERY, SMOOTHING = 4, 8  # subsets from one denoising to the next, and its iterations
+FAINT = 0.3  # times water: splats below are preconditioned as if they held this
+
+Image = NDArray[np.float32]
+
+
+@dataclass(slots=True, kw_only=True)
+class Fit:
+    """The unknowns `u`, float32 [splat] in 1/mm of the hardened beam, on one lattice, and how they fare.
+
+    `tv` is the denoiser's threshold a pass in units of water. `misfit` is the mean |P − p| of the last pass.
+    """
+
+    data: Data
+    lattice: Lattice
+    response: Response
+    curve: MaterialCurve
+    u: Image
+    tv: float
+    misfit: float = math.inf
+    view_updates: int = 0
+    _projector: Projector = field(init=False)
+    _shapes: Image = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._projector = Projector(geometry=self.data.geometry)
+        self._shapes = self.lattice.splats(np.zeros((len(self.lattice), 1), np.float32)).shapes()
+
+    def run(self, passes: int, proceed: Callable[["Fit"], bool]) -> bool:
+        """Go through all views `passes` times; stop and return False when `proceed`, asked after a subset, says so."""
+        n_views = self.data.geometry.n_views
+        n = min(max(n_views // SUBSET, LEAST_SUBSETS), n_views)
+        for _ in range(passes):
+            misfit = 0.0
+            for k, subset in enumerate(bit_reversed(n)):
+                views = np.arange(subset, n_views, n)
+                misfit += self._step(views) / n
+                if (k + 1) % SMOOTH_EVERY == 0 or k + 1 == n:
+                    share = (k % SMOOTH_EVERY + 1) / n
+                    self.u = self.lattice.denoise(self.u, self.tv * self.curve.water * share, SMOOTHING)
+                if not proceed(self):
+                    return False
+            self.misfit = misfit
+        return True
+
+    def volume(self) -> Image:
+        """Return u on the voxel grid, a mean over each voxel: [z, y, x] in 1/mm."""
+        return voxelise(self.lattice.splats(self.u[:, None]), self.data.geometry)[0]
+
+    def _step(self, views: NDArray[np.int64]) -> float:
+        """Update `u` from some views; return their mean |P − p|."""
+        densities, slopes = self.curve(self.u)
+        values = densities / np.float32(self.lattice.unit)
+        paths = self._projector.forward(self._shapes, values, views)
+        la, lb = (np.ascontiguousarray(paths[:, c]) for c in (0, 1))
+        p, by_a, by_b = evaluate(self.response, la, lb)
+        lacking, weights = self.data.p[views] - p, self.data.weights[views]
+        along = weights * (by_a * la + by_b * lb)  # J·u: the majoriser's other half
+        lacking *= weights > 0
+        pulls = weights * lacking
+        images = np.stack([pulls * by_a, pulls * by_b, along * by_a, along * by_b], 1, dtype=np.float32)
+        sums = self._projector.adjoint(self._shapes, images, views)
+        gradient, curvature = (np.einsum("sc,sc->s", slopes, sums[:, k : k + 2]) for k in (0, 2))
+        self._move(gradient, curvature, len(views))
+        self.view_updates += len(views)
+        return float(np.abs(lacking).mean())
+
+    def _move(self, gradient: Image, curvature: Image, n_views: int) -> None:
+        water = self.curve.water
+        held = np.maximum(self.u, np.float32(FAINT * water))
+        root = np.sqrt(held / np.maximum(curvature, np.float32(1e-20)))
+        half = root * gradient
+        tissue = self.u < METAL * water  # a metal's own steps are so large that spread they swamp the tissue
+        spread = self.lattice.filter_slices(np.where(tissue, half, 0), self._ramp(n_views))
+        step = root * np.where(tissue, spread, half)
+        self.u = np.clip(self.u + step, 0, np.float32(self.curve.knots[-1]))
+
+    def _ramp(self, n_views: int) -> Image:
+        _, n_y, n_x = self.lattice.support.shape
+        cycles = np.hypot((np.fft.fftfreq(2 * n_y) * n_y)[:, None], np.fft.rfftfreq(2 * n_x) * n_x)
+        return np.clip(cycles * math.pi / n_views, 1, max(STEEPEST * n_views, 1)).astype(np.float32)
+
+
+def bit_reversed(n: int) -> list[int]:
+    """Return 0 … n − 1 in the order of their reversed bits, which keeps successive subsets far apart."""
+    bits = max(n - 1, 0).bit_length()
+    order = (int(f"{k:0{bits}b}"[::-1], 2) if bits else 0 for k in range(1 << bits))
+    return [k for k in order if k < n]
+
+
+@dataclass(slots=True, kw_only=True)
+class Clock:
+    """Tells a fit when its seconds are over."""
+
+    seconds: float
+    began: float = field(default_factory=time.perf_counter)
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the start."""
+        return time.perf_counter() - self.began
+
+    def proceed(self, _: Fit) -> bool:
+        """Whether time is left."""
+        return self.elapsed < self.seconds
