@@ -180,14 +180,25 @@ class Trace:
         if self.dilation is not None or not shadow.any():
             return dilate(shadow, self.dilation or 0)
         pixels = reach(self.geometry)
-        near = dilate(shadow, pixels)
-        p = line_integrals(self.scan, view)[0].numpy()
-        around = scipy.ndimage.maximum_filter(np.where(near, -np.inf, p), 2 * pixels + 3)
-        return shadow | (near & (p > around))
+        window = _around(shadow, 2 * pixels + 2)
+        near = dilate(shadow[window], pixels)
+        p = line_integrals(self.scan, view)[0].numpy()[window]
+        around = scipy.ndimage.maximum_filter(np.where(near, np.float32(-np.inf), p), 2 * pixels + 3)
+        shadow[window] |= near & (p > around)
+        return shadow
 
     def lengths(self, view: int) -> NDArray[np.float32]:
         """Return the length in metal in one view in mm, [v, u]."""
         return self.tracer.background(self.geometry, view)[1]
+
+
+def _around(mask: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:
+    """Return the smallest window of rows and columns that holds a mask [v, u] that is not empty, and a margin."""
+    ranges = []
+    for axis in (1, 0):
+        found = np.flatnonzero(mask.any(axis))
+        ranges.append(slice(max(int(found[0]) - margin, 0), int(found[-1]) + margin + 1))
+    return ranges[0], ranges[1]
 
 
 def reinsert(values: torch.Tensor, first: NDArray[np.float32], metal: Metal, insert: str) -> None:
