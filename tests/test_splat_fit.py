@@ -151,7 +151,7 @@ def test_it_beats_fdk_with_and_without_metal(small):
     truth = truth_of(small)
     for scan in (small.scan, small.metal_free.scan):
         ours, theirs = (tissue_score(f(scan).values.numpy(), truth).values["rmse"] for f in (reconstruct, fdk))
-        assert ours < 0.8 * theirs  # measured: 0.72 on both; one pass instead of two at full resolution gives more
+        assert ours < 0.8 * theirs  # measured: 0.72 on both
 
 
 def test_the_same_scan_gives_the_same_bits(stored):

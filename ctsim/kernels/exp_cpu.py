@@ -17,7 +17,7 @@ LARGEST = np.float32(80.0)  # exp(−80) = 1.8e-35 is still a normal float32
 
 
 @intrinsic
-def _as_float(typingctx, bits):
+def as_float(typingctx, bits):
     """Reinterpret an int32 as a float32."""
 
     def codegen(context, builder, signature, args):
@@ -33,4 +33,4 @@ def exp_minus(x):
     whole = np.float32(np.floor(y + np.float32(0.5)))
     f = y - whole
     p = C0 + f * (C1 + f * (C2 + f * (C3 + f * (C4 + f * (C5 + f * C6)))))
-    return p * _as_float((np.int32(whole) + np.int32(127)) << np.int32(23))  # pyright: ignore[reportCallIssue]  numba supplies the context
+    return p * as_float((np.int32(whole) + np.int32(127)) << np.int32(23))  # pyright: ignore[reportCallIssue]  numba supplies the context

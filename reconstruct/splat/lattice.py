@@ -11,8 +11,8 @@ from ctsim.geometry import Geometry
 from reconstruct.splat.model import Splats
 from reconstruct.tv import Denoiser, axis_ratios
 
-WIDTH = 0.45
-"""σ of a splat in voxels. At 0.55 a splat is smoother than the edges that data of this resolution show."""
+SIGMA = 0.45
+"""σ of a splat in voxels: wider ones, not negative, cannot make the edges of a volume of this grid."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -36,7 +36,7 @@ class Lattice:
         self._index = np.flatnonzero(self.support)
         self.positions = np.stack([x[i], y[j], z[k]], 1)
         d = np.array(self.geometry.d_voxel)
-        self.scale = WIDTH * float(np.prod(d)) ** (1 / 3)
+        self.scale = SIGMA * float(np.prod(d)) ** (1 / 3)
         self.unit = float((math.sqrt(2 * math.pi) * self.scale) ** 3 / np.prod(d))
         self._denoiser = Denoiser(
             np.ascontiguousarray(self.support.transpose(1, 2, 0)), axis_ratios(self.geometry), positivity=True

@@ -72,7 +72,7 @@ def reconstruct(
     finite = bool(np.isfinite(values).all())
     details |= {
         "read-out": f"hardened by {length:.1f} mm of water",
-        "misfit": fit.misfit,
+        "misfit": fit.misfit if math.isfinite(fit.misfit) else None,
         "view_updates": fit.view_updates,
     }
     return Volume(

@@ -4,8 +4,8 @@ Minimises ½ Σ_rays w (P(u) − p)² + TV with w = exp(−p), the share of phot
 count for little and no mask is needed. A subset's step is s·F(s·g), g the gradient, s² the inverse of a separable
 majoriser of the Hessian (Erdogan and Fessler, Phys. Med. Biol. 44, 1999, doi:10.1088/0031-9155/44/11/311), and F a ramp
 filter of the transverse frequencies: n views of a subset overlap only below n/π cycles a field of view; above, one
-view alone answers for a frequency, and up to n times the step is stable there. Without F edges take eight times the
-passes.
+view alone answers for a frequency, and up to n times the step is stable there. At half resolution one pass with F left
+a smaller error on a thorax with iron than three without.
 """
 
 import math

@@ -10,7 +10,7 @@ from llvmlite import ir
 from numba import njit, prange, types
 from numba.extending import intrinsic
 
-from ctsim.kernels.exp_cpu import exp_minus
+from ctsim.kernels.exp_cpu import as_float, exp_minus
 
 BLOCK = 256  # pixels whose intermediate sums stay in the L1 cache
 CHUNK = 4096  # pixels of one task; sums over pixels are taken chunk by chunk, whatever the number of threads
@@ -30,22 +30,12 @@ def _bits(typingctx, number):
     return types.int32(types.float32), codegen
 
 
-@intrinsic
-def _number(typingctx, bits):
-    """Reinterpret an int32 as a float32."""
-
-    def codegen(context, builder, signature, args):
-        return builder.bitcast(args[0], ir.FloatType())
-
-    return types.float32(types.int32), codegen
-
-
 @njit(inline="always")
 def _log(x):
     """Return log(x) of a normal positive float32, vectorised; absolute error below 2e-7·max(1, log x)."""
     shifted = _bits(x) - ROOT_HALF  # pyright: ignore[reportCallIssue]  numba supplies the context
     exponent = shifted >> np.int32(23)
-    mantissa = _number((shifted & np.int32(0x007FFFFF)) + ROOT_HALF)  # pyright: ignore[reportCallIssue]
+    mantissa = as_float((shifted & np.int32(0x007FFFFF)) + ROOT_HALF)  # pyright: ignore[reportCallIssue]
     f = mantissa - np.float32(1)
     s = f / (np.float32(2) + f)  # log m = 2·artanh(s), |s| ≤ 0.172: the first term left out is below 1e-9
     s2 = s * s
