@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baselines.inpaint import Filled
-from baselines.limar import check_insert, finished, uncorrected
+from baselines.limar import check_insert, finished, mended, uncorrected
 from baselines.metal import Trace, find_metal, reinsert
 from baselines.morphology import dilate
 from baselines.prior import RING, check_prior, choose_prior
 from ctsim.types import Scan, Status, Volume
-from reconstruct.fdk import fdk_stream
 from reconstruct.fdk import reconstruct as fdk
 from reconstruct.log import line_integrals
 from reconstruct.projector import forward_columns
@@ -53,27 +52,24 @@ def bhc_poly(
     if first.status is not Status.OK or not metal.found:
         return uncorrected(first, metal)
     trace = Trace(metal, scan)
-    choice = choose_prior(scan, trace, metal, x_0, prior)
+    choice = choose_prior(trace, metal, first.values, prior)
     if choice is None:
         return _left(uncorrected(first, metal), "nothing stands out from air")
     fit = _fit(scan, trace, choice.columns, choice.water)
     if not fit.pixels:
         return _left(uncorrected(first, metal), "no pixel of the trace has a signal")
-    negative, shown = 0, Filled(shown=scan.geometry.n_views // 4)
+    negative = 0
 
-    def read(views: slice) -> Array:
+    def correct(p: Array, views: slice, _: Filled) -> None:
         nonlocal negative
-        p = line_integrals(scan, views)[0].numpy()
         for k, held, metal_length, tissue in _along(
             choice.columns, choice.water, trace, range(views.start, views.stop)
         ):
             added = _terms(metal_length[held], tissue[held]) @ fit.coefficients
             negative += int((added < 0).sum())
             p[k - views.start][held] -= np.maximum(added, 0).astype(np.float32)
-        shown.keep(p, views)
-        return p
 
-    values = fdk_stream(read, scan.geometry)
+    values, shown = mended(trace, first.values, correct)
     reinsert(values, x_0, metal, insert)
     counted = {
         "negative_pixels": negative,

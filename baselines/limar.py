@@ -4,6 +4,7 @@ Kalender, Hebel and Ebersberger, Radiology 164, 1987, doi:10.1148/radiology.164.
 cut out of the projections and bridged, the rest is reconstructed, the metal is put back.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,9 +16,8 @@ from baselines.metal import INSERTS, Metal, Trace, find_metal, reinsert
 from baselines.settings import keywords
 from ctsim.errors import InputError
 from ctsim.types import Scan, Status, Volume
-from reconstruct.fdk import fdk_stream
+from reconstruct.fdk import add_fdk
 from reconstruct.fdk import reconstruct as fdk
-from reconstruct.log import line_integrals
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,7 +54,7 @@ def reconstruct(scan: Scan, settings: Bridging, device: str) -> Volume:
     if first.status is not Status.OK or not metal.found:
         return uncorrected(first, metal)
     trace = Trace(metal, scan, settings.dilation)
-    values, filled = interpolated(scan, trace, settings.interpolation)
+    values, filled = interpolated(trace, first.values, settings.interpolation)
     reinsert(values, first.values.numpy(), metal, settings.insert)
     details: dict[str, object] = {"view_updates": 2 * scan.geometry.n_views, "dilation": settings.dilation}
     details["intermediates"] = filled.intermediates(trace.view(filled.shown))
@@ -67,18 +67,37 @@ def check_insert(insert: str) -> None:
         raise InputError(f"insert must be one of {', '.join(INSERTS)}, got {insert!r}")
 
 
-def interpolated(scan: Scan, trace: Trace, how: str) -> tuple[torch.Tensor, Filled]:
-    """Return FDK of the projections with the trace interpolated, and what was filled."""
-    filled = Filled(shown=scan.geometry.n_views // 4)
+def interpolated(trace: Trace, first: torch.Tensor, how: str) -> tuple[torch.Tensor, Filled]:
+    """Return FDK of the projections with the trace interpolated, and what was filled; `first` is FDK without."""
 
-    def read(views: slice) -> NDArray[np.float32]:
-        p = line_integrals(scan, views)[0].numpy()
+    def bridge(p: NDArray[np.float32], views: slice, filled: Filled) -> None:
         for k, view in enumerate(range(views.start, views.stop)):
             fill(p[k], trace.view(view), how, filled)
+
+    return mended(trace, first, bridge)
+
+
+def mended(
+    trace: Trace, first: torch.Tensor, bridge: Callable[[NDArray[np.float32], slice, Filled], None]
+) -> tuple[torch.Tensor, Filled]:
+    """Return FDK of the projections with the trace filled, and what was filled.
+
+    `first` [z, y, x] is FDK of the projections as they are; `bridge` changes those of some views [view, v, u], only in
+    the trace. What it changes is reconstructed and added.
+    """
+    filled = Filled(shown=trace.geometry.n_views // 4)
+
+    def change(views: slice) -> NDArray[np.float32]:
+        p = trace.logarithm.of(views)[0]
+        before = p.copy()
+        bridge(p, views, filled)
         filled.keep(p, views)
+        p -= before
         return p
 
-    return fdk_stream(read, scan.geometry), filled
+    values = first.clone()
+    add_fdk(change, trace.geometry, trace.rows(), values)
+    return values, filled
 
 
 def uncorrected(first: Volume, metal: Metal) -> Volume:

@@ -14,7 +14,7 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.project import Tracer
 from ctsim.types import Phantom, Scan
-from reconstruct.log import line_integrals
+from reconstruct.log import LineIntegrals
 
 PEAK, HALF, SMALLEST = 0.25, 0.5, 8  # of the maximum; of the metal's value; voxels
 FACTORS = (8.0, 1.5)  # metal must exceed this many times water, and this many times the body's 99.9th percentile
@@ -154,7 +154,7 @@ class Trace:
     """
 
     def __init__(self, metal: Metal, scan: Scan, dilation: int | None = None) -> None:
-        self.scan, self.geometry, self.dilation = scan, scan.geometry, dilation
+        self.geometry, self.dilation, self.logarithm = scan.geometry, dilation, LineIntegrals(scan)
         self.tracer = Tracer.of(
             Phantom(
                 labels=metal.mask.astype(np.uint8),
@@ -180,19 +180,27 @@ class Trace:
         if self.dilation is not None or not shadow.any():
             return dilate(shadow, self.dilation or 0)
         pixels = reach(self.geometry)
-        window = _around(shadow, 2 * pixels + 2)
+        window = around(shadow, 2 * pixels + 2)
         near = dilate(shadow[window], pixels)
-        p = line_integrals(self.scan, view)[0].numpy()[window]
-        around = scipy.ndimage.maximum_filter(np.where(near, np.float32(-np.inf), p), 2 * pixels + 3)
-        shadow[window] |= near & (p > around)
+        p = self.logarithm.of(view)[0][window]
+        darkest = scipy.ndimage.maximum_filter(np.where(near, np.float32(-np.inf), p), 2 * pixels + 3)
+        shadow[window] |= near & (p > darkest)
         return shadow
+
+    def rows(self) -> slice:
+        """Return the detector rows that hold metal in any view."""
+        held = np.zeros(self.geometry.n_detector[0], np.bool_)
+        for view in range(self.geometry.n_views):
+            held |= self.view(view).any(1)
+        found = np.flatnonzero(held)
+        return slice(int(found[0]), int(found[-1]) + 1) if found.size else slice(0, 0)
 
     def lengths(self, view: int) -> NDArray[np.float32]:
         """Return the length in metal in one view in mm, [v, u]."""
         return self.tracer.background(self.geometry, view)[1]
 
 
-def _around(mask: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:
+def around(mask: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:
     """Return the smallest window of rows and columns that holds a mask [v, u] that is not empty, and a margin."""
     ranges = []
     for axis in (1, 0):

@@ -13,15 +13,13 @@ import torch
 from numpy.typing import NDArray
 
 from baselines.inpaint import Filled, fill
-from baselines.limar import Bridging, finished, uncorrected
+from baselines.limar import Bridging, finished, mended, uncorrected
 from baselines.metal import Trace, find_metal, reinsert
 from baselines.prior import check_prior, choose_prior
 from baselines.settings import keywords
 from ctsim.errors import InputError
 from ctsim.types import Scan, Status, Volume
-from reconstruct.fdk import fdk_stream
 from reconstruct.fdk import reconstruct as fdk
-from reconstruct.log import line_integrals
 from reconstruct.projector import forward_columns
 
 NORMALISATIONS = ("offset", "additive", "ratio")
@@ -104,11 +102,11 @@ def reconstruct(scan: Scan, settings: Settings, device: str) -> Volume:
     if first.status is not Status.OK or not metal.found:
         return uncorrected(first, metal)
     trace = Trace(metal, scan, settings.dilation)
-    choice = choose_prior(scan, trace, metal, x_0, settings.prior, settings.interpolation)
+    choice = choose_prior(trace, metal, first.values, settings.prior, settings.interpolation)
     if choice is None:
         return uncorrected(first, metal)
     bridge = functools.partial(settings.rule.fill, largest=choice.largest, how=settings.interpolation)
-    values, filled = normalised(scan, trace, choice.columns, bridge)
+    values, filled = normalised(trace, first.values, choice.columns, bridge)
     reinsert(values, x_0, metal, settings.insert)
     details: dict[str, object] = {"dilation": settings.dilation, "largest_prior": choice.largest}
     shown = filled.intermediates(trace.view(filled.shown))
@@ -120,27 +118,25 @@ def reconstruct(scan: Scan, settings: Settings, device: str) -> Volume:
 Bridge = Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], Filled], NDArray[np.float32]]
 
 
-def normalised(scan: Scan, trace: Trace, columns: NDArray[np.float32], bridge: Bridge) -> tuple[torch.Tensor, Filled]:
+def normalised(
+    trace: Trace, first: torch.Tensor, columns: NDArray[np.float32], bridge: Bridge
+) -> tuple[torch.Tensor, Filled]:
     """Return FDK of the projections, their trace bridged with those of a prior, and what was filled.
 
-    The prior is stored as `columns` [y, x, z]. `bridge(p, q, trace, filled)` gets the rows [v, u] of a view that hold
-    metal; only those are projected.
+    `first` [z, y, x] is FDK without, the prior is stored as `columns` [y, x, z]. `bridge(p, q, trace, filled)` gets the
+    rows [v, u] of a view that hold metal; only those are projected.
     """
-    filled = Filled(shown=scan.geometry.n_views // 4)
 
-    def read(views: slice) -> NDArray[np.float32]:
-        p = line_integrals(scan, views)[0].numpy()
+    def through_prior(p: NDArray[np.float32], views: slice, filled: Filled) -> None:
         traces = np.stack([trace.view(view) for view in range(views.start, views.stop)])
         held: NDArray[np.bool_] = np.any(traces, axis=2)
         wanted = held.copy()  # rows without any pixel left are filled from their neighbours
         wanted[:, 1:] |= held[:, :-1]
         wanted[:, :-1] |= held[:, 1:]
-        q = forward_columns(columns, scan.geometry, views, rows=wanted)
+        q = forward_columns(columns, trace.geometry, views, rows=wanted)
         for k in np.flatnonzero(held.any(1)):
             at = np.flatnonzero(wanted[k])
             rows = slice(at[0], at[-1] + 1)
             p[k, rows] = bridge(p[k, rows], q[k, rows], traces[k, rows], filled)
-        filled.keep(p, views)
-        return p
 
-    return fdk_stream(read, scan.geometry), filled
+    return mended(trace, first, through_prior)

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.ndimage
+import torch
 from numpy.typing import NDArray
 
 from baselines.limar import interpolated
-from baselines.metal import Metal, Trace, reach, water_value
+from baselines.metal import Metal, Trace, around, reach, water_value
 from baselines.morphology import dilate, opened
 from ctsim.errors import InputError
-from ctsim.types import Scan
-from reconstruct.log import line_integrals
 from reconstruct.projector import forward_columns
 
 AIR, LUNG, BONE = 0.5, 0.15, 1.5  # bounds of the classes in multiples of water
@@ -56,22 +55,22 @@ def check_prior(prior: str) -> None:
         raise InputError(f"prior must be one of {', '.join(PRIORS)}, got {prior!r}")
 
 
-def choose_prior(scan: Scan, trace: Trace, metal: Metal, first: Array, prior: str, how: str = "rows") -> Choice | None:
+def choose_prior(trace: Trace, metal: Metal, first: torch.Tensor, prior: str, how: str = "rows") -> Choice | None:
     """Return the prior from FDK's volume `first`, from LIMAR's, or ("auto") the better of both; None where all is air.
 
     The better one is LIMAR's where its projections fit the measured ones on a ring around the trace better by a
     twentieth: at a draw FDK's has the finer detail. `how` is LIMAR's interpolation.
     """
-    water = water_value(first)
+    water = water_value(first.numpy())
     if water <= 0:
         return None
     names = PRIORS[1:] if prior == "auto" else (prior,)
     found: dict[str, tuple[Array, float]] = {}
     misfit: dict[str, float] = {}
     for name in names:
-        volume = first if name == "fdk" else interpolated(scan, trace, how)[0].numpy()
+        volume = (first if name == "fdk" else interpolated(trace, first, how)[0]).numpy()
         columns = np.ascontiguousarray(tissue_prior(volume, metal, water).transpose(1, 2, 0))
-        misfit[name], largest = _misfit(scan, trace, columns)
+        misfit[name], largest = _misfit(trace, columns)
         found[name] = columns, largest
     name = better(misfit) if prior == "auto" else prior
     columns, largest = found[name]
@@ -104,19 +103,24 @@ def tissue_prior(volume: Array, metal: Metal, water: float) -> Array:
     return out
 
 
-def _misfit(scan: Scan, trace: Trace, columns: Array) -> tuple[float, float]:
+def _misfit(trace: Trace, columns: Array) -> tuple[float, float]:
     """Return the standard deviation of P − q on the ring and the greatest q, in some views."""
-    n = scan.geometry.n_views
+    n = trace.geometry.n_views
     views = np.unique(np.linspace(0, n - 1, min(CHOICE_VIEWS, n)).round().astype(int)).tolist()
-    projections = forward_columns(columns, scan.geometry, views)
-    off = [_around(scan, view, trace.view(view), q) for view, q in zip(views, projections, strict=True)]
+    projections = forward_columns(columns, trace.geometry, views)
+    off = [_beside(trace, view, q) for view, q in zip(views, projections, strict=True)]
     ring = np.concatenate(off)
     return float(np.std(ring)) if ring.size else 0.0, float(projections.max())
 
 
-def _around(scan: Scan, view: int, trace: NDArray[np.bool_], q: Array) -> Array:
+def _beside(trace: Trace, view: int, q: Array) -> Array:
     """Return P − q on a ring around the trace of one view; nothing where there is no trace."""
-    p, clamped = line_integrals(scan, view)
-    inner = dilate(trace, reach(scan.geometry))  # what little metal is left there would be held against both
-    ring = dilate(inner, RING) & ~inner & ~clamped.numpy()
-    return (p.numpy() - q)[ring]
+    shadow = trace.view(view)
+    if not shadow.any():
+        return q[shadow]
+    pixels = reach(trace.geometry)
+    window = around(shadow, pixels + RING)
+    p, clamped = trace.logarithm.of(view)
+    inner = dilate(shadow[window], pixels)  # what little metal is left there would be held against both
+    ring = dilate(inner, RING) & ~inner & ~clamped[window]
+    return (p - q)[window][ring]

@@ -28,7 +28,6 @@ from benchmarks.cli import guarded
 from benchmarks.protocol import truth_of
 from ctsim.errors import InputError
 from ctsim.store import StoredScan, list_scans, open_scan
-from ctsim.types import Scan
 from reconstruct.fdk import reconstruct as fdk
 
 DILATIONS = (0, None, 1)
@@ -69,52 +68,50 @@ def rows(stored: StoredScan) -> list[dict[str, object]]:
         raise InputError(f"{stored.name}: expected a scene with its spectrum and its metal-free twin")
     mask, bare = np.asarray(stored.metal) > 0, free.scan
     scan = dataclasses.replace(stored.scan, metal=torch.from_numpy(mask))
-    first, twin = fdk(scan).values.numpy(), fdk(bare).values.numpy()
+    first, twin = fdk(scan).values, fdk(bare).values
     tissue = truth_of(stored).tissue
-    metal = find_metal(scan, first, "oracle")
+    metal = find_metal(scan, first.numpy(), "oracle")
 
     def error(values: torch.Tensor) -> float:
-        off = (values.numpy() - twin)[tissue].astype(np.float64)
+        off = (values - twin).numpy()[tissue].astype(np.float64)
         return round(1000 / water * float(np.sqrt(np.mean(off**2))), 1)
 
     found: list[dict[str, object]] = []
     for dilation in DILATIONS:
         trace = Trace(metal, scan, dilation)
         mended = dataclasses.replace(scan, counts=torch.where(_held(trace), bare.counts, scan.counts))
-        values, misfit = by_prior(scan, trace, metal, first)
+        values, misfit = by_prior(trace, metal, first)
         errors = {name: error(v) for name, v in values.items()}
-        best = choose_prior(scan, trace, metal, twin, "fdk")  # FDK, of the twin
+        best = choose_prior(trace, metal, twin, "fdk")  # FDK, of the twin
         chosen = better(misfit)
         found.append({
             "scene": stored.name, "dilation": "rule" if dilation is None else dilation,
-            "fdk": error(torch.from_numpy(first)),
-            "mended": error(fdk(mended).values), "limar": error(interpolated(scan, trace, "rows")[0]),
+            "fdk": error(first),
+            "mended": error(fdk(mended).values), "limar": error(interpolated(trace, first, "rows")[0]),
             **{f"nmar_{name}": e for name, e in errors.items()},
-            "nmar_twin": None if best is None else error(nmar_with(scan, trace, best)),
+            "nmar_twin": None if best is None else error(nmar_with(trace, first, best)),
             "misfit_ratio": round(misfit["limar"] / misfit["fdk"], 3), "chosen": chosen,
             "regret": round(errors[chosen] - min(errors.values()), 1),
         })  # fmt: skip
     return found
 
 
-def by_prior(
-    scan: Scan, trace: Trace, metal: Metal, first: np.ndarray
-) -> tuple[dict[str, torch.Tensor], dict[str, float]]:
+def by_prior(trace: Trace, metal: Metal, first: torch.Tensor) -> tuple[dict[str, torch.Tensor], dict[str, float]]:
     """Return NMAR's volume with either prior, and its misfit on the ring."""
     values, misfit = {}, {}
     for name in PRIORS:
-        choice = choose_prior(scan, trace, metal, first, name)
+        choice = choose_prior(trace, metal, first, name)
         if choice is None:
             raise InputError("nothing stands out from air: there is no prior to choose")
-        values[name] = nmar_with(scan, trace, choice)
+        values[name] = nmar_with(trace, first, choice)
         misfit[name] = choice.misfit[name]
     return values, misfit
 
 
-def nmar_with(scan: Scan, trace: Trace, choice: Choice) -> torch.Tensor:
+def nmar_with(trace: Trace, first: torch.Tensor, choice: Choice) -> torch.Tensor:
     """Return NMAR's volume with a prior, metal not put back."""
     bridge = functools.partial(nmar.Normalise().fill, largest=choice.largest, how="rows")
-    return nmar.normalised(scan, trace, choice.columns, bridge)[0]
+    return nmar.normalised(trace, first, choice.columns, bridge)[0]
 
 
 def _held(trace: Trace) -> torch.Tensor:

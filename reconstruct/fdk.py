@@ -6,6 +6,7 @@ Feldkamp, Davis and Kress, J. Opt. Soc. Am. A 1, 1984, doi:10.1364/JOSAA.1.00061
 
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from ctsim.geometry import Geometry
 from ctsim.kernels.backproject_cpu import backproject
 from ctsim.types import Scan, Status, Volume
 from reconstruct.filters import filter_rows, padded_length, ramp_response
-from reconstruct.log import count_floor, line_integrals
+from reconstruct.log import LineIntegrals
 from reconstruct.redundancy import RayWeights, ray_weights
 
 CHUNK_BYTES = 1 << 25
@@ -30,13 +31,13 @@ def reconstruct(scan: Scan, *, device: str = "cpu", window: str = "ram-lak", cut
     """
     if torch.device(device).type != "cpu":
         raise InputError(f"fdk runs on device 'cpu' only, got {device!r}")
-    clamped = 0
+    clamped, logarithm = 0, LineIntegrals(scan)
 
     def read(views: slice) -> NDArray[np.float32]:
         nonlocal clamped
-        p, mask = line_integrals(scan, views)
+        p, mask = logarithm.of(views)
         clamped += int(mask.sum())
-        return p.numpy()
+        return p
 
     weights = _orbit_weights(scan.geometry)
     values = _run(read, scan.geometry, weights, window, cutoff)
@@ -46,7 +47,7 @@ def reconstruct(scan: Scan, *, device: str = "cpu", window: str = "ram-lak", cut
         "cutoff": cutoff,
         "view_updates": scan.geometry.n_views,
         "clamped_pixels": clamped,
-        "count_floor": count_floor(scan),
+        "count_floor": logarithm.floor,
         "rays": weights.kind,
         "field_of_view_mm": weights.radius,
     }
@@ -85,6 +86,52 @@ def fdk_stream(
     the orbit is not circular or the window is unknown.
     """
     return torch.from_numpy(_run(read, geometry, _orbit_weights(geometry), window, cutoff))
+
+
+def add_fdk(
+    read: Callable[[slice], NDArray[np.float32]], geometry: Geometry, rows: slice, volume: torch.Tensor
+) -> None:
+    """Add to a volume [z, y, x] what line integrals add to it that are 0 outside some detector rows.
+
+    `read` as in `fdk_stream`, with all rows. Only those are filtered, and only the slices that they reach are gone
+    through: FDK is linear, so a correction of few rows need not reconstruct the rest again.
+    """
+    last = geometry.n_detector[0]
+    rows = slice(max(rows.start - 1, 0), min(rows.stop + 1, last))  # the 0 beside them belongs to their interpolation
+    planes = _planes(geometry, rows)
+    if planes.stop <= planes.start:
+        return
+    part = msgspec.structs.replace(
+        geometry,
+        n_detector=(rows.stop - rows.start, geometry.n_detector[1]),
+        n_voxel=(planes.stop - planes.start, *geometry.n_voxel[1:]),
+        off_detector=(_moved(geometry.off_detector[0], geometry.d_detector[0], last, rows), geometry.off_detector[1]),
+        off_origin=(
+            _moved(geometry.off_origin[0], geometry.d_voxel[0], geometry.n_voxel[0], planes),
+            *geometry.off_origin[1:],
+        ),
+    )
+
+    def cut(views: slice) -> NDArray[np.float32]:
+        return np.ascontiguousarray(read(views)[:, rows])
+
+    volume[planes] += torch.from_numpy(_run(cut, part, _orbit_weights(geometry), "ram-lak", 1.0))
+
+
+def _moved(offset: float, pitch: float, n: int, part: slice) -> float:
+    """Return the offset of a part of n pixels or slices."""
+    return offset + ((part.start + part.stop - 1) / 2 - (n - 1) / 2) * pitch
+
+
+def _planes(geometry: Geometry, rows: slice) -> slice:
+    """Return the slices of the volume that detector rows see within the field of view."""
+    n, d, off = geometry.n_detector[0], geometry.d_detector[0], geometry.off_detector[0]
+    edges = (np.array([rows.start - 0.5, rows.stop - 0.5]) - (n - 1) / 2) * d + off
+    radius = _orbit_weights(geometry).radius
+    heights = np.outer(edges, (geometry.dso + np.array([-radius, radius])) / geometry.dsd)
+    z = geometry.voxel_centres()[0]
+    first, after = np.searchsorted(z, [heights.min(), heights.max()])
+    return slice(max(int(first) - 1, 0), min(int(after) + 1, len(z)))
 
 
 def _orbit_weights(geometry: Geometry) -> RayWeights:

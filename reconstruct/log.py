@@ -22,6 +22,31 @@ def count_floor(scan: Scan) -> float:
     return floor if math.isfinite(floor) and floor > 0 else 0.5
 
 
+class LineIntegrals:
+    """Takes the logarithm of a scan's counts, some views at a time; what all views share is worked out once."""
+
+    def __init__(self, scan: Scan) -> None:
+        self.scan, self.floor = scan, count_floor(scan)
+        self._log_open, self._dead = _log_open(scan.flat.numpy() - np.float32(scan.dark), self.floor)
+        self._table = self._low = None
+        if scan.counts.dtype == torch.uint16:
+            # 65536 logarithms serve all pixels.
+            signal = np.arange(65536) - scan.dark
+            self._table, self._low = np.log(np.maximum(signal, self.floor)).astype(np.float32), signal <= self.floor
+
+    def of(self, view: int | slice) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Return what `line_integrals` does, as arrays."""
+        counts = self.scan.counts[view].numpy()
+        stack = counts[None] if counts.ndim == 2 else counts
+        p, clamped = np.empty(stack.shape, np.float32), np.empty(stack.shape, np.bool_)
+        if self._table is not None:
+            _look_up(stack, self._table, self._low, self._log_open, self._dead, p, clamped)
+        else:
+            dark, floor = np.float32(self.scan.dark), np.float32(self.floor)
+            _take_log(np.asarray(stack, np.float32), dark, floor, self._log_open, self._dead, p, clamped)
+        return p.reshape(counts.shape), clamped.reshape(counts.shape)
+
+
 def line_integrals(scan: Scan, view: int | slice) -> tuple[torch.Tensor, torch.Tensor]:
     """Return p = −ln(max(counts − dark, floor) / (flat − dark)), float32, and the mask of clamped pixels, bool.
 
@@ -29,20 +54,7 @@ def line_integrals(scan: Scan, view: int | slice) -> tuple[torch.Tensor, torch.T
     contain the pedestal. Readings that are not finite, and pixels whose open field is below the floor,
     count as clamped.
     """
-    counts = scan.counts[view].numpy()
-    stack = counts[None] if counts.ndim == 2 else counts
-    p = np.empty(stack.shape, np.float32)
-    clamped = np.empty(stack.shape, np.bool_)
-    floor = count_floor(scan)
-    log_open, dead = _log_open(scan.flat.numpy() - np.float32(scan.dark), floor)
-    if stack.dtype == np.uint16:
-        # 65536 logarithms serve all pixels.
-        signal = np.arange(65536) - scan.dark
-        table = np.log(np.maximum(signal, floor)).astype(np.float32)
-        _look_up(stack, table, signal <= floor, log_open, dead, p, clamped)
-    else:
-        _take_log(np.asarray(stack, np.float32), np.float32(scan.dark), np.float32(floor), log_open, dead, p, clamped)
-    p, clamped = p.reshape(counts.shape), clamped.reshape(counts.shape)
+    p, clamped = LineIntegrals(scan).of(view)
     return torch.from_numpy(p), torch.from_numpy(clamped)
 
 
