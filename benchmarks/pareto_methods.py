@@ -1,0 +1,182 @@
+"""Every method of the table over its own effort, on the clock, scored under protocol `tissue`.
+
+Iterative methods run once to twice their default iterations and are scored as they pass each of `STOPS`
+(`baselines.iterative.watch`); the clock stands still while they are. A run of k iterations is said to take what it
+took to get there and what the method took after its last: its closing residual. Methods with an effort that cannot
+be watched run once for each value; the others are single points.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from baselines.iterative import watch
+from benchmarks import metrics
+from benchmarks.methods import Method, find
+from benchmarks.pareto_records import Mark, Setting
+from benchmarks.protocol import VERSION, Truth, tissue_range, truth_of
+from benchmarks.run import scan_for, warm_up
+from ctsim.geometry import Geometry
+from ctsim.store import StoredScan, open_scan
+from ctsim.types import Scan, Status
+from reconstruct.fdk import reconstruct as fdk
+
+STOPS = frozenset((1, 2, 3, 5, 8, 12, 20, 30, 50, 80, 120, 200))
+UNWATCHED: dict[str, tuple[str, tuple[Any, ...]]] = {
+    "ibhc": ("iterations", (1, 2, 3, 4, 6)),
+    "splat": ("passes", ((1, 0), (1, 1), (2, 1), (2, 2), (2, 4), (4, 4), (4, 8), (8, 8))),
+}
+"""Methods that are run once for each value of a parameter; the default is added."""
+FDKS = {"fdk": 1.0}
+"""Cost in FDKs, of an iteration where there are any."""
+LAST = 2  # times the default: how far iterations go
+
+
+class Ended(RuntimeError):
+    """A method ended without a volume to score: its status and the reason."""
+
+    def __init__(self, status: str, reason: str) -> None:
+        super().__init__(f"{status}: {reason}")
+        self.status, self.reason = status, reason
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Effort:
+    """One run to time: a method with its parameters, and what the run is called."""
+
+    method: Method
+    label: str
+    default: bool = True
+
+
+def efforts(name: str) -> list[Effort]:
+    """List the runs of a method of the table."""
+    usual = find(name)
+    if name in UNWATCHED:
+        key, values = UNWATCHED[name]
+        usually = usual.params[key]
+        every = list(dict.fromkeys((*values, tuple(usually) if isinstance(usually, list) else usually)))
+        return [
+            Effort(method=find(name, {key: v}), label=f"{key} {_words(v)}", default=_words(v) == _words(usually))
+            for v in every
+        ]
+    count = usual.params.get("iterations")
+    if count is None:
+        return [Effort(method=usual, label="defaults")]
+    return [Effort(method=find(name, {"iterations": LAST * count}), label=f"{LAST * count} iterations")]
+
+
+def in_fdks(effort: Effort) -> float:
+    """Return about how many times FDK's time a run takes, as measured on lung-Fe of `quick`."""
+    count = effort.method.params.get("iterations")
+    return FDKS.get(effort.method.name, 3.0) * (1 if count is None else count)
+
+
+def fdk_seconds(geometry: Geometry) -> float:
+    """Time FDK of a blank scan, after a run that compiles."""
+    blank = Scan(geometry=geometry, counts=torch.ones(geometry.shape), flat=torch.ones(geometry.n_detector))
+    fdk(blank)
+    start = time.perf_counter()
+    fdk(blank)
+    return time.perf_counter() - start
+
+
+def _words(value: Any) -> str:
+    return " + ".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
+
+
+class Bench:
+    """One stored scene, ready to score volumes."""
+
+    def __init__(self, folder: Path) -> None:
+        self.stored: StoredScan = open_scan(folder)
+        self.truth: Truth = truth_of(self.stored)
+
+    def setting(self, effort: Effort, machine: str) -> Setting:
+        """Return what determines a run."""
+        method = effort.method
+        return Setting(
+            part="methods",
+            scene=self.stored.name,
+            data=f"{self.stored.content_hash}, protocol {VERSION}",
+            group="volumes",
+            curve=method.name,
+            label=effort.label,
+            params=method.params,
+            inputs=method.inputs,
+            code=method.code,
+            machine=machine,
+        )
+
+    def warm_up(self, method: Method) -> float:
+        """Run the method on a few views and slices, so that compiling is not timed; return its seconds."""
+        return warm_up(method, scan_for(method, self.stored, "metal"), "cpu")
+
+    def run(self, effort: Effort) -> tuple[Mark, ...]:
+        """Time one run; return a mark at each stop, or one if the method cannot be watched.
+
+        Raises Ended where the method is skipped or there is no finite volume.
+        """
+        method, usual = effort.method, find(effort.method.name).params.get("iterations")
+        scan = scan_for(method, self.stored, "metal")
+        if reason := method.skip(scan):
+            raise Ended(str(Status.SKIPPED), reason)
+        marks = Marks(score=self.values, stops=STOPS | {usual, method.params.get("iterations")})
+        with watch(marks):
+            volume = method.reconstruct(scan, "cpu")
+        total = marks.clock()
+        if volume.status is not Status.OK:
+            raise Ended(str(volume.status), volume.reason)
+        end = self.values(volume.values)
+        if not marks.count:
+            return (Mark(label=effort.label, seconds=total, values=end, default=effort.default),)
+        # the volume that is returned may be finished, such as by a last cut at 0
+        passed = [m for m in marks.found if m[0] < marks.count] + [(marks.count, marks.last, end)]
+        return tuple(
+            Mark(
+                label=f"{k} iteration{'s' * (k > 1)}",
+                seconds=seconds + total - marks.last,
+                values=values,
+                default=k == min(usual or marks.count, marks.count),
+            )
+            for k, seconds, values in passed
+        )
+
+    def values(self, volume: torch.Tensor) -> dict[str, float]:
+        """Return RMSE (1/mm) and PSNR3D (dB) of `tissue`."""
+        found = volume.numpy()
+        if not np.isfinite(found).all():
+            raise Ended(str(Status.NONFINITE), "the volume holds values that are not finite")
+        mse = metrics.mse3d(found, self.truth.references["effective"], self.truth.tissue)
+        psnr = metrics.psnr(mse, tissue_range(self.truth, "effective"))
+        return {"rmse": mse**0.5} | ({} if psnr is None else {"psnr3d": psnr})
+
+
+@dataclass(slots=True, kw_only=True)
+class Marks:
+    """Watches a method: scores its volume at the stops, on a clock that leaves out the scoring."""
+
+    score: Callable[[torch.Tensor], dict[str, float]]
+    stops: frozenset[Any]
+    found: list[tuple[int, float, dict[str, float]]] = field(default_factory=list)
+    last: float = 0.0
+    count: int = 0
+    _away: float = 0.0
+    _began: float = field(default_factory=time.perf_counter)
+
+    def clock(self) -> float:
+        """Return the seconds that the method has run."""
+        return time.perf_counter() - self._began - self._away
+
+    def __call__(self, view_updates: int, seconds: float, volume: torch.Tensor) -> None:
+        """Take note of an iteration; the method's own seconds begin after its preparation, so they are not used."""
+        self.last = self.clock()
+        self.count += 1
+        if self.count in self.stops:
+            self.found.append((self.count, self.last, self.score(volume)))
+        self._away += self.clock() - self.last

@@ -1,0 +1,174 @@
+"""Records of `run-benchmark pareto`: one JSON line per timed run, and the points that their medians make.
+
+A line holds one run of one setting; a method that can be watched leaves a mark after each of several iterations
+of one run. Runs of a setting are counted by its identity, so a command that was stopped goes on where it was.
+"""
+
+import hashlib
+import os
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any, Literal
+
+import msgspec
+
+from benchmarks.host import Host
+from benchmarks.pareto_front import Pair, front, knee
+from benchmarks.records import OK
+from ctsim.errors import InputError
+
+NAME = "pareto.jsonl"
+VERSION = 1
+"""Part of every identity: a change of what is measured counts it up."""
+
+Part = Literal["simulator", "methods"]
+ERROR: dict[Part, str] = {"simulator": "rms", "methods": "rmse"}
+"""The value of a mark that a part's fronts are drawn in."""
+
+
+class Setting(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What determines a run: a part, a scene (`data` is its content's hash), and a choice with its parameters.
+
+    `curve` is a method or a kind of choice of the simulator, `label` the choice; points are compared within `group`.
+    `code` hashes the sources, `machine` is processor and threads: times of another one are measured anew.
+    """
+
+    part: Part
+    scene: str
+    data: str
+    group: str
+    curve: str
+    label: str
+    params: dict[str, Any]
+    inputs: str = ""
+    code: str = ""
+    machine: str = ""
+    version: int = VERSION
+
+    @property
+    def identity(self) -> str:
+        """SHA-256 over all fields."""
+        return hashlib.sha256(msgspec.json.encode(self, order="sorted")).hexdigest()
+
+
+class Mark(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a run had reached after so many seconds; `values` are errors by name, `default` says that it is one."""
+
+    label: str
+    seconds: float
+    values: dict[str, float]
+    default: bool = False
+
+
+class Timed(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One timed run of a setting; `warm_up` are the seconds of the call before it that compiled, if there was one."""
+
+    setting: Setting
+    marks: tuple[Mark, ...] = ()
+    status: str = OK
+    reason: str = ""
+    warm_up: float | None = None
+    host: Host
+    commit: str
+    time: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Point:
+    """A setting at one of its marks: all runs' seconds, and the errors, which do not differ between runs."""
+
+    setting: Setting
+    label: str
+    seconds: tuple[float, ...]
+    values: dict[str, float]
+    default: bool
+
+    @property
+    def pair(self) -> Pair:
+        """Median seconds and error."""
+        return median(self.seconds), self.values[ERROR[self.setting.part]]
+
+
+def append(path: Path, record: Timed) -> None:
+    """Append one record and force it to the disk, behind what an interrupted writer may have left torn."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("ab+") as file:
+        if file.tell():
+            file.seek(-1, os.SEEK_END)
+            if file.read(1) != b"\n":
+                file.write(b"\n")
+        file.write(msgspec.json.encode(record) + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read(path: Path) -> tuple[list[Timed], int]:
+    """Read a records file; lines that are cut short are left out and counted.
+
+    Raises InputError where a whole JSON line is not a record. A file that is not there has none.
+    """
+    if not path.exists():
+        return [], 0
+    decoder, found, torn = msgspec.json.Decoder(Timed), [], 0
+    for number, line in enumerate(path.read_bytes().splitlines(), 1):
+        try:
+            found += [decoder.decode(line)] if line.strip() else []
+        except msgspec.ValidationError as error:
+            raise InputError(f"{path}, line {number}: expected a record of run-benchmark pareto: {error}") from None
+        except msgspec.DecodeError:
+            torn += 1
+    return found, torn
+
+
+def runs(found: Sequence[Timed]) -> Counter[str]:
+    """Count the runs of each identity that ended well."""
+    return Counter(t.setting.identity for t in found if t.status == OK)
+
+
+def latest(found: Sequence[Timed]) -> list[Timed]:
+    """Keep what a table shows: of each choice the runs of its newest identity, on the machine of the last record."""
+    if not found:
+        return []
+    mine = [t for t in found if (t.setting.machine, t.setting.version) == (found[-1].setting.machine, VERSION)]
+    newest = {_place(t.setting): t.setting.identity for t in mine}
+    return [t for t in mine if newest[_place(t.setting)] == t.setting.identity]
+
+
+def _place(setting: Setting) -> tuple[str, ...]:
+    return setting.part, setting.scene, setting.curve, setting.label
+
+
+def points(found: Sequence[Timed]) -> list[Point]:
+    """Make a point of every mark, in the order of their first appearance."""
+    held: dict[tuple[str, str], list[tuple[Setting, Mark]]] = {}
+    for timed in found:
+        if timed.status == OK:
+            for mark in timed.marks:
+                held.setdefault((timed.setting.identity, mark.label), []).append((timed.setting, mark))
+    return [
+        Point(
+            setting=marks[-1][0],
+            label=label,
+            seconds=tuple(m.seconds for _, m in marks),
+            values=marks[-1][1].values,
+            default=marks[-1][1].default,
+        )
+        for (_, label), marks in held.items()
+    ]
+
+
+def failures(found: Sequence[Timed]) -> list[Timed]:
+    """Return the last record of every setting that has no run that ended well."""
+    well = runs(found)
+    last = {t.setting.identity: t for t in found}
+    return [t for identity, t in last.items() if not well[identity]]
+
+
+def recommended(of: Sequence[Point]) -> Point:
+    """Return the knee of the points' front, or, where it has none, the most accurate of them."""
+    pairs = [p.pair for p in of]
+    at = knee(pairs)
+    return of[front(pairs)[-1] if at is None else at]

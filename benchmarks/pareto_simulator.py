@@ -1,0 +1,170 @@
+"""The simulator's choices, each timed and held against a converged scan of the same scene.
+
+The scene is analytic: a water cylinder with a bone rod and two iron rods. The reference has the finest of every choice:
+closed-form chords of 16² rays a pixel averaged in intensity, and the whole fine spectrum. Errors are those of
+P = −ln(signal/open) without noise in a few views. The scatter levels stand in a group of their own, where the
+reference has the highest level's signal added: a constant, whose own error is not known here.
+"""
+
+import functools
+import time
+import typing
+from dataclasses import dataclass, field
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.methods import code_version
+from benchmarks.pareto_records import Mark, Setting
+from benchmarks.peer_cases import SIZE, relative, voxelised
+from benchmarks.peer_poly import measured_pixel, poly_scene
+from ctsim.noise import Noise
+from ctsim.plan import Plan, make_plan
+from ctsim.project import Response, Tracer, transmit
+from ctsim.quadrature import full_rule
+from ctsim.scatter import Scatter, open_fraction
+from ctsim.settings import Simulation, Truth
+from ctsim.simulate import simulate_views
+from ctsim.spectrum import spectrum
+from ctsim.types import Phantom, Scanner
+from phantoms.scanners import preset
+
+SCENE = "rods"
+SIDE, VIEWS, CHECKED = 128, 24, 4
+TOLERANCES, SUBRAYS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6), (1, 4, 8, 16, 34, 64, 128, 256)
+GRIDS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
+"""Label voxels along an axis, in detector pixels along one."""
+USUAL = 1.5  # of the bundled suites
+CALM = 1e-4  # |ΔP| of the central ray alone, below which a pixel has no edge
+PROJECTIONS, SCATTER = "projections", "scatter"
+LEVELS: tuple[int, ...] = typing.get_args(typing.get_type_hints(Scatter)["level"])
+EXACT, BODY, VOXELS = "exact solids", "body in voxels, metal exact", "all in voxels"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """One way to simulate the scene; `grid` (None: analytic) and `metal` say what is turned into voxels."""
+
+    curve: str
+    label: str
+    simulation: Simulation = field(default_factory=Simulation)
+    grid: float | None = None
+    metal: bool = False
+    level: int = 0
+    default: bool = False
+
+    @property
+    def group(self) -> str:
+        """Choices of one group have one reference."""
+        return SCATTER if self.curve == SCATTER else PROJECTIONS
+
+
+def choices() -> list[Choice]:
+    """List every choice: tolerances with sub-rays, voxels instead of solids, and scatter levels."""
+    usual = Simulation()
+    found = [
+        Choice(
+            curve=f"{EXACT}, tolerance {tolerance:.0e}",
+            label=f"{subrays} sub-rays",
+            simulation=Simulation(tolerance=tolerance, subrays=subrays),
+            default=(tolerance, subrays) == (usual.tolerance, usual.subrays),
+        )
+        for tolerance in sorted({*TOLERANCES, usual.tolerance}, reverse=True)
+        for subrays in sorted({*SUBRAYS, usual.subrays})
+    ]
+    whole = Simulation(skip=False)
+    found.append(Choice(curve=f"{EXACT}, nothing skipped", label=f"{usual.subrays} sub-rays", simulation=whole))
+    found += [
+        Choice(curve=curve, label=f"{round(grid * SIDE)}³ labels", grid=grid, metal=metal, default=default)
+        for curve, metal in ((BODY, False), (VOXELS, True))
+        for grid in GRIDS
+        for default in (grid == USUAL and not metal,)
+    ]
+    level = Scatter().level
+    return found + [Choice(curve=SCATTER, label=f"level {k}", level=k, default=k == level) for k in LEVELS]
+
+
+def _scatter(level: int) -> Scatter:
+    return msgspec.convert({"level": level}, Scatter)
+
+
+class Bench:
+    """The scene with its reference and what is prepared for each choice; `side` is that of detector and grid."""
+
+    def __init__(self, side: int = SIDE, views: int = VIEWS) -> None:
+        self.side = side
+        scanner = preset("skyscan1273", views, (side, side), (side, side, side), SIZE)
+        self.scanner = msgspec.structs.replace(scanner, noise=Noise(model="none"))
+        self.phantom = poly_scene(side)
+        self.checked = tuple(sorted({round((k + 0.5) * views / CHECKED) % views for k in range(CHECKED)}))
+        self._plans: dict[str, tuple[Plan, Phantom, Scanner]] = {}
+
+    def setting(self, choice: Choice, machine: str) -> Setting:
+        """Return what determines a choice's runs."""
+        return Setting(
+            part="simulator",
+            scene=SCENE,
+            data=f"{self.side}² pixels, {self.scanner.geometry.n_views} views",
+            group=choice.group,
+            curve=choice.curve,
+            label=choice.label,
+            params=msgspec.to_builtins(choice.simulation)
+            | {"grid": choice.grid, "metal": choice.metal, "level": choice.level},
+            code=code_version("ctsim.simulate"),
+            machine=machine,
+        )
+
+    def plan(self, choice: Choice) -> tuple[Plan, Phantom, Scanner]:
+        """Plan a choice, once; no clock runs yet."""
+        key = f"{choice.curve}: {choice.label}"
+        if key not in self._plans:
+            scanner = msgspec.structs.replace(self.scanner, scatter=_scatter(choice.level))
+            phantom = self._phantom(choice.grid, choice.metal)
+            plan = make_plan(phantom, scanner, choice.simulation, Truth(twin=False, noise_free=True), "pareto")
+            self._plans[key] = plan, phantom, scanner
+        return self._plans[key]
+
+    def estimate(self) -> float:
+        """Return about how long a run of the median choice takes, in seconds."""
+        return self.plan(Choice(curve=EXACT, label="default"))[0].seconds
+
+    def run(self, choice: Choice) -> tuple[Mark, ...]:
+        """Time all views of a choice and return its errors."""
+        plan, phantom, scanner = self.plan(choice)
+        start = time.perf_counter()
+        views = [images["noise_free"] for _, images in simulate_views(plan, phantom, scanner)]
+        seconds = time.perf_counter() - start
+        found = np.stack([views[k] for k in self.checked])
+        s = open_fraction(_scatter(max(LEVELS)), scanner.geometry) if choice.group == SCATTER else 0.0
+        label = f"{choice.label}, {len(plan.rule.energies)} energies"
+        return (Mark(label=label, seconds=seconds, values=self.errors(found, s), default=choice.default),)
+
+    def errors(self, p: NDArray[np.float32], scatter: float = 0.0) -> dict[str, float]:
+        """Hold P of the checked views against the reference with `scatter` (S/I0) added.
+
+        `rms` is relative, `worst` and `off_edges` are the greatest |ΔP|, the latter where a pixel has no edge.
+        """
+        exact, calm = self._reference
+        exact = -np.log(np.exp(-exact) + scatter)
+        off = np.abs(p - exact)
+        return {"rms": relative(p, exact), "worst": float(off.max()), "off_edges": float(off[calm].max())}
+
+    @functools.cached_property
+    def _reference(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """P of the checked views, and where the central ray alone says the same."""
+        exact = measured_pixel(self.phantom, self.scanner, self.checked)
+        tracer, fine = Tracer.of(self.phantom), full_rule(spectrum(self.scanner.tube), self.scanner.detector)
+        response = Response.of(fine, tracer.materials)
+        central = [transmit(tracer, self.scanner.geometry, k, response, subrays=1)[0] for k in self.checked]
+        return exact, np.abs(-np.log(np.stack(central)) - exact) < CALM
+
+    def _phantom(self, grid: float | None, metal: bool) -> Phantom:
+        """Return the scene, or its body (and with `metal` all of it) as labels of so many voxels a pixel."""
+        if grid is None:
+            return self.phantom
+        n = max(round(grid * self.side), 1)
+        cubes = msgspec.structs.replace(
+            self.scanner.geometry, n_voxel=(n, n, n), d_voxel=(SIZE / n, SIZE / n, SIZE / n)
+        )
+        return voxelised(self.phantom, cubes, tuple(s for s in self.phantom.solids if s.metal and not metal))

@@ -1,0 +1,169 @@
+"""What `run-benchmark pareto` found, as Markdown: the front, the knees, where the defaults lie, and every point."""
+
+from collections.abc import Iterator, Sequence
+
+from benchmarks.pareto_front import beaten_by, front, knee
+from benchmarks.pareto_records import ERROR, Part, Point, Timed, failures, points, recommended
+
+HEADS: dict[Part, dict[str, str]] = {
+    "simulator": {
+        "rms": "relative RMS of P",
+        "worst": "worst |ΔP|",
+        "off_edges": "worst |ΔP| off the edges",
+    },
+    "methods": {"rmse": "RMSE (1/mm)", "psnr3d": "PSNR3D (dB)"},
+}
+LOWER: dict[Part, tuple[str, ...]] = {"simulator": ("rms", "worst", "off_edges"), "methods": ("rmse",)}
+"""The values that fronts can be drawn in: smaller is better."""
+ABOUT: dict[Part, str] = {
+    "simulator": "P = −ln(signal/open) without noise, against 16² rays a pixel in closed form and the whole spectrum",
+    "methods": "protocol `tissue`: effective spectrum, inside the body dilated by 4, outside the metal dilated by 2",
+}
+
+
+def summary(found: Sequence[Timed]) -> str:
+    """Render the fronts, the defaults and each curve's knee; what failed or was skipped stands below."""
+    out = [_provenance(found), ""]
+    for group in groups(points(found)):
+        out += [*_front(group), "", *_defaults(group), "", *_curves(group), ""]
+    bad = failures(found)
+    if bad:
+        out += ["| not measured | setting | status | reason |", "|---|---|---|---|"]
+        out += [_row(t.setting.curve, t.setting.label, t.status, t.reason) for t in bad]
+    return "\n".join(out).rstrip() + "\n"
+
+
+def every_point(found: Sequence[Timed]) -> str:
+    """Render all points, each with the errors in which it is on its group's front."""
+    out: list[str] = []
+    for group in groups(points(found)):
+        part = group[0].setting.part
+        out += ["", f"### {_title(group)}: every point", ""]
+        out += _head("curve", "setting", "inputs", "s", "slowest", *HEADS[part].values(), "on the front in")
+        out += [
+            _row(p.setting.curve, _named(p), p.setting.inputs or "–", _s(p), f"{max(p.seconds):.3g}", *_values(p), on)
+            for p, on in zip(group, _fronts(group), strict=True)
+        ]
+    return "\n".join(out) + "\n"
+
+
+def groups(every: Sequence[Point]) -> list[list[Point]]:
+    """Part the points into those that may be compared: one part, scene and group."""
+    held: dict[tuple[str, str, str], list[Point]] = {}
+    for p in every:
+        held.setdefault((p.setting.part, p.setting.scene, p.setting.group), []).append(p)
+    return list(held.values())
+
+
+def curves(group: Sequence[Point]) -> dict[str, list[Point]]:
+    """Part a group's points by method or kind of choice."""
+    return {c: [p for p in group if p.setting.curve == c] for c in dict.fromkeys(p.setting.curve for p in group)}
+
+
+def _title(group: Sequence[Point]) -> str:
+    setting = group[0].setting
+    where = f" ({setting.data})" if setting.part == "simulator" else ""
+    return f"{setting.part}, {setting.scene}: {setting.group}{where}"
+
+
+def _front(group: Sequence[Point]) -> Iterator[str]:
+    """Yield the table of the group's front in its main error."""
+    part = group[0].setting.part
+    pairs = [p.pair for p in group]
+    at = knee(pairs)
+    yield f"### {_title(group)}"
+    yield ""
+    yield f"The front, in {HEADS[part][ERROR[part]]}; {ABOUT[part]}."
+    yield ""
+    yield from _head("curve", "setting", "inputs", "s", *HEADS[part].values(), "")
+    for k in front(pairs):
+        p = group[k]
+        note = "**knee: recommended**" if k == at else ""
+        yield _row(p.setting.curve, _named(p), p.setting.inputs or "–", _s(p), *_values(p), note)
+    if at is None:
+        yield ""
+        yield f"No point of the front lies below the chord between its ends; recommended: {_short(recommended(group))}."
+
+
+def _defaults(group: Sequence[Point]) -> Iterator[str]:
+    """Yield a line for every default: on the front, or what beats it."""
+    for k, p in enumerate(group):
+        if p.default:
+            words = [_beaten(group, k, key) for key in LOWER[p.setting.part]]
+            yield f"- {p.setting.curve}, {_named(p)}: {'; '.join(words)}."
+
+
+def _beaten(group: Sequence[Point], k: int, key: str) -> str:
+    name = HEADS[group[k].setting.part][key]
+    pairs = _pairs(group, key)
+    if k in front(pairs):
+        return f"on the front in {name}"
+    best, share = beaten_by(pairs, k)
+    return f"off it in {name} ({_short(group[best])} is no worse in {share:.2f} of the time)"
+
+
+def _curves(group: Sequence[Point]) -> Iterator[str]:
+    """Yield the table of each curve's default, knee and most accurate point."""
+    part = group[0].setting.part
+    key = ERROR[part]
+    name = HEADS[part][key]
+    yield from _head("curve", "default", "s", name, "its knee", "s", name, "most accurate", "s", name)
+    for curve, mine in curves(group).items():
+        default = next((p for p in mine if p.default), None)
+        at = knee([p.pair for p in mine])
+        best = min(mine, key=lambda p: (p.values[key], p.pair[0]))
+        chosen = (default, None if at is None else mine[at], best)
+        yield _row(curve, *(cell for p in chosen for cell in _cells(p)))
+
+
+def _cells(p: Point | None) -> tuple[str, str, str]:
+    return ("–", "–", "–") if p is None else (p.label, _s(p), f"{p.pair[1]:.3g}")
+
+
+def _fronts(group: Sequence[Point]) -> list[str]:
+    """Return for each point the names of the errors in which it is on the front."""
+    keys = LOWER[group[0].setting.part]
+    on = {key: set(front(_pairs(group, key))) for key in keys}
+    return [", ".join(HEADS[p.setting.part][key] for key in keys if k in on[key]) for k, p in enumerate(group)]
+
+
+def _pairs(group: Sequence[Point], key: str) -> list[tuple[float, float]]:
+    return [(p.pair[0], p.values[key]) for p in group]
+
+
+def _named(p: Point) -> str:
+    return f"{p.label} (default)" if p.default else p.label
+
+
+def _short(p: Point) -> str:
+    return f"{p.setting.curve}, {p.label}"
+
+
+def _s(p: Point) -> str:
+    return f"{p.pair[0]:.3g}"
+
+
+def _values(p: Point) -> list[str]:
+    shown = {"psnr3d": "{:.2f}", "rmse": "{:.3e}"}
+    values = ((key, p.values.get(key)) for key in HEADS[p.setting.part])
+    return ["–" if v is None else shown.get(key, "{:.1e}").format(v) for key, v in values]
+
+
+def _head(*names: str) -> list[str]:
+    right = {"s", "slowest", *(name for heads in HEADS.values() for name in heads.values())}
+    return [_row(*names), "|" + "|".join("--:" if name in right else "---" for name in names) + "|"]
+
+
+def _row(*cells: str) -> str:
+    return "| " + " | ".join(cell.replace("|ΔP|", "\\|ΔP\\|") for cell in cells) + " |"
+
+
+def _provenance(found: Sequence[Timed]) -> str:
+    last = found[-1]
+    h, changed = last.host, "+changes" if last.commit.endswith("+changes") else ""
+    counts = sorted({len(p.seconds) for p in points(found)})
+    of = "–".join(map(str, dict.fromkeys((counts[0], counts[-1])))) if counts else "0"
+    return (
+        f"{last.time}, commit {last.commit[:12]}{changed}, {h.cpu}, {h.cores} cores, {h.threads} threads, "
+        f"Python {h.python}, numba {h.versions.get('numba', '?')}. Seconds are medians of {of} interleaved runs."
+    )
