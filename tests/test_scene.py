@@ -42,6 +42,48 @@ def test_suites_load_and_round_trip(suite: str) -> None:
         assert one.resolve().geometry.fov_radius >= 0.46 * one.phantom.size
 
 
+def test_systems_are_one_thorax_in_the_papers_five_cases() -> None:
+    scenes = load_suite(SUITES / "systems.toml")
+    lung = load_suite(SUITES / "core.toml")[0]
+    cases = []
+    for one in scenes:
+        assert parse_suite(scene_to_toml(one)) == (one,)
+        assert (one.phantom, one.seed, one.truth, one.simulation) == (
+            lung.phantom,
+            lung.seed,
+            lung.truth,
+            lung.simulation,
+        )
+        scanner, plain = one.resolve(), lung.resolve()
+        assert (scanner.geometry, scanner.i0, scanner.noise) == (plain.geometry, plain.i0, plain.noise)
+        (sheet,) = scanner.tube.filters
+        cases.append((scanner.tube.kvp, sheet.material, sheet.thickness, scanner.detector.kind))
+        kvp, material, thickness, kind = cases[-1]
+        assert one.name.lower() == f"lung-{kvp:g}kv-{material}{thickness}-{kind}".lower()
+        assert scanner.detector.thickness == 0.1
+    assert cases == [
+        (90, "Al", 0.5, "gos"),
+        (90, "Al", 1.0, "gos"),
+        (90, "Al", 0.5, "csi"),
+        (120, "Al", 0.5, "gos"),
+        (60, "Cu", 0.5, "gos"),
+    ]
+
+
+def test_real_scans_are_five_objects_with_metal_and_a_twin_without() -> None:
+    scenes = load_suite(SUITES / "real.toml")
+    recipes = {"walnut": "Fe", "metal_rods": "Al6061", "chicken": "Fe", "bell_pepper": "Al", "broccoli": "Al"}
+    assert {s.phantom.recipe: s.phantom.metal for s in scenes} == recipes and len(scenes) == 5
+    for one in scenes:
+        assert parse_suite(scene_to_toml(one)) == (one,)
+        scanner = one.resolve()
+        assert scanner.tube == MACHINES["skyscan1273"].tube and scanner.detector == MACHINES["skyscan1273"].detector
+        assert (scanner.geometry.n_voxel, scanner.geometry.shape) == ((128, 128, 128), (240, 224, 224))
+        small = msgspec.structs.replace(one.phantom, n_voxel=(24, 24, 24))
+        body = build(msgspec.structs.replace(one, phantom=small))
+        assert one.truth.twin and any(s.metal and s.material == recipes[one.phantom.recipe] for s in body.solids)
+
+
 def test_identity_is_stable_and_sees_every_change() -> None:
     one = scene()
     assert scene_id(one) == scene_id(scene()) and len(scene_id(one)) == 12
