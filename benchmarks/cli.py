@@ -9,7 +9,7 @@ import signal
 import sys
 from collections.abc import Callable
 
-OTHERS = {"inspect": "inspector", "peers": "peers", "reproduce": "reproduce"}
+OTHERS = {"inspect": "inspector", "peers": "peers", "reproduce": "reproduce", "skipping": "skipping", "report": "reports.report"}
 EXIT_USER, EXIT_INTERRUPTED = 2, 130
 
 
@@ -19,10 +19,12 @@ def make_dataset() -> int:
 
 
 def run_benchmark() -> int:
-    """Run `run-benchmark` or one of its subcommands `inspect`, `peers` and `reproduce`; return the exit code."""
+    """Run `run-benchmark` or one of its subcommands, the keys of `OTHERS`; return the exit code."""
     arguments = sys.argv[1:]
     if arguments and arguments[0] in OTHERS:
-        return guarded(f"run-benchmark {arguments[0]}", f"benchmarks.{OTHERS[arguments[0]]}", arguments[1:])
+        module = OTHERS[arguments[0]]  # one of another package is named, never imported by this one
+        module = module if "." in module else f"benchmarks.{module}"
+        return guarded(f"run-benchmark {arguments[0]}", module, arguments[1:])
     return guarded("run-benchmark", "benchmarks.cli_run", arguments)
 
 

@@ -1,0 +1,208 @@
+"""What `run-benchmark skipping` measures of reconstruction methods and commands (see `skipping_cases`)."""
+
+import contextlib
+import functools
+import io
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from baselines.inpaint import Filled, fill
+from baselines.limar import interpolated
+from baselines.metal import Trace, find_metal
+from baselines.nmar import Normalise, normalised
+from baselines.prior import Choice, choose_prior
+from benchmarks import cli_run, make_dataset
+from benchmarks.methods import find
+from benchmarks.run import scan_for
+from benchmarks.skipping_cases import Case, Pair, Setup, largest
+from benchmarks.volumes import read_volume
+from ctsim.store import StoredScan, open_scan
+from ctsim.types import Scan
+from phantoms.scene import scene_to_toml
+from reconstruct.fdk import fdk_stream
+from reconstruct.fdk import reconstruct as fdk
+from reconstruct.projector import forward_columns
+
+HOW = "rows"
+Bridge = Callable[[NDArray[np.float32], slice, Filled], None]
+# float32 sums in the same order, of rows read at places that were worked out from another centre
+MOVED, MOVED_AT = 1e-5, "tests/test_fdk.py"
+
+
+def quietly(command: Callable[[list[str]], int], *arguments: str | Path) -> None:
+    """Run a command of ours without what it says; raise RuntimeError with that where it fails."""
+    said = io.StringIO()
+    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+        code = command([str(argument) for argument in arguments])
+    if code:
+        raise RuntimeError(f"exit code {code}: {said.getvalue().strip()}")
+
+
+def made(setup: Setup, *flags: str) -> StoredScan:
+    """Make the thorax' scan in the setup's folder unless it is there, and open it."""
+    scene = setup.scene()
+    recipe = setup.folder / "scene.toml"
+    recipe.write_text(scene_to_toml(scene), encoding="utf-8")
+    quietly(make_dataset.main, recipe, setup.folder / "data", *flags)
+    return open_scan(setup.folder / "data" / scene.name)
+
+
+# --- the whole way, as published, with nothing left out ---------------------------------------------
+
+
+def straight(trace: Trace) -> Bridge:
+    """Return what bridges the trace as LIMAR does."""
+
+    def bridge(p: NDArray[np.float32], views: slice, filled: Filled) -> None:
+        for k, view in enumerate(range(views.start, views.stop)):
+            fill(p[k], trace.view(view), HOW, filled)
+
+    return bridge
+
+
+def through_prior(trace: Trace, choice: Choice) -> Bridge:
+    """Return what bridges the trace as NMAR does, with the prior projected on every row of every view."""
+
+    def bridge(p: NDArray[np.float32], views: slice, filled: Filled) -> None:
+        q = forward_columns(choice.columns, trace.geometry, views)
+        for k, view in enumerate(range(views.start, views.stop)):
+            p[k] = Normalise().fill(p[k], q[k], trace.view(view), filled, choice.largest, HOW)
+
+    return bridge
+
+
+def everything(trace: Trace, bridge: Bridge) -> torch.Tensor:
+    """Reconstruct all bridged projections from nothing: [z, y, x] in 1/mm."""
+    filled = Filled()
+
+    def read(views: slice) -> NDArray[np.float32]:
+        p = trace.logarithm.of(views)[0]
+        bridge(p, views, filled)
+        return p
+
+    return fdk_stream(read, trace.geometry)
+
+
+def chosen(trace: Trace, scan: Scan, first: torch.Tensor) -> Choice:
+    """Return NMAR's prior."""
+    choice = choose_prior(trace, find_metal(scan, first.numpy(), "oracle"), first, "auto", HOW)
+    if choice is None:
+        raise RuntimeError("the thorax has no tissue to make a prior of")
+    return choice
+
+
+def regardless(scan: Scan, name: str) -> torch.Tensor:
+    """Correct a scan as LIMAR or NMAR would, did they not look whether there is metal."""
+    first = fdk(scan).values
+    trace = Trace(find_metal(scan, first.numpy(), "oracle"), scan)
+    if name == "limar":
+        return everything(trace, straight(trace))
+    return everything(trace, through_prior(trace, chosen(trace, scan, first)))
+
+
+# --- pairs ---------------------------------------------------------------------------------------------
+
+
+def volumes_apart(one: torch.Tensor, other: torch.Tensor) -> float:
+    """Return the largest difference of two volumes."""
+    return largest([(one.numpy(), other.numpy())])
+
+
+def metal_free(setup: Setup) -> Iterator[Pair[torch.Tensor]]:
+    """Yield LIMAR and NMAR on the twin, where they stop after FDK, and all they would do for an empty trace."""
+    stored = made(setup)
+    for name in ("limar", "nmar"):
+        method = find(name)
+        scan = scan_for(method, stored, "metal_free")
+
+        def stopping(run: Any = method, scan: Scan = scan) -> torch.Tensor:
+            return run.reconstruct(scan, "cpu").values
+
+        yield Pair(
+            case="metal-free",
+            scene=f"{stored.name}, twin",
+            what=f"all that {name.upper()} does after FDK where there is no metal",
+            skipping=stopping,
+            whole=functools.partial(regardless, scan, name),
+            difference=volumes_apart,
+            unit="1/mm",
+        )
+
+
+def rows(setup: Setup) -> Iterator[Pair[torch.Tensor]]:
+    """Yield LIMAR and NMAR reconstructing what they change, and reconstructing all of it again.
+
+    FDK, the trace and the prior, which both ways need, are prepared.
+    """
+    stored = made(setup)
+    scan = scan_for(find("limar"), stored, "metal")
+    first = fdk(scan).values
+    trace = Trace(find_metal(scan, first.numpy(), "oracle"), scan)
+    choice, touched = chosen(trace, scan, first), trace.rows()
+    bridge = functools.partial(Normalise().fill, largest=choice.largest, how=HOW)
+    ways: dict[str, tuple[Callable[[], torch.Tensor], Bridge]] = {
+        "LIMAR": (lambda: interpolated(trace, first, HOW)[0], straight(trace)),
+        "NMAR": (lambda: normalised(trace, first, choice.columns, bridge)[0], through_prior(trace, choice)),
+    }
+    for name, (part, bridging) in ways.items():
+        most = float(part().abs().max())
+        yield Pair(
+            case="rows",
+            scene=stored.name,
+            what=f"detector rows that {name} leaves as they are",
+            skipping=part,
+            whole=functools.partial(everything, trace, bridging),
+            difference=volumes_apart,
+            unit="1/mm",
+            limit=MOVED * most,
+            stated=MOVED_AT,
+            note=f"{touched.stop - touched.start} of {scan.geometry.n_detector[0]} rows hold metal",
+        )
+
+
+def stored_scan(setup: Setup) -> Iterator[Pair[list[NDArray[Any]]]]:
+    """Yield make-dataset where the scan is there, and made again."""
+    stored = made(setup)
+    names = sorted(name.removesuffix(".tif") for name in stored.files if name.endswith(".tif"))
+
+    def arrays(*flags: str) -> list[NDArray[Any]]:
+        found = made(setup, *flags)
+        return [found.array(name) for name in names]  # mapped, not read
+
+    yield Pair(
+        case="scan",
+        scene=stored.name,
+        what="make-dataset of a scan that is there",
+        skipping=arrays,
+        whole=functools.partial(arrays, "--force"),
+        difference=lambda a, b: largest(list(zip(a, b, strict=True))),
+        unit="any array",
+    )
+
+
+def recorded_run(setup: Setup) -> Iterator[Pair[list[NDArray[np.float32]]]]:
+    """Yield run-benchmark where the run is recorded, and run again; both render the tables and pictures."""
+    name = made(setup).name
+    results = setup.folder / "results"
+
+    def volumes(*flags: str) -> list[NDArray[np.float32]]:
+        quietly(cli_run.main, setup.folder / "data", results, "--method", "nmar", *flags)
+        return [read_volume(path) for path in sorted((results / "volumes").glob("*.tif"))]
+
+    yield Pair(
+        case="record",
+        scene=name,
+        what="run-benchmark of a run that is recorded, NMAR on the scan and its twin",
+        skipping=volumes,
+        whole=functools.partial(volumes, "--force"),
+        difference=lambda a, b: largest(list(zip(a, b, strict=True))),
+        unit="1/mm",
+    )
+
+
+CASES: dict[str, Case] = {"metal-free": metal_free, "rows": rows, "scan": stored_scan, "record": recorded_run}

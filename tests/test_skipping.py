@@ -1,0 +1,151 @@
+"""`run-benchmark skipping`: both ways of every pair do what they say, and a difference beyond what is stated shows."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks import cli, make_dataset, skipping, skipping_cases, skipping_methods, skipping_tables
+from benchmarks.skipping_cases import Pair, Setup
+from ctsim.bricks import MIXED
+from ctsim.errors import InputError
+from ctsim.project import Tracer
+from phantoms.scene import build
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The command on tiny grids: exit code, records, and its folder."""
+    folder = tmp_path_factory.mktemp("skipping")
+    code = skipping.main([str(folder), "--size", "small", "--repeats", "1"])
+    return code, skipping_tables.read(folder / skipping.NAME), folder
+
+
+def small(tmp_path):
+    return Setup(size="small", repeats=1, folder=tmp_path)
+
+
+def pairs(case, tmp_path):
+    return list((skipping_cases.CASES | skipping_methods.CASES)[case](small(tmp_path)))
+
+
+def fake(difference, limit=1.0):
+    return Pair(
+        case="rays",
+        scene="none",
+        what="nothing",
+        skipping=lambda: 0.0,
+        whole=lambda: 0.0,
+        difference=lambda a, b: difference,
+        unit="P",
+        limit=limit,
+    )
+
+
+def test_every_case_is_measured_and_stays_within_what_is_stated(run):
+    code, records, folder = run
+    assert code == 0
+    assert tuple(dict.fromkeys(r.measured.case for r in records)) == skipping.CASES
+    assert skipping_cases.CASES.keys() | skipping_methods.CASES.keys() == set(skipping.CASES)
+    assert all(len(r.measured.skipping) == len(r.measured.whole) == 1 and r.commit for r in records)
+    by = {r.measured.case: r.measured for r in records}
+    for exact in ("twin", "truth", "metal-free", "scan", "record"):
+        assert by[exact].difference == by[exact].limit == 0
+    # fewer energies and no scatter are seen in the result, or the two ways were the same
+    assert 0 < by["energies"].difference <= by["energies"].limit < 2e-4
+    assert by["scatter"].difference > 1e-3 and by["scatter"].limit is None
+    text = (folder / "skipping.md").read_text(encoding="utf-8")
+    assert all(f"| {case} |" in text for case in skipping.CASES) and "Grids this small" in text and "NO" not in text
+
+
+@pytest.mark.parametrize("difference", [2.0, math.nan, math.inf])
+def test_a_difference_beyond_what_is_stated_ends_with_one(tmp_path, monkeypatch, capsys, difference):
+    monkeypatch.setitem(skipping_cases.CASES, "rays", lambda setup: iter([fake(0.5), fake(difference)]))
+    assert skipping.main([str(tmp_path), "--case", "rays", "--repeats", "2"]) == 1
+    assert "| NO |" in capsys.readouterr().out
+    found = skipping_tables.read(tmp_path / skipping.NAME)
+    assert [r.measured.held for r in found] == [True, False]
+    monkeypatch.setitem(skipping_cases.CASES, "rays", lambda setup: iter([fake(0.5), fake(9.0, limit=None)]))
+    assert skipping.main([str(tmp_path), "--case", "rays", "--repeats", "2"]) == 0
+    out = capsys.readouterr().out
+    assert "NO" not in out and out.count("| rays |") == 2  # the newest run alone
+
+
+def test_what_was_measured_stays_when_a_later_case_is_interrupted(tmp_path, monkeypatch):
+    def interrupted(setup):
+        yield fake(0.0)
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(skipping_cases.CASES, "rays", interrupted)
+    monkeypatch.setattr("sys.argv", ["run-benchmark", "skipping", str(tmp_path), "--case", "rays"])
+    assert cli.run_benchmark() == cli.EXIT_INTERRUPTED
+    assert len(skipping_tables.read(tmp_path / skipping.NAME)) == 1
+
+
+def test_arrays_that_are_not_finite_are_apart():
+    one, bad = np.ones(3, np.float32), np.array([1, np.nan, 1], np.float32)
+    assert skipping_cases.largest([(one, one)]) == 0
+    assert math.isnan(skipping_cases.largest([(one, one), (one, bad)]))
+    # unsigned counts do not wrap around
+    assert skipping_cases.largest([(np.array([1], np.uint16), np.array([3], np.uint16))]) == 2
+    with pytest.raises(ValueError, match="nothing to compare"):
+        skipping_cases.largest([])
+
+
+def test_bricks_with_nothing_left_out_hold_the_same_labels(tmp_path):
+    phantom = build(small(tmp_path).scene())
+    whole, usual = skipping_cases.all_mixed(phantom), Tracer.of(phantom).bricks
+    assert (whole.code & 255 == MIXED).all() and not (usual.code & 255 == MIXED).all()
+    z, y, x = (n // 4 for n in phantom.labels.shape)
+    assert np.array_equal(whole.slot.ravel(), np.arange(z * y * x))  # bricks are kept, in order
+    back = whole.pool.reshape(z, y, x, 4, 4, 4).transpose(0, 3, 1, 4, 2, 5).reshape(phantom.labels.shape)
+    assert np.array_equal(back, phantom.labels)
+    assert np.array_equal(whole.grid, usual.grid)
+
+
+def test_sub_rays_are_cast_everywhere_in_the_way_without_the_skip(tmp_path):
+    (edges,) = pairs("edges", tmp_path)
+    # with all sub-rays wherever the thickness of a solid varies, many more pixels differ from their central ray
+    few, every = edges.skipping(), edges.whole()
+    changed = np.mean([np.mean(a != b) for a, b in zip(few, every, strict=True)])
+    assert changed > 0.1
+
+
+def test_the_stated_difference_of_scatter_is_its_fraction(tmp_path):
+    (pair,) = pairs("scatter", tmp_path)
+    fraction = float(pair.note.split("=")[1].split()[0])
+    for without, lit in itertools.islice(zip(pair.skipping(), pair.whole(), strict=True), 2):
+        lifted = np.exp(-lit["noise_free"].astype(np.float64)) - np.exp(-without["noise_free"].astype(np.float64))
+        # two digits of the fraction are said; float32 signals near 1
+        np.testing.assert_allclose(lifted, fraction, rtol=0.05, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["limar", "nmar"])
+def test_regardless_of_metal_all_is_projected_and_reconstructed(tmp_path, monkeypatch, name):
+    calls = []
+    for where in ("fdk_stream", "forward_columns"):
+        real = getattr(skipping_methods, where)
+
+        def counted(*arguments, real=real, where=where, **more):
+            calls.append(where)
+            return real(*arguments, **more)
+
+        monkeypatch.setattr(skipping_methods, where, counted)
+    pair = pairs("metal-free", tmp_path)[("limar", "nmar").index(name)]
+    first = pair.skipping()
+    assert not calls
+    assert pair.difference(first, pair.whole()) == 0
+    assert set(calls) == ({"fdk_stream"} if name == "limar" else {"fdk_stream", "forward_columns"})
+
+
+def test_wrong_arguments_are_one_sentence(tmp_path):
+    with pytest.raises(InputError, match="--repeats must be at least 1"):
+        skipping.main([str(tmp_path), "--repeats", "0"])
+    with pytest.raises(SystemExit):
+        skipping.main([str(tmp_path), "--case", "nothing"])
+
+
+def test_a_command_that_fails_is_not_taken_for_a_fast_one(tmp_path):
+    with pytest.raises(RuntimeError, match="no such scene"):
+        skipping_methods.quietly(make_dataset.main, "core", tmp_path, "--only", "none")
