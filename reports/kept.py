@@ -1,0 +1,109 @@
+"""What a results folder keeps of one scan: the truth, the windows to look through, and a volume a method.
+
+Arrays are mapped; nothing is read before it is looked at.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.artefact import water_attenuation
+from benchmarks.panels import Look, cut, look_of
+from benchmarks.protocol import Stored, Truth, truth_of
+from benchmarks.records import Record, latest, read_all
+from benchmarks.run import repetition
+from benchmarks.volumes import identity_of
+from ctsim.errors import InputError
+from ctsim.store import list_scans, open_scan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kept:
+    """One method's record and its volume [z, y, x] in 1/mm."""
+
+    record: Record
+    values: NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """A scan and what methods made of it. `look` holds the window's top and the error scale in 1/mm."""
+
+    stored: Stored
+    scene: str
+    seed: int
+    truth: Truth
+    look: Look
+    kept: tuple[Kept, ...]
+
+    @property
+    def reference(self) -> NDArray[np.float32]:
+        """The effective-spectrum reference, [z, y, x] in 1/mm."""
+        return self.truth.references["effective"]
+
+    @property
+    def at(self) -> tuple[int, int, int]:
+        """The slices (z, y, x) through the most metal."""
+        return cut(self.truth.metal, self.truth.body)
+
+    def hounsfield(self, value: float) -> float | None:
+        """Return an attenuation (1/mm) in HU of the scan's water; None where its spectrum is not known."""
+        water = self.look.water
+        return None if water is None else 1000 * (value / water - 1)
+
+
+def case_of(stored: Stored, records: list[Record], results: Path) -> Case:
+    """Collect what `results` keeps of a scan; volumes of other data, parameters or code are left out."""
+    import tifffile
+
+    kept = []
+    for record in latest(records):
+        path = results / record.volume if record.volume else None
+        mine = record.run.scan == stored.content_hash and record.run.variant == "metal" and record.scores
+        if mine and path is not None and identity_of(path) == record.identity:
+            kept.append(Kept(record=record, values=tifffile.memmap(path, mode="r")))
+    scene, seed = repetition(stored)
+    truth = truth_of(stored)
+    look = look_of(truth, None, np.zeros(0, np.bool_), water_attenuation(stored))
+    return Case(stored=stored, scene=scene, seed=seed, truth=truth, look=look, kept=tuple(kept))
+
+
+def first_cases(data: Path, records: list[Record], results: Path) -> Iterator[Case]:
+    """Yield one case a scene, the first repetition of which a volume is kept; scenes without one are left out.
+
+    Raises InputError where `data` holds none of the scans that `results` measured.
+    """
+    folders = list_scans(data)
+    known = {record.run.scan for record in latest(records)}
+    seen: set[str] = set()
+    met = False
+    for stored in map(open_scan, folders):
+        met |= stored.content_hash in known
+        if stored.content_hash not in known or repetition(stored)[0] in seen:
+            continue
+        case = case_of(stored, records, results)
+        if case.kept:
+            seen.add(case.scene)
+            yield case
+    if not met:
+        raise InputError(f"{data}: none of its {len(folders)} scans is one that {results} has records of")
+
+
+def open_case(data: Path, results: Path, scene: str | None = None) -> Case:
+    """Open one scan by its name (None: the first of which a volume is kept).
+
+    Raises InputError where there is no such scan or no volume of it is kept.
+    """
+    records, _ = read_all(results)
+    names = []
+    for stored in map(open_scan, list_scans(data)):
+        names.append(stored.name)
+        if scene in (None, stored.name) and (case := case_of(stored, records, results)).kept:
+            return case
+    if scene is not None and scene not in names:
+        raise InputError(f"{data}: there is no scan {scene!r}; expected {', '.join(names) or 'a dataset with scans'}")
+    raise InputError(f"{results}: no volume of {scene or 'any scan of ' + str(data)} is kept; run a method first")

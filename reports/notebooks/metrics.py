@@ -1,0 +1,74 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # One volume, many scores
+# PSNR and SSIM are not numbers of a volume but of a volume and a convention. Here one kept volume is scored under the
+# protocol `tissue`, then with one thing changed at a time. The same table comes from `run-benchmark inspect`.
+#
+# The folders are `data` and `results`, or what the environment variables `CTSIM_DATA` and `CTSIM_RESULTS` name.
+
+# %%
+import os
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks import inspector
+from reports import kept, show
+from reports.figures import COLOURS, INK
+
+DATA, RESULTS = (Path(os.environ.get(f"CTSIM_{name.upper()}", name)) for name in ("data", "results"))
+case = kept.open_case(DATA, RESULTS)
+first = case.kept[0]
+values = np.asarray(first.values)
+
+# %%
+show.text(inspector.markdown(values, case.stored, first.record.label))
+
+# %% [markdown]
+# ## How far each convention moves the scores
+# A bar is the change against `tissue`. A larger range adds 20·log10 of its ratio to PSNR and changes nothing in the
+# volume.
+
+# %%
+base_psnr, base_ssim, _ = inspector.score(values, case.truth, inspector.BASE)
+named = [(what, how) for what, group in (*inspector.SINGLE.items(), ("all of it", inspector.WHOLE)) for how in group]
+moved = [(what, how, inspector.score(values, case.truth, how)) for what, how in named]
+kinds = list(dict.fromkeys(what for what, _ in named))
+
+drawing = Figure(figsize=(9.5, 0.27 * len(moved) + 1.2), layout="constrained")
+left, right = drawing.subplots(1, 2, sharey=True)
+for axes, number, base, title in ((left, 0, base_psnr, "PSNR3D (dB)"), (right, 1, base_ssim, "SSIM3D")):
+    for line, (what, _, found) in enumerate(moved):
+        value = found[number]
+        if value is not None and base is not None:
+            axes.barh(line, value - base, color=COLOURS[kinds.index(what) % len(COLOURS)])
+    axes.axvline(0, color=INK, lw=0.8)
+    axes.set_xlabel(f"change in {title}" + ("" if base is None else f"; tissue: {base:.3g}"))
+left.set_yticks(range(len(moved)), labels=[how.title for _, how, _ in moved], fontsize=8)
+left.invert_yaxis()
+show.figure(drawing, "metrics-conventions")
+
+# %% [markdown]
+# ## Does a convention change who wins?
+# The order of the methods by PSNR under each convention, best first. Where it differs, a ranking is a statement about
+# the convention as well.
+
+# %%
+rows = []
+for how in (inspector.BASE, *(how for _, how in named)):
+    found = {k.record.label: inspector.score(np.asarray(k.values), case.truth, how)[0] for k in case.kept}
+    known = {label: psnr for label, psnr in found.items() if psnr is not None}
+    rows.append([how.title, " > ".join(sorted(known, key=lambda label: -known[label])) or "–"])
+show.table(["convention", "order by PSNR3D"], rows)

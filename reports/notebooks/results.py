@@ -1,0 +1,55 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # What a results folder says
+# Tables and figures from the records, and each scene's slices. Nothing is reconstructed here.
+#
+# The folders are `data` and `results`, or what the environment variables `CTSIM_DATA` and `CTSIM_RESULTS` name.
+
+# %%
+import os
+from pathlib import Path
+
+from benchmarks.records import read_all
+from benchmarks.tables import render
+from ctsim.errors import InputError
+from reports import figures, kept, show, view
+
+DATA, RESULTS = (Path(os.environ.get(f"CTSIM_{name.upper()}", name)) for name in ("data", "results"))
+records, _ = read_all(RESULTS)
+if not records:
+    raise InputError(f"{RESULTS}: there are no records; run `run-benchmark {DATA} {RESULTS}` first")
+
+# %% [markdown]
+# ## Scores
+# `tissue` is the primary protocol. The gains are over no correction (FDK) and over NMAR; an anchored score is 0 where
+# the metal might never have been there and 1 where it was left uncorrected.
+
+# %%
+show.text(render(records, "md", ("tissue", "against", "anchored", "cost")))
+
+# %% [markdown]
+# ## Figures
+
+# %%
+for number, (_, drawing) in enumerate(figures.drawn(records)):
+    show.figure(drawing, f"results-{number}")
+
+# %% [markdown]
+# ## Slices
+# The slice through the most metal, one window for all, and the signed errors. In Jupyter, `view.viewer(case)` puts
+# sliders around the same pictures.
+
+# %%
+for case in kept.first_cases(DATA, records, RESULTS):
+    show.figure(view.figure(case, view.first_state(case)), f"results-{case.stored.name}")

@@ -1,0 +1,217 @@
+"""One HTML file that needs nothing else: tables that sort, figures, and a slice slider for each scene.
+
+Its parts are written by `benchmarks.tables` and `reports.figures`; here they are put in their places. A policy in
+the file itself forbids it to load anything.
+"""
+
+import html
+import json
+import string
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any
+
+import matplotlib
+import matplotlib.colors
+import numpy as np
+
+from benchmarks.records import OK, Record
+from benchmarks.tables import render
+from reports import figures, markdown, slices
+from reports.kept import Case, Kept
+
+PRIMARY = "tissue"
+TITLES = {
+    "tissue": "Tissue, the primary protocol",
+    "aligned": "Tissue after one gain",
+    "aligned_50kev": "Tissue after one gain, against 50 keV",
+    "paper": "All voxels against 50 keV",
+    "metal": "The metal itself",
+    "artefact": "Artefacts, against the metal-free twin",
+    "projection": "Views that no method saw",
+    "against": "Gains over FDK and NMAR",
+    "anchored": "Anchored scores and harm",
+    "cost": "Cost",
+}
+SIGNED_STOPS = 17  # of the error colours; the browser interpolates between them
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Content:
+    """What a page shows. `more` are further pages in Markdown by title; `missing` says why there are no slices."""
+
+    title: str
+    provenance: str
+    records: list[Record]
+    cases: list[Case]
+    most: int = 1
+    more: dict[str, str]
+    missing: str = ""
+
+
+def page(content: Content, done: Callable[[], Any] = lambda: None) -> str:
+    """Return the page; `done` is called after every slice that was encoded."""
+    tables = markdown.sections(render(content.records, "md"))
+    scenes = [_scene(case, slices.frame_of(case, content.most), done) for case in content.cases]
+    parts = {
+        "scores": ("Scores", _table(PRIMARY, tables.pop(PRIMARY)) if PRIMARY in tables else ""),
+        "figures": ("Figures", _figures(content.records)),
+        "slices": ("Slices", _slices(scenes, content.cases) if scenes else f"<p>{html.escape(content.missing)}</p>"),
+        "protocols": ("All protocols", "".join(_folded(name, text) for name, text in tables.items())),
+        "more": ("More", "".join(_folded(name, text) for name, text in content.more.items())),
+    }
+    kept = {name: part for name, part in parts.items() if part[1]}
+    return string.Template(_asset("page.html")).substitute(
+        title=html.escape(content.title),
+        provenance=markdown.inline(content.provenance),
+        style=_asset("page.css"),
+        script=_asset("page.js"),
+        transfer=_transfer(),
+        contents="".join(f'<a href="#{name}">{title}</a>' for name, (title, _) in kept.items()),
+        main="".join(f'<h2 id="{name}">{title}</h2>\n{body}\n' for name, (title, body) in kept.items()),
+    )
+
+
+def _asset(name: str) -> str:
+    return resources.files("reports").joinpath(name).read_text(encoding="utf-8")
+
+
+def _table(name: str, text: str) -> str:
+    return f'<div id="table-{html.escape(name)}">{markdown.to_html(text)}</div>'
+
+
+def _folded(name: str, text: str) -> str:
+    title = TITLES.get(name, name)
+    return f"<details><summary>{html.escape(title)}</summary>{_table(name, text)}</details>"
+
+
+def _figures(records: list[Record]) -> str:
+    shown = (f"<figure>{figures.svg(figure, label)}</figure>" for label, figure in figures.drawn(records))
+    return f'<div class="figures">{"".join(shown)}</div>'
+
+
+def _slices(scenes: list[str], cases: list[Case]) -> str:
+    """Return what all scenes share, then the scenes."""
+    labels = dict.fromkeys(kept.record.label for case in cases for kept in case.kept)
+    radios = (("both", "volumes and errors"), ("volume", "volumes"), ("error", "errors"))
+    show = "".join(
+        f'<label><input type="radio" name="show" value="{value}"{" checked" * (value == "both")}>{text}</label>'
+        for value, text in radios
+    )
+    boxes = "".join(
+        f'<label><input type="checkbox" name="method" value="{html.escape(label)}" checked>{html.escape(label)}</label>'
+        for label in labels
+    )
+    return (
+        '<p class="caption">Errors are volume minus effective-spectrum reference. Slices normal to z, row 0 at the '
+        "bottom, cropped to the judged body. Stored in 8 bits over the stated window and compressed: for looking, "
+        "not for measuring. Metal is outlined, and grey in the errors because it is not judged.</p>"
+        f'<fieldset class="look">{show}'
+        '<label><input type="checkbox" name="ring" checked>metal outline</label></fieldset>'
+        f'<details><summary>Methods</summary><fieldset class="look">{boxes}</fieldset></details>' + "".join(scenes)
+    )
+
+
+def _scene(case: Case, frame: slices.Frame, done: Callable[[], Any]) -> str:
+    """Return a scene's section: slider, legends, a tile a method, and the images themselves."""
+    name = html.escape(case.stored.name)
+    start = int(np.argmin(np.abs(np.array(frame.z) - case.at[0])))
+    tiles = [_tile(case, frame, "reference", "<b>reference</b>, effective spectrum", "")]
+    tiles += [_tile(case, frame, str(k), _caption(kept), kept.record.label) for k, kept in enumerate(case.kept)]
+    data = json.dumps(_images(case, frame, start, done), separators=(",", ":")).replace("<", "\\u003c")
+    return (
+        f'<section class="scene" id="scene-{name}"><h3>{name}</h3><div class="control">'
+        f'<input type="range" min="0" max="{len(frame.z) - 1}" value="{start}" aria-label="slice of {name}">'
+        f"<output></output></div>{_legends(case)}"
+        f'<div class="tiles">{"".join(tiles)}</div><script type="application/json">{data}</script></section>\n'
+    )
+
+
+def _tile(case: Case, frame: slices.Frame, row: str, caption: str, label: str) -> str:
+    _, d_y, d_x = case.truth.d_voxel
+    height, width = ((part.stop - part.start) for part in (frame.rows, frame.columns))
+    ratio = f'style="aspect-ratio: {width * d_x:.6g} / {height * d_y:.6g}"'
+    ring = '<img class="stencil ring" data-kind="ring" alt="">'
+    only = "" if label else " only"
+    alt = html.escape(label or "reference")
+    frames = (
+        f'<div class="frame volume{only}" {ratio}><img class="values" data-kind="volume" data-row="{row}" '
+        f'alt="{alt}: volume">{ring}</div>'
+    )
+    if label:
+        frames += (
+            f'<div class="frame error" {ratio}><img class="values" data-kind="error" data-row="{row}" '
+            f'alt="{alt}: error"><img class="stencil" data-kind="fill" alt="">{ring}</div>'
+        )
+    return (
+        f'<figure class="tile" data-method="{html.escape(label)}"><div class="pair">{frames}</div>'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def _caption(kept: Kept) -> str:
+    record = kept.record
+    values = record.scores[PRIMARY].values
+    psnr, ssim = values["psnr3d"], values["ssim3d"]
+    said = "identical" if psnr is None else f"{psnr:.2f} dB"
+    status = "" if record.status == OK else f" · {html.escape(record.status)}"
+    return f"<b>{html.escape(record.label)}</b> {said}" + ("" if ssim is None else f" · SSIM3D {ssim:.3f}") + status
+
+
+def _images(case: Case, frame: slices.Frame, start: int, done: Callable[[], Any]) -> dict[str, Any]:
+    """Encode every slice of every volume; `said` is what stands beside the slider."""
+    heights, total = case.stored.geometry.voxel_centres()[0], case.truth.metal.shape[0]
+    stencils = [slices.metal_stencils(case, frame, z) for z in frame.z]
+
+    def encoded(make: Callable[..., slices.Image8], values: Any) -> list[str]:
+        found = []
+        for z in frame.z:
+            found.append(slices.webp(make(case, values, frame, z)))
+            done()
+        return found
+
+    return {
+        "z": list(frame.z),
+        "said": [f"slice {z} of 0 … {total - 1}, z = {heights[z]:.1f} mm" for z in frame.z],
+        "start": start,
+        "volume": {"reference": encoded(slices.volume_image, case.reference)}
+        | {str(k): encoded(slices.volume_image, kept.values) for k, kept in enumerate(case.kept)},
+        "error": {str(k): encoded(slices.error_image, kept.values) for k, kept in enumerate(case.kept)},
+        "ring": {"all": [ring for ring, _ in stencils]},
+        "fill": {"all": [fill for _, fill in stencils]},
+    }
+
+
+def _legends(case: Case) -> str:
+    """Return the bars of the window and of the error scale, in HU where the scan's water is known."""
+    water = case.look.water
+    grey, signed = "#000, #fff", ", ".join(_colours())
+    top, error = case.look.top, case.look.error
+    volume = ("0", f"{top:.4g} 1/mm")
+    errors = (f"−{error:.4g}", "0", f"+{error:.4g} 1/mm")
+    if water is not None:
+        volume = ("−1000 HU", f"{case.hounsfield(top):.0f} HU ({top:.4g} 1/mm)")
+        errors = (f"−{1000 * error / water:.0f} HU", "0", f"+{1000 * error / water:.0f} HU")
+    return f'<div class="legends">{_legend("volumes", grey, volume)}{_legend("errors", signed, errors)}</div>'
+
+
+def _legend(title: str, colours: str, ends: Iterable[str]) -> str:
+    marks = "".join(f"<span>{end}</span>" for end in ends)
+    bar = f'<div class="bar" style="background: linear-gradient(to right, {colours})"></div>'
+    return f'<div class="legend">{title}{bar}<div class="ends">{marks}</div></div>'
+
+
+def _colours() -> list[str]:
+    """Return the error colours from most negative to most positive: the panels' own."""
+    signed = matplotlib.colormaps["RdBu_r"]
+    return [matplotlib.colors.to_hex(signed(x)) for x in np.linspace(0, 1, SIGNED_STOPS)]
+
+
+def _transfer() -> str:
+    """Return the filter that turns the stored grey of an error into its colour."""
+    rgb = np.array([matplotlib.colors.to_rgb(colour) for colour in _colours()])
+    return "".join(
+        f'<feFunc{name} type="table" tableValues="{" ".join(f"{v:.4g}" for v in rgb[:, k])}"/>'
+        for k, name in enumerate("RGB")
+    )

@@ -1,0 +1,107 @@
+"""Slices for a page: 8 bits over the stated window, small enough to be carried in it.
+
+Volumes run from 0 to the window's top, errors from minus to plus the error scale. WebP at this quality moves a grey
+by one or two of 255: for looking, not for measuring.
+"""
+
+import base64
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.metrics import erode
+from reports.kept import Case
+
+QUALITY = 80
+FINE = 4  # points of an outline along a voxel, so that it is a line where metal is a few voxels wide
+RING, UNJUDGED = (255, 176, 0), (140, 140, 140)  # as in the panels
+
+Image8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Frame:
+    """Which part of a volume is shown: slices `z`, rows and columns of the judged body."""
+
+    z: tuple[int, ...]
+    rows: slice
+    columns: slice
+
+    def cut(self, volume: NDArray[Any], z: int) -> NDArray[Any]:
+        """Return a slice as it is looked at: row 0 at the bottom."""
+        return np.asarray(volume[z, self.rows, self.columns])[::-1]
+
+
+def quantised(image: NDArray[Any], low: float, high: float) -> Image8:
+    """Return `image` as 0 … 255 over [low, high]; what lies outside is clipped."""
+    return np.rint(np.clip((image - low) / (high - low), 0, 1) * 255).astype(np.uint8)
+
+
+def frame_of(case: Case, most: int) -> Frame:
+    """Choose at most `most` slices through the body, at even steps, the one through the most metal among them."""
+    judged = case.truth.judged
+    z, rows, columns = (np.flatnonzero(judged.any(axis=tuple(a for a in range(3) if a != axis))) for axis in range(3))
+    step = math.ceil(z.size / max(most, 1))
+    first = int(z[0]) + (case.at[0] - int(z[0])) % step
+    chosen = range(first, int(z[-1]) + 1, step)
+    return Frame(
+        z=tuple(chosen),
+        rows=slice(int(rows[0]), int(rows[-1]) + 1),
+        columns=slice(int(columns[0]), int(columns[-1]) + 1),
+    )
+
+
+def volume_image(case: Case, values: NDArray[Any], frame: Frame, z: int) -> Image8:
+    """Return a slice of a volume over the window on tissue."""
+    return quantised(frame.cut(values, z), 0.0, case.look.top)
+
+
+def error_image(case: Case, values: NDArray[Any], frame: Frame, z: int) -> Image8:
+    """Return a slice of a volume minus the reference over the error scale; 128 is none, also in the unjudged metal."""
+    error = np.where(case.truth.metal[z], 0, values[z] - case.reference[z])[None]
+    inside = Frame(z=(0,), rows=frame.rows, columns=frame.columns)
+    return quantised(inside.cut(error, 0), -case.look.error, case.look.error)
+
+
+def webp(image: Image8) -> str:
+    """Encode a grey image as WebP, base64."""
+    return _encoded(image, "L", format="WEBP", quality=QUALITY, method=4)
+
+
+def stencil(mask: NDArray[np.bool_], colour: tuple[int, int, int]) -> str:
+    """Encode a mask as a PNG of one colour, transparent elsewhere, base64; "" where there is nothing."""
+    if not mask.any():
+        return ""
+    return _encoded(mask.astype(np.uint8), "P", palette=(0, 0, 0, *colour), format="PNG", transparency=0, bits=1)
+
+
+def _encoded(image: Image8, mode: str, palette: Sequence[int] = (), **options: Any) -> str:
+    from PIL import Image
+
+    picture = Image.fromarray(np.ascontiguousarray(image), "L")
+    if mode == "P":
+        picture = Image.frombytes("P", picture.size, picture.tobytes())
+        picture.putpalette(palette)
+    buffer = io.BytesIO()
+    picture.save(buffer, **options)
+    return base64.b64encode(buffer.getvalue()).decode()
+
+
+def metal_stencils(case: Case, frame: Frame, z: int) -> tuple[str, str]:
+    """Return the metal's outline, drawn within it so that it hides no tissue, and the metal filled."""
+    metal = frame.cut(case.truth.metal, z)
+    fine = np.kron(metal, np.ones((1, FINE, FINE), np.bool_))
+    ring = (fine & ~erode(np.repeat(fine, 3, axis=0))[1:2])[0]
+    return stencil(ring, RING), stencil(metal, UNJUDGED)
+
+
+def bytes_a_slice(case: Case) -> int:
+    """Estimate the bytes of one slice of every volume, from the one through the most metal."""
+    frame, z = frame_of(case, 1), case.at[0]
+    pairs = ((volume_image, k) for k in case.kept), ((error_image, k) for k in case.kept)
+    return sum(len(webp(make(case, k.values, frame, z))) for group in pairs for make, k in group)
