@@ -14,12 +14,16 @@ _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
 
 
+class Busy(InputError):
+    """Another process has the lock."""
+
+
 def lock(path: Path) -> int:
     """Take the lock file `path` and return its handle; `unlock` gives it back.
 
     Raises
     ------
-    InputError
+    Busy
         When another process has it.
     """
     while True:
@@ -32,7 +36,7 @@ def lock(path: Path) -> int:
         except BlockingIOError:
             os.close(handle)
             scene = path.name.removeprefix(".").removesuffix(".lock")
-            raise InputError(f"{path.parent}: another process is writing the scene {scene!r}") from None
+            raise Busy(f"{path.parent}: another process is writing the scene {scene!r}") from None
         except BaseException:
             os.close(handle)
             raise
@@ -76,7 +80,7 @@ def put_in_place(new: Path, final: Path) -> None:
 
     Where the system cannot swap, the old folder is moved aside first; `recover` mends a crash between.
     """
-    old = _aside(final)
+    old = aside(final)
     if not final.exists():
         new.rename(final)
     else:
@@ -92,14 +96,15 @@ def put_in_place(new: Path, final: Path) -> None:
 
 def recover(final: Path) -> None:
     """Finish or undo a `put_in_place` that was cut off."""
-    old = _aside(final)
+    old = aside(final)
     if old.exists() and not final.exists():
         old.rename(final)
     elif old.exists():
         shutil.rmtree(old)
 
 
-def _aside(final: Path) -> Path:
+def aside(final: Path) -> Path:
+    """Return where the folder that `final` replaces waits to be removed."""
     return final.with_name(f".{final.name}.old")
 
 

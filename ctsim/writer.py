@@ -67,9 +67,36 @@ def is_complete(data_dir: str | Path, name: str, scene_id: str) -> bool:
         )
     # the run that wrote it may have ended between the rename and the index
     (folder / mf.PROGRESS).unlink(missing_ok=True)
+    _tidy(Path(data_dir), name)
     line = mf.IndexLine(name=name, scene_id=scene_id, content_hash=found.content_hash)
     mf.append_index(Path(data_dir), line)
     return True
+
+
+def _tidy(data_dir: Path, name: str) -> None:
+    """Remove what a run killed after the rename left beside a finished scene, unless somebody writes it now."""
+    partial, lock = data_dir / f".{name}.partial", data_dir / f".{name}.lock"
+    old = durable.aside(data_dir / name)
+    replaced = partial.is_dir() and not (partial / mf.PROGRESS).exists()  # of --force: no note, nothing to go on from
+    if not (lock.exists() or replaced or old.exists()):
+        return
+    with contextlib.suppress(durable.Busy):
+        handle = durable.lock(lock)
+        try:
+            durable.recover(data_dir / name)
+            if replaced:
+                shutil.rmtree(partial)
+        finally:
+            durable.unlock(lock, handle)
+
+
+def views_noted(data_dir: Path, name: str) -> int:
+    """Return how many views of an unfinished scene are safe on the disk; 0 where nothing is noted."""
+    try:
+        note = (data_dir / f".{name}.partial" / mf.PROGRESS).read_bytes()
+        return msgspec.json.decode(note, type=_Progress).views
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError):
+        return 0
 
 
 class SceneWriter:
@@ -181,7 +208,7 @@ class SceneWriter:
             durable.sync_tree(self._partial)
             final = self.data_dir / self.name
             durable.put_in_place(self._partial, final)
-            (final / mf.PROGRESS).unlink()  # only now: a crash before the rename must be able to go on
+            (final / mf.PROGRESS).unlink(missing_ok=True)  # only now: a crash before the rename must be able to go on
             line = mf.IndexLine(name=self.name, scene_id=self.scene_id, content_hash=whole.content_hash)
             mf.append_index(self.data_dir, line)
         return final
