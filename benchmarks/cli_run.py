@@ -2,6 +2,7 @@
 
 import logging
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,7 +15,9 @@ if TYPE_CHECKING:
     from benchmarks.methods import Method
     from benchmarks.protocol import Stored
     from benchmarks.records import Record
-    from benchmarks.run import Options, Task
+    from benchmarks.run import Options
+    from benchmarks.schedule import Group
+    from benchmarks.workers import Pool
 
 log = logging.getLogger(__name__)
 
@@ -53,6 +56,14 @@ class Arguments:
     """Reconstruct the metal-free twins too, by every method: for the protocol artefact and the anchored score."""
     table: tyro.conf.FlagCreatePairsOff[bool] = False
     """Only render the tables from the records, computing nothing."""
+    collect: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="OTHER [OTHER ...]")] = ()
+    """Take over what these results folders of other machines have and RESULTS lacks, then only render the tables."""
+    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print which runs are to do, in their order, with what they took the last time; write nothing."""
+    workers: int = 1
+    """Do so many runs at once, each with its share of the cores; times are then those of a shared machine."""
+    scheduler: Annotated[str | None, tyro.conf.arg(metavar="tcp://HOST:PORT")] = None
+    """Let the workers of this Dask scheduler do the runs; DATA and RESULTS must be the same files for them."""
 
 
 def main(arguments: list[str]) -> int:
@@ -61,23 +72,27 @@ def main(arguments: list[str]) -> int:
     given = tyro.cli(Arguments, prog="run-benchmark", args=arguments)
     from benchmarks import records, tables
 
-    found, torn = records.read_all(given.results)
-    for rest in torn:
-        log.warning("%s", rest)
-    if given.table:
-        tables.write(found, given.results)
+    for folder in (given.results, *given.collect):
+        for rest in records.read_all(folder)[1]:
+            log.warning("%s", rest)
+    for other, count in records.collect(given.results, given.collect).items():
+        log.warning("%s: %d records taken over", other, count)
+    if given.table or given.collect:
+        tables.write(records.read_all(given.results)[0], given.results)
         _show(given.results)
         return 0
-    records.repair(given.results / records.NAME)
     return _compute(given)
 
 
 def _compute(given: Arguments) -> int:
     """Run what is missing, then render tables and panels from all records, also after Ctrl-C."""
-    from benchmarks import records, run
+    from benchmarks import records, run, schedule
     from benchmarks.devices import check_device
+    from benchmarks.workers import open_pool
 
     check_device(given.device)
+    if given.scheduler and (given.isolate or given.seconds is not None):
+        raise InputError("--isolate and --seconds start processes, which Dask's workers may not: expected --workers")
     options = run.Options(
         device=given.device,
         isolate=given.isolate,
@@ -87,35 +102,51 @@ def _compute(given: Arguments) -> int:
         anchor=given.anchor,
     )
     methods, scans = _methods(given), _scans(given)
-    given.results.mkdir(parents=True, exist_ok=True)
-    listed = run.tasks(scans, methods, options)
+    names = given.scene or tuple(s.name for s in scans)
+    listed = [task for task in run.tasks(scans, methods, options) if task.stored.name in names]
     left = run.pending(listed, given.results, given.force)
+    costs = schedule.Costs(records.read_all(given.results)[0])
+    groups = schedule.ordered(left, costs)
+    if given.dry_run:
+        sys.stdout.write(schedule.text(groups, len(listed), costs))
+        return 0
+    workers = open_pool(given.workers, given.scheduler)
+    given.results.mkdir(parents=True, exist_ok=True)
+    records.repair(given.results / records.NAME)
+    if len(left) < len(listed):
+        log.warning(
+            "%d of %d runs are recorded already (--force does them again)", len(listed) - len(left), len(listed)
+        )
     failed: list[Record] = []
     try:
-        failed = _work(left, len(listed), given.results, options)
+        with workers as pool:
+            failed = _work(groups, given.results, options, pool)
     finally:
         found, _ = records.read_all(given.results)
         if found:
-            _report(found, scans, given.results)
+            _report(found, [s for s in scans if s.name in names], given.results)
     _show(given.results)
     return 1 if failed else 0
 
 
-def _work(left: "list[Task]", n_listed: int, results: Path, options: "Options") -> "list[Record]":
-    """Run the tasks behind a progress bar; return the records of those that failed."""
+def _work(groups: "list[Group]", results: Path, options: "Options", pool: "Pool | None") -> "list[Record]":
+    """Do the runs behind a progress bar, the tables following them; return the records of those that failed."""
     from tqdm import tqdm
 
-    from benchmarks import run
+    from benchmarks import records, schedule, tables
 
-    if len(left) < n_listed:
-        log.warning("%d of %d runs are recorded already (--force runs them again)", n_listed - len(left), n_listed)
-    failed = []
-    with tqdm(total=len(left), unit="run", disable=not left) as bar:
-        for task, record in zip(left, run.run_all(left, results, options), strict=True):
+    failed, written, took = [], 0.0, 0.0
+    n_runs = sum(len(group) for group in groups)
+    with tqdm(total=n_runs, unit="run", disable=not n_runs) as bar:
+        for task, record in schedule.work(groups, results, options, pool):
             bar.set_postfix_str(f"{task.stored.name} {record.label}: {record.status}")
             bar.update()
             if record.status not in ("ok", "skipped"):
                 failed.append(record)
+            if time.monotonic() > written + 10 * took:  # no more than a tenth of the time goes into tables
+                begun = time.monotonic()
+                tables.write(records.read_all(results)[0], results)
+                written, took = time.monotonic(), time.monotonic() - begun
     return failed
 
 
@@ -128,7 +159,7 @@ def _methods(given: Arguments) -> "list[Method]":
 
 
 def _scans(given: Arguments) -> "list[Stored]":
-    """Open the dataset's scans, those of --scene where given."""
+    """Open the dataset's scans, in its order; check that those of --scene are among them."""
     from ctsim.store import list_scans, open_scan
 
     scans: list[Stored] = [open_scan(folder) for folder in list_scans(given.data)]
@@ -138,7 +169,7 @@ def _scans(given: Arguments) -> "list[Stored]":
     for wanted in given.scene:
         if wanted not in names:
             raise InputError(f"--scene {wanted!r}: {given.data} has {', '.join(names)}")
-    return [s for s in scans if not given.scene or s.name in given.scene]
+    return scans
 
 
 def _report(found: "list[Record]", scans: "list[Stored]", results: Path) -> None:

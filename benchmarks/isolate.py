@@ -83,6 +83,11 @@ def run_apart(store: str, folder: Path, variant: str, method: "Method", device: 
         return _collect(Path(out), process.exitcode)
 
 
+def how_it_ended(exit_code: int) -> str:
+    """Name the signal or the exit code that a process ended with."""
+    return f"signal {signal.Signals(-exit_code).name}" if exit_code < 0 else f"exit code {exit_code}"
+
+
 def _collect(out: Path, exit_code: int) -> Outcome:
     """Read what the process left, or say how it died."""
     if not (out / _RESULT).exists():
@@ -90,8 +95,7 @@ def _collect(out: Path, exit_code: int) -> Outcome:
             return Outcome(
                 status="out_of_memory", reason="the process was killed, as the system does when memory is short"
             )
-        how = f"signal {signal.Signals(-exit_code).name}" if exit_code < 0 else f"exit code {exit_code}"
-        return Outcome(status="error", reason=f"the process died with {how}")
+        return Outcome(status="error", reason=f"the process died with {how_it_ended(exit_code)}")
     ended = msgspec.json.decode((out / _RESULT).read_bytes(), type=_Ended)
     values = np.load(out / _VALUES) if (out / _VALUES).exists() else None
     shown = intermediates.read(out / _SHOWN, "")

@@ -5,6 +5,7 @@ import dataclasses
 import difflib
 import shutil
 import sys
+import time
 import tomllib
 from collections.abc import Iterator
 from importlib import resources
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from benchmarks.workers import TICK, Lost, Pool, open_pool
 from ctsim.errors import InputError
 from ctsim.human import human_bytes, human_time
 
@@ -45,6 +47,10 @@ class Options:
     """Only these scenes of the suite."""
     seeds: tuple[int, ...] = ()
     """Make every scene once for each of these seeds, as NAME-sSEED."""
+    workers: int = 1
+    """Make so many scenes at once, each with its share of the cores."""
+    scheduler: Annotated[str | None, tyro.conf.arg(metavar="tcp://HOST:PORT")] = None
+    """Let the workers of this Dask scheduler make the scenes; OUT must be the same folder for them."""
 
 
 def main(argv: list[str]) -> int:
@@ -56,7 +62,7 @@ def main(argv: list[str]) -> int:
         if options.out is None:
             raise InputError("the data folder is missing: expected make-dataset SUITE OUT")
         scenes = select(load(options.suite), options.only, options.seeds)
-        return _dry_run(scenes, options) if options.dry_run else _make(scenes, options.out, options.force)
+        return _dry_run(scenes, options) if options.dry_run else _make(scenes, options.out, options)
     except (InputError, OSError, tomllib.TOMLDecodeError) as error:
         _say(f"make-dataset: {_sentence(error)}")
         return 2
@@ -150,28 +156,92 @@ def _dry_run(scenes: "tuple[Scene, ...]", options: Options) -> int:
     return 0
 
 
-def _make(scenes: "tuple[Scene, ...]", out: Path, force: bool) -> int:
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """A scene to make, as it travels to a worker."""
+
+    scene: "Scene"
+    plan: "Plan"
+    out: Path
+    force: bool
+
+
+def _make(scenes: "tuple[Scene, ...]", out: Path, options: Options) -> int:
+    from ctsim.manifest import arrange_index
     from ctsim.writer import is_complete
     from phantoms.scene import build, scene_id
 
     # what is in the way shows before the first hour is spent, not after it
-    todo = [s for s in scenes if force or not is_complete(out, s.name, scene_id(s))]
+    todo = [s for s in scenes if options.force or not is_complete(out, s.name, scene_id(s))]
     for scene in scenes:
         if scene not in todo:
             _say(f"{scene.name}: already complete")
     plans = {scene.name: _plan(scene)[0] for scene in todo}  # all phantoms could be more than memory holds
     _check_space(out, sum(plan.disk_bytes for plan in plans.values()))
-    for number, scene in enumerate(todo, 1):
-        title = f"{number}/{len(todo)} {scene.name}"
-        with _memory(scene.name):
-            make_scene(scene, plans[scene.name], (build(scene), scene.resolve()), out, force=force, title=title)
+    with open_pool(options.workers, options.scheduler) as pool:
+        if pool:
+            where = out.resolve()
+            _make_apart([Job(scene=s, plan=plans[s.name], out=where, force=options.force) for s in todo], pool)
+        for number, scene in enumerate(() if pool else todo, 1):
+            title = f"{number}/{len(todo)} {scene.name}"
+            with _memory(scene.name):
+                parts = build(scene), scene.resolve()
+                make_scene(scene, plans[scene.name], parts, out, force=options.force, title=title)
+    arrange_index(out, [scene.name for scene in scenes])
     return 0
 
 
+def _make_apart(jobs: list[Job], pool: Pool) -> None:
+    """Make scenes on workers behind one progress bar, which follows the views that the workers noted as safe."""
+    from tqdm import tqdm
+
+    from ctsim.writer import views_noted
+
+    views = [job.scene.resolve().geometry.n_views for job in jobs]
+    left = set(range(len(jobs)))
+    with tqdm(total=sum(views), unit="view", disable=None, file=sys.stderr) as bar:
+        for answer in pool.answers(do, jobs):
+            if answer is not None:
+                number, end = answer
+                name = jobs[number].scene.name
+                if isinstance(end, Lost):
+                    raise InputError(f"{name}: {end.reason}, as happens when memory is short; expected fewer workers")
+                left.discard(number)
+                bar.set_description(f"{len(jobs) - len(left)}/{len(jobs)} {name}")
+            bar.n = sum(
+                n if k not in left else views_noted(jobs[k].out, jobs[k].scene.name) for k, n in enumerate(views)
+            )
+            bar.refresh()
+
+
+def do(job: Job) -> None:
+    """Be the worker: make a scene unless it is there, after any process that makes it just now."""
+    from ctsim.durable import Busy
+    from ctsim.writer import is_complete
+    from phantoms.scene import build, scene_id
+
+    name = job.scene.name
+    while job.force or not is_complete(job.out, name, scene_id(job.scene)):
+        with contextlib.suppress(Busy), _memory(name):
+            make_scene(
+                job.scene, job.plan, (build(job.scene), job.scene.resolve()), job.out, force=job.force, title=None
+            )
+            return
+        time.sleep(TICK)  # a worker that was thought lost may still be at it
+
+
 def make_scene(
-    scene: "Scene", plan: "Plan", parts: "tuple[Phantom, Scanner]", out: Path, *, force: bool = False, title: str = ""
+    scene: "Scene",
+    plan: "Plan",
+    parts: "tuple[Phantom, Scanner]",
+    out: Path,
+    *,
+    force: bool = False,
+    title: str | None = "",
 ) -> Path:
     """Simulate one scene into `out`, going on from where an earlier run stopped; return its folder.
+
+    Its progress is shown under `title`, not at all where that is None.
 
     Raises
     ------
@@ -191,10 +261,11 @@ def make_scene(
     with SceneWriter(
         out, scene.name, scene_id=scene_id(scene), plan_hash=plan_hash(plan), stacks=stacks, force=force
     ) as writer:
-        if writer.first_view:
+        if writer.first_view and title is not None:
             _say(f"{scene.name}: goes on from view {writer.first_view} of {geometry.n_views}")
         views = simulate_views(plan, phantom, scanner, first_view=writer.first_view)
-        for view, arrays in _progress(views, writer.first_view, geometry.n_views, title or scene.name):
+        shown = title if title is None else title or scene.name
+        for view, arrays in _progress(views, writer.first_view, geometry.n_views, shown):
             writer.put(view, arrays)
         info = dict(scan_info(plan, phantom, scanner))
         writer.write_image("flat", info.pop("flat"), geometry.d_detector)
@@ -237,10 +308,11 @@ def _check_space(out: Path, need: int) -> None:
         raise InputError(f"{out}: the dataset needs {human_bytes(need)} but only {human_bytes(free)} are free")
 
 
-def _progress(views: Iterator[Any], first: int, n_views: int, title: str) -> Iterator[Any]:
+def _progress(views: Iterator[Any], first: int, n_views: int, title: str | None) -> Iterator[Any]:
     from tqdm import tqdm
 
-    return iter(tqdm(views, title, n_views, initial=first, unit="view", disable=None, file=sys.stderr))
+    hidden = True if title is None else None  # None: hidden where nobody watches
+    return iter(tqdm(views, title, n_views, initial=first, unit="view", disable=hidden, file=sys.stderr))
 
 
 def _json(value: Any) -> bytes:

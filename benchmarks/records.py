@@ -1,17 +1,22 @@
 """Records: one JSON line per measurement, appended and flushed, so that a crash loses one line at most.
 
 A run is what a scene, its files, a method, its parameters and its code determine; its identity is a
-SHA-256 over them. Of a run that was recorded several times the last record counts.
+SHA-256 over them. Of a run that was recorded several times the last record counts. Workers hand their records
+to the command that started them, which alone appends; the lock on the file is for two commands on one folder.
 """
 
+import contextlib
+import fcntl
 import hashlib
 import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from benchmarks.host import Host
+from benchmarks.methods import TABLE
 from benchmarks.protocol import VERSION, Score
 from ctsim.errors import InputError
 
@@ -59,7 +64,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """One measurement: the run, how it ended, its scores under each protocol, cost and provenance.
 
     `label` is the method with the parameters that differ from its defaults; `inputs` what the method
-    needs beside the counts; `volume` the path of the kept volume relative to the results folder.
+    needs beside the counts; `volume` the path of the kept volume relative to the results folder; `place`
+    the numbers of the scan in its dataset and of the method in its command, by which tables are ordered.
     """
 
     identity: str
@@ -71,6 +77,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     scores: dict[str, Score] = {}
     cost: Cost | None = None
     volume: str | None = None
+    place: tuple[int, int] = (0, 0)
     host: Host | None = None
     commit: str = "unknown"
     time: str = ""
@@ -94,16 +101,26 @@ def append(path: Path, record: Record) -> None:
     """
     line = msgspec.json.encode(record) + b"\n"
     path.parent.mkdir(parents=True, exist_ok=True)
+    with locked(path) as descriptor:
+        _mend(path, descriptor)  # another command may have been killed while it wrote
+        size = os.fstat(descriptor).st_size
+        try:
+            written = 0
+            while written < len(line):
+                written += os.write(descriptor, line[written:])
+            os.fsync(descriptor)
+        except OSError as error:
+            os.ftruncate(descriptor, size)
+            raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+@contextlib.contextmanager
+def locked(path: Path) -> Iterator[int]:
+    """Open a records file for appending, made if it is not there, alone among processes; yield its descriptor."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
-    size = os.fstat(descriptor).st_size
     try:
-        written = 0
-        while written < len(line):
-            written += os.write(descriptor, line[written:])
-        os.fsync(descriptor)
-    except OSError:
-        os.ftruncate(descriptor, size)
-        raise
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield descriptor
     finally:
         os.close(descriptor)
 
@@ -137,30 +154,55 @@ def repair(path: Path) -> Torn | None:
 
     Returns what was torn, None where nothing was. A whole last line that only lacks its end gets it.
     """
+    if not path.exists():
+        return None
+    with locked(path) as descriptor:
+        return _mend(path, descriptor)
+
+
+def _mend(path: Path, descriptor: int) -> Torn | None:
+    """Do what `repair` says with a file that is locked."""
+    size = os.fstat(descriptor).st_size
+    if not size or os.pread(descriptor, 1, size - 1) == b"\n":
+        return None
     _, torn = read(path)
-    if torn is not None:
-        with path.open("r+b") as file:
-            file.seek(torn.offset)
-            path.with_suffix(".torn").write_bytes(file.read())
-            file.truncate(torn.offset)
-        return torn
-    if path.exists() and path.stat().st_size:
-        with path.open("r+b") as file:
-            file.seek(-1, os.SEEK_END)
-            if file.read(1) != b"\n":
-                file.write(b"\n")
-    return None
+    if torn is None:
+        os.write(descriptor, b"\n")
+    else:
+        path.with_suffix(".torn").write_bytes(os.pread(descriptor, torn.length, torn.offset))
+        os.ftruncate(descriptor, torn.offset)
+    return torn
 
 
 def read_all(results: Path) -> tuple[list[Record], list[Torn]]:
-    """Read every `records*.jsonl` of a results folder: files copied from other machines merge so."""
+    """Read every `records*.jsonl` of a results folder, oldest record first: files of other machines merge so."""
     records: list[Record] = []
     torn = []
     for path in sorted(results.glob("records*.jsonl")):
         found, rest = read(path)
         records += found
         torn += [rest] if rest else []
-    return records, torn
+    return sorted(records, key=lambda record: record.time), torn
+
+
+def collect(results: Path, others: Sequence[Path]) -> dict[Path, int]:
+    """Append to `results` the records that it lacks of other results folders; return how many came from each.
+
+    What is there already is left out, and so is a run that failed there as here. Volumes stay where they
+    are: a collected record leads to them. Raises InputError for a folder without records.
+    """
+    known, counts = last(read_all(results)[0]), {}
+    for other in others:
+        found = last(read_all(other)[0])
+        if not found:
+            raise InputError(f"--collect {other}: there are no records, expected a results folder of run-benchmark")
+        lacked = [r for key, r in found.items() if key not in known or (r.status == OK and known[key].status != OK)]
+        for record in lacked:
+            volume = record.volume and os.path.relpath(other.resolve() / record.volume, results.resolve())
+            append(results / NAME, msgspec.structs.replace(record, volume=volume))
+            known[record.identity] = record
+        counts[other] = len(lacked)
+    return counts
 
 
 def latest(records: list[Record]) -> list[Record]:
@@ -168,6 +210,7 @@ def latest(records: list[Record]) -> list[Record]:
 
     Only this protocol version counts, and only the newest data of a scene and seed: a scan that was made
     anew supersedes all that was measured on the old one, and a method's new code supersedes its old.
+    Their order is that of the dataset, of the methods table and of the command, whichever run ended first.
     """
     records = [r for r in records if r.run.protocol == VERSION]
     newest = {(r.run.scene, r.run.seed): (r.run.scene_id, r.run.scan) for r in records}
@@ -176,7 +219,25 @@ def latest(records: list[Record]) -> list[Record]:
         run = record.run
         if newest[run.scene, run.seed] == (run.scene_id, run.scan):
             kept[(run.scene, run.seed, run.variant, record.label)] = record
-    return list(kept.values())
+    scenes: dict[str, int] = {}
+    labels: dict[str, int] = {}
+    for record in kept.values():
+        scene, method = record.place
+        scenes[record.run.scene] = min(scene, scenes.get(record.run.scene, scene))
+        labels[record.label] = min(method, labels.get(record.label, method))
+    columns = sorted(scenes, key=lambda scene: scenes[scene])
+    rows = sorted(labels, key=lambda label: (rank(label), labels[label]))
+
+    def order(record: Record) -> tuple[int, int, int, bool]:
+        run = record.run
+        return columns.index(run.scene), run.seed, rows.index(record.label), run.variant == "metal"
+
+    return sorted(kept.values(), key=order)
+
+
+def rank(label: str) -> int:
+    """Return the place of a method in the methods table by its label; those outside come after all of it."""
+    return list(TABLE).index(name) if (name := label.partition("[")[0]) in TABLE else len(TABLE)
 
 
 def outdated(records: list[Record]) -> str:

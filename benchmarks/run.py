@@ -23,7 +23,7 @@ from benchmarks.host import commit, host, measured
 from benchmarks.isolate import Outcome, run_apart
 from benchmarks.judge import Judge, Twin
 from benchmarks.methods import Method
-from benchmarks.protocol import Stored
+from benchmarks.protocol import Score, Stored
 from benchmarks.records import Cost, Record, Run
 from benchmarks.volumes import identity_of, read_volume, write_volume
 from ctsim.errors import InputError
@@ -58,11 +58,15 @@ class Options:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """One run to do: a scan (the twin without metal where `variant` says so) and a method."""
+    """One run to do: a scan (the twin without metal where `variant` says so) and a method.
+
+    `place` are the numbers of the scan and of the method among those asked for.
+    """
 
     stored: Stored
     variant: str
     method: Method
+    place: tuple[int, int] = (0, 0)
 
     @property
     def scan(self) -> "Scan":
@@ -124,9 +128,11 @@ def scan_for(method: Method, stored: Stored, variant: str) -> "Scan":
 def tasks(scans: list[Stored], methods: list[Method], options: Options) -> list[Task]:
     """List every run: all methods on all scans, each on the metal-free twin first where asked and there is one."""
     found = []
-    for stored in scans:
+    for i, stored in enumerate(scans):
         variants = ("metal_free", "metal") if options.anchor and stored.metal_free is not None else ("metal",)
-        found += [Task(stored=stored, variant=v, method=m) for m in methods for v in variants]
+        found += [
+            Task(stored=stored, variant=v, method=m, place=(i, k)) for k, m in enumerate(methods) for v in variants
+        ]
     return found
 
 
@@ -163,22 +169,34 @@ def run_all(listed: list[Task], results: Path, options: Options) -> Iterator[Rec
 
     Raises OSError where results cannot be written. Failures of methods are records, not exceptions.
     """
-    warm: dict[tuple[str, str, str], float] = {}
-    judge: tuple[str, Judge] | None = None
-    twin: tuple[Task, Outcome] | None = None
+    runner = Runner(results, options)
     for task in listed:
-        if judge is None or judge[0] != task.stored.content_hash:
-            judge = twin = None  # let go of the last scan's masks first
-            judge = (task.stored.content_hash, Judge.of(task.stored))
-        outcome = run_one(task, options, warm)
-        if task.variant == "metal":
-            pair = _twin(task, twin, results, options)
-            twin = None
-        else:
-            pair, twin = Twin(), (task, outcome)
-        record = _record(task, outcome, (judge[1], pair), results, options)
+        record = runner.run(task)
         records.append(results / records.NAME, record)
         yield record
+
+
+class Runner:
+    """Runs tasks in this process and remembers what the next needs: compiled methods, a scan's truth, its twin."""
+
+    def __init__(self, results: Path, options: Options) -> None:
+        self._results, self._options = results, options
+        self._warm: dict[tuple[str, str, str], float] = {}
+        self._judge: tuple[str, Judge] | None = None
+        self._twin: tuple[Task, Outcome] | None = None
+
+    def run(self, task: Task) -> Record:
+        """Run and score a task, keep its volume and return its record, which is the caller's to append."""
+        if self._judge is None or self._judge[0] != task.stored.content_hash:
+            self._judge = self._twin = None  # let go of the last scan's masks first
+            self._judge = (task.stored.content_hash, Judge.of(task.stored))
+        outcome = run_one(task, self._options, self._warm)
+        if task.variant == "metal":
+            pair = _twin(task, self._twin, self._results, self._options)
+            self._twin = None
+        else:
+            pair, self._twin = Twin(), (task, outcome)
+        return _record(task, outcome, (self._judge[1], pair), self._results, self._options)
 
 
 def _twin(task: Task, last: tuple[Task, Outcome] | None, results: Path, options: Options) -> Twin:
@@ -299,7 +317,7 @@ def tiny(scan: "Scan") -> "Scan":
 
 def _record(task: Task, outcome: Outcome, by: tuple[Judge, Twin], results: Path, options: Options) -> Record:
     """Score an outcome and write its volume."""
-    scores, kept, run = {}, None, task.run
+    scores, kept, identity = {}, None, task.run.identity
     if outcome.values is not None and outcome.status in ("ok", "diverged"):
         try:
             scores = by[0].scores(outcome.values, task.variant, by[1])
@@ -307,13 +325,18 @@ def _record(task: Task, outcome: Outcome, by: tuple[Judge, Twin], results: Path,
             outcome.status, outcome.reason = "out_of_memory", f"while scoring: {describe(error)}"
     if outcome.values is not None and options.keep_volumes:
         kept = f"volumes/{task.file_name}"
-        write_volume(results / kept, outcome.values, run.identity)
+        write_volume(results / kept, outcome.values, identity)
         if outcome.intermediates:
             beside = intermediates.path_of(results / kept)
-            intermediates.write(beside, outcome.intermediates, run.identity)
+            intermediates.write(beside, outcome.intermediates, identity)
+    return describe_run(task, outcome, scores, kept)
+
+
+def describe_run(task: Task, outcome: Outcome, scores: dict[str, Score], kept: str | None) -> Record:
+    """Return the record of a run with where and when it was made; `kept` is its volume's path within the results."""
     return Record(
-        identity=run.identity,
-        run=run,
+        identity=task.run.identity,
+        run=task.run,
         label=task.method.label,
         inputs=task.method.inputs,
         status=outcome.status,
@@ -321,6 +344,7 @@ def _record(task: Task, outcome: Outcome, by: tuple[Judge, Twin], results: Path,
         scores=scores,
         cost=outcome.cost,
         volume=kept,
+        place=task.place,
         host=host(),
         commit=commit(),
         time=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),

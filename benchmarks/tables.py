@@ -15,6 +15,7 @@ from benchmarks.columns import COLUMNS, Column
 from benchmarks.compare import NMAR, derived, harm, row_of
 from benchmarks.records import OK, Record, latest, outdated
 from benchmarks.texts import escape, ranked
+from ctsim.durable import write_synced
 from ctsim.errors import InputError
 
 Format = Literal["md", "tex"]
@@ -258,6 +259,6 @@ def write(records: list[Record], results: Path) -> None:
         raise InputError(f"{results}: there are no records to tabulate; run a method first")
     if not latest(records):
         raise InputError(f"{results}: {outdated(records)}")
-    for form in ("md", "tex"):
-        (results / f"table.{form}").write_text(render(records, form), encoding="utf-8")
-    summary(records).to_csv(results / "table.csv", index=False)
+    texts = {"md": render(records, "md"), "tex": render(records, "tex"), "csv": summary(records).to_csv(index=False)}
+    for form, text in texts.items():
+        write_synced(results / f"table.{form}", text.encode())  # one who looks while runs go on sees a whole table

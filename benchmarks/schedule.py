@@ -1,0 +1,149 @@
+"""Which runs are to be done, in what order, what they will take; and doing them, here or on workers."""
+
+import functools
+import pkgutil
+import statistics
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from benchmarks import methods, records
+from benchmarks.isolate import Outcome
+from benchmarks.records import OK, Record
+from benchmarks.run import Options, Runner, Task, describe_run, run_all
+from benchmarks.workers import Lost, Pool
+from ctsim.errors import InputError
+from ctsim.human import human_time
+
+Group = tuple[Task, ...]
+"""The runs of one method on one scan: on its twin without metal first, which the second is judged by."""
+
+
+class Costs:
+    """Seconds that runs took, from records of the past; of runs that ended well, without warm-up and scoring."""
+
+    def __init__(self, found: list[Record]) -> None:
+        self._runs: dict[tuple[str, int, str, str], float] = {}
+        self._methods: dict[str, list[float]] = {}
+        for record in found:
+            if record.status == OK and record.cost is not None:
+                run = record.run
+                self._runs[run.scene, run.seed, run.variant, record.label] = record.cost.wall
+                self._methods.setdefault(record.label, []).append(record.cost.wall)
+
+    def method(self, label: str) -> float | None:
+        """Return the median of a method's seconds, None where it has never run."""
+        return statistics.median(self._methods[label]) if label in self._methods else None
+
+    def task(self, task: Task) -> float | None:
+        """Return what the same scan took the last time, else the method's median, else None."""
+        run, label = task.run, task.method.label
+        return self._runs.get((run.scene, run.seed, run.variant, label), self.method(label))
+
+
+def ordered(left: list[Task], costs: Costs) -> list[Group]:
+    """Order runs so that a table soon has whole rows: the cheapest method on all scans first, the dearest last.
+
+    A method that has never run counts as dear as those before it in the methods table, which lists the cheap first.
+    """
+    labels = sorted(dict.fromkeys(task.method.label for task in left), key=records.rank)
+    expected: dict[str, float] = {}
+    for label in labels:
+        known = costs.method(label)
+        expected[label] = max(expected.values(), default=0.0) if known is None else known
+    groups = [tuple(tasks) for _, tasks in groupby(left, key=lambda task: task.place)]
+    return sorted(groups, key=lambda g: (expected[g[0].method.label], labels.index(g[0].method.label), g[0].place))
+
+
+def text(groups: list[Group], n_listed: int, costs: Costs) -> str:
+    """Return what --dry-run prints: the runs in their order with the seconds expected of each, and their sum."""
+    left = [task for group in groups for task in group]
+    names = [task.stored.name + ("" if task.variant == "metal" else " (metal-free)") for task in left]
+    seconds = [costs.task(task) for task in left]
+    wide, long = (max((len(t) for t in column), default=0) for column in ([t.method.label for t in left], names))
+    lines = [
+        f"{task.method.label:{wide}}  {name:{long}}  {'unknown' if cost is None else human_time(cost)}"
+        for task, name, cost in zip(left, names, seconds, strict=True)
+    ]
+    unknown = dict.fromkeys(t.method.label for t, cost in zip(left, seconds, strict=True) if cost is None)
+    lines.append(
+        f"total: {len(left)} of {n_listed} runs, {human_time(sum(s for s in seconds if s is not None))} by the records "
+        "of earlier runs, without warm-up and scoring" + (f"; never run: {', '.join(unknown)}" if unknown else "")
+    )
+    return "\n".join(lines) + "\n"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """A group as it travels to a worker: names and paths, by which it finds data and method itself."""
+
+    folder: Path
+    place: tuple[int, int]
+    variants: tuple[str, ...]
+    method: str
+    overrides: dict[str, Any]
+    results: Path
+    options: Options
+
+
+def work(groups: list[Group], results: Path, options: Options, pool: Pool | None) -> Iterator[tuple[Task, Record]]:
+    """Do the runs, in this process without a pool; each record is on the disk before it is yielded.
+
+    Raises OSError where results cannot be written, InputError where a worker has other data or code than this process.
+    """
+    if pool is None:
+        left = [task for group in groups for task in group]
+        yield from zip(left, run_all(left, results, options), strict=True)
+        return
+    for answer in pool.answers(do, [_job(group, results.resolve(), options) for group in groups]):
+        if answer is not None:
+            group = groups[answer[0]]
+            for task, record in zip(group, _records(group, answer[1]), strict=True):
+                records.append(results / records.NAME, record)
+                yield task, record
+
+
+def _job(group: Group, results: Path, options: Options) -> Job:
+    first = group[0]
+    return Job(
+        folder=first.stored.folder.resolve(),
+        place=first.place,
+        variants=tuple(task.variant for task in group),
+        method=first.method.name,
+        overrides=first.method.overrides,
+        results=results,
+        options=options,
+    )
+
+
+def do(job: Job) -> list[bytes]:
+    """Be the worker: run a group, keep its volumes, and return its records as JSON."""
+    stored = pkgutil.resolve_name(job.options.store)(job.folder)
+    method = methods.find(job.method, job.overrides)
+    tasks = [Task(stored=stored, variant=variant, method=method, place=job.place) for variant in job.variants]
+    runner = _runner(job.results, job.options)
+    return [msgspec.json.encode(runner.run(task)) for task in tasks]
+
+
+@functools.lru_cache(maxsize=1)
+def _runner(results: Path, options: Options) -> Runner:
+    """Return this process's runner, which knows from earlier jobs what is compiled."""
+    return Runner(results, options)
+
+
+def _records(group: Group, answer: list[bytes] | Lost) -> list[Record]:
+    """Return the records of a group, those of a failure where its process died."""
+    if isinstance(answer, Lost):
+        return [describe_run(task, Outcome(status="error", reason=answer.reason), {}, None) for task in group]
+    found = [msgspec.json.decode(line, type=Record) for line in answer]
+    for task, record in zip(group, found, strict=True):
+        if record.identity != task.run.identity:
+            raise InputError(
+                f"{task.method.label} on {task.stored.name}: a worker has another version of the data or of the "
+                "method's code than this command; expected the same files and the same installation"
+            )
+    return found

@@ -1,0 +1,285 @@
+"""Jobs on several processes: of this machine (`Local`) or of a Dask cluster (`Cluster`), behind one interface.
+
+A job is a value that can be pickled and a function of a module that takes it. Jobs begin in the order given and
+are answered as they end. One whose process dies is begun again elsewhere, at most `TRIES` times in all; so a
+job must be one that can be repeated.
+"""
+
+import contextlib
+import importlib
+import multiprocessing
+import os
+import signal
+import threading
+import time
+import traceback
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from multiprocessing import connection
+from typing import Any, Protocol, Self
+
+from ctsim.errors import InputError
+
+TRIES = 3
+TICK = 1.0  # seconds between two looks at what goes on
+GRACE = 10.0  # seconds that a worker has to write down where it stopped
+CONNECT = 10.0  # seconds that a scheduler has to answer
+
+Function = Callable[[Any], Any]
+Answers = Iterator[tuple[int, Any] | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """The answer to a job whose process died each time."""
+
+    reason: str
+
+
+class Pool(Protocol):
+    """What runs jobs."""
+
+    def answers(self, function: Function, jobs: Sequence[Any]) -> Answers:
+        """Yield (number of a job, what `function` returned of it or `Lost`) as jobs end, None when nothing happened.
+
+        Raises what a job raised; the others are then ended with the pool.
+        """
+        ...
+
+
+def open_pool(workers: int, scheduler: str | None) -> contextlib.AbstractContextManager[Pool | None]:
+    """Return what --workers and --scheduler ask for; a pool of None where this process is to do all.
+
+    Raises InputError for less than one worker, for both at once, and for a scheduler that cannot be used.
+    """
+    if workers < 1:
+        raise InputError(f"--workers {workers}: expected 1 or more")
+    if scheduler is None:
+        return contextlib.nullcontext() if workers == 1 else Local(workers)
+    if workers != 1:
+        raise InputError("--workers and --scheduler exclude each other: the scheduler's own workers do the work")
+    return Cluster(scheduler)
+
+
+@dataclass(slots=True)
+class _Worker:
+    """A process, the pipe to it, and the number of the job that it has."""
+
+    process: Any
+    pipe: connection.Connection
+    job: int | None = None
+
+
+class Local:
+    """Processes of this machine, each with its share of the cores for the kernels."""
+
+    def __init__(self, n: int) -> None:
+        self._n = n
+        self._workers: list[_Worker] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for worker in self._workers:
+            worker.process.terminate()
+            worker.pipe.close()
+        end = time.monotonic() + GRACE
+        try:
+            for worker in self._workers:
+                worker.process.join(max(0.0, end - time.monotonic()))
+        finally:
+            for worker in self._workers:
+                worker.process.kill()
+                worker.process.join()
+            self._workers = []
+
+    def answers(self, function: Function, jobs: Sequence[Any]) -> Answers:
+        """See `Pool`."""
+        waiting, deaths = deque(range(len(jobs))), Counter[int]()
+        while waiting or any(w.job is not None for w in self._workers):
+            while waiting and (worker := self._idle()) is not None:
+                worker.job = waiting.popleft()
+                with contextlib.suppress(OSError):  # it is dead: its end of the pipe will say so below
+                    worker.pipe.send((function, jobs[worker.job]))
+            busy = {w.pipe: w for w in self._workers if w.job is not None}
+            ready = connection.wait(list(busy), TICK)
+            if not ready:
+                yield None
+            for worker in (busy[pipe] for pipe in ready if isinstance(pipe, connection.Connection)):
+                job, worker.job = worker.job, None
+                assert job is not None
+                try:
+                    failed, answer = worker.pipe.recv()
+                except (EOFError, OSError):
+                    how = self._bury(worker)
+                    deaths[job] += 1
+                    if deaths[job] == TRIES:
+                        yield job, Lost(f"its process died {TRIES} times, the last time with {how}")
+                    else:
+                        waiting.appendleft(job)
+                    continue
+                if failed:
+                    raise answer
+                yield job, answer
+
+    def _idle(self) -> _Worker | None:
+        """Return a worker without a job, a new one where there may be more, None where all are busy."""
+        for worker in self._workers:
+            if worker.job is None:
+                return worker
+        if len(self._workers) == self._n:
+            return None
+        self._workers.append(_start(self._n))
+        return self._workers[-1]
+
+    def _bury(self, worker: _Worker) -> str:
+        """Forget a worker whose pipe is closed; say how it ended."""
+        from benchmarks.isolate import how_it_ended
+
+        self._workers.remove(worker)
+        worker.pipe.close()
+        worker.process.join()
+        return how_it_ended(worker.process.exitcode)
+
+
+def threads_of(n: int) -> dict[str, str]:
+    """Return the variables by which each of `n` processes gets its share of the cores; never more than were set."""
+    share = max(1, len(os.sched_getaffinity(0)) // n)
+    before = {name: os.environ.get(name, "").partition(",")[0] for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
+    return {name: str(min(share, int(given)) if given.isdecimal() else share) for name, given in before.items()}
+
+
+def _start(n: int) -> _Worker:
+    """Start one of `n` workers. It does not hear Ctrl-C: the parent decides what that means."""
+    context = multiprocessing.get_context("spawn")
+    mine, its = context.Pipe()
+    process = context.Process(target=_serve, args=(its,))
+    share = threads_of(n)  # read when numba and torch are imported
+    before = {name: os.environ.get(name) for name in share}
+    heard = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited, so that it holds from the first instruction
+    os.environ.update(share)
+    try:
+        process.start()
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+        signal.signal(signal.SIGINT, heard)
+    its.close()
+    return _Worker(process, mine)
+
+
+def _serve(pipe: connection.Connection) -> None:
+    """Be a worker: answer jobs until the pipe closes or the parent ends."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a job can so write down where it stopped
+    threading.Thread(target=_follow_parent, daemon=True).start()
+    with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
+        while True:
+            function, job = pipe.recv()
+            pipe.send(_attempt(function, job))
+
+
+def _attempt(function: Function, job: Any) -> tuple[bool, Any]:
+    """Return (whether it failed, the answer or the exception)."""
+    try:
+        return False, function(job)
+    except InputError as error:
+        return True, InputError(str(error))
+    except Exception as error:
+        error.add_note("".join(traceback.format_exception(error)))  # where it was raised does not cross processes
+        return True, error
+
+
+def _follow_parent() -> None:
+    """End this process when the one that started it has ended, however that happened."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    connection.wait([parent.sentinel])
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(GRACE)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Cluster:
+    """The workers of a Dask scheduler: one job at a time each, with as many threads as Dask gave the worker.
+
+    Workers may come and go. Those of a cluster outlive the command: when it is interrupted, jobs that have
+    begun there end by themselves.
+    """
+
+    def __init__(self, address: str) -> None:
+        try:
+            self._dask: Any = importlib.import_module("distributed")
+        except ImportError:
+            raise InputError("--scheduler needs the package distributed: pip install 'ctsim[cluster]'") from None
+        try:
+            self._client = self._dask.Client(address, timeout=CONNECT, set_as_default=False)
+        except (OSError, ValueError) as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise InputError(
+                f"--scheduler {address}: no Dask scheduler answers there, expected tcp://host:port ({reason})"
+            ) from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._client.close()  # what nobody waits for any more is not begun
+
+    def answers(self, function: Function, jobs: Sequence[Any]) -> Answers:
+        """See `Pool`."""
+        waiting, running = deque(range(len(jobs))), {}
+        while waiting or running:
+            for address in self._client.nthreads().keys() - {address for _, address in running.values()}:
+                if waiting:
+                    number = waiting.popleft()
+                    future = self._client.submit(
+                        _alone, function, jobs[number], pure=False, workers=[address], allow_other_workers=True
+                    )
+                    running[future] = (number, address)
+            done = self._done(list(running))
+            if not done:
+                yield None
+            for future in done:
+                number, _ = running.pop(future)
+                yield number, self._answer(future)
+
+    def _done(self, futures: list[Any]) -> set[Any]:
+        """Wait a little for one of the futures; return those that have ended."""
+        if not futures:  # no worker is there yet
+            time.sleep(TICK)
+            return set()
+        try:
+            return self._dask.wait(futures, timeout=TICK, return_when="FIRST_COMPLETED").done
+        except TimeoutError:
+            return set()
+
+    def _answer(self, future: Any) -> Any:
+        error = future.exception()
+        if isinstance(error, self._dask.scheduler.KilledWorker):
+            return Lost("its process died each time that Dask began it anew")
+        if error is not None:
+            raise error
+        return future.result()
+
+
+_ALONE = threading.Lock()
+
+
+def _alone(function: Function, job: Any) -> Any:
+    """Be a Dask task: alone in its process, for neither kernels nor measurements share one."""
+    with _ALONE:
+        import numba
+        import torch
+        from distributed import get_worker
+        from numba.core import config
+
+        threads: int = get_worker().state.nthreads
+        most = int(config.NUMBA_NUM_THREADS)  # pyright: ignore[reportAttributeAccessIssue]
+        numba.set_num_threads(min(threads, most))
+        torch.set_num_threads(threads)
+        return function(job)
