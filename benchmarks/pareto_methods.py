@@ -1,11 +1,12 @@
 """Every method of the table over its own effort, on the clock, scored under protocol `tissue`.
 
 Iterative methods run once to twice their default iterations and are scored as they pass each of `STOPS`
-(`baselines.iterative.watch`); the clock stands still while they are. A run of k iterations is said to take what it
-took to get there and what the method took after its last: its closing residual. Methods with an effort that cannot
-be watched run once for each value; the others are single points.
+(`watch`); the clock stands still while they are. A run of k iterations is said to take what it took to get there, and
+what the method took after its last: its closing residual. Methods whose effort is not a count of iterations that can be
+watched run once for each value; those without are single points.
 """
 
+import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,7 +16,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from baselines.iterative import watch
 from benchmarks import metrics
 from benchmarks.methods import Method, find
 from benchmarks.pareto_records import Mark, Setting
@@ -25,13 +25,14 @@ from ctsim.geometry import Geometry
 from ctsim.store import StoredScan, open_scan
 from ctsim.types import Scan, Status
 from reconstruct.fdk import reconstruct as fdk
+from reconstruct.watch import watch
 
 STOPS = frozenset((1, 2, 3, 5, 8, 12, 20, 30, 50, 80, 120, 200))
-UNWATCHED: dict[str, tuple[str, tuple[Any, ...]]] = {
+BY_VALUE: dict[str, tuple[str, tuple[Any, ...]]] = {
     "ibhc": ("iterations", (1, 2, 3, 4, 6)),
     "splat": ("passes", ((1, 0), (1, 1), (2, 1), (2, 2), (2, 4), (4, 4), (4, 8), (8, 8))),
 }
-"""Methods that are run once for each value of a parameter; the default is added."""
+"""Methods that run once for each of these values of a parameter; the default is added."""
 FDKS = {"fdk": 1.0}
 """Cost in FDKs, of an iteration where there are any."""
 LAST = 2  # times the default: how far iterations go
@@ -57,8 +58,8 @@ class Effort:
 def efforts(name: str) -> list[Effort]:
     """List the runs of a method of the table."""
     usual = find(name)
-    if name in UNWATCHED:
-        key, values = UNWATCHED[name]
+    if name in BY_VALUE:
+        key, values = BY_VALUE[name]
         usually = usual.params[key]
         every = list(dict.fromkeys((*values, tuple(usually) if isinstance(usually, list) else usually)))
         return [
@@ -127,20 +128,22 @@ class Bench:
         if reason := method.skip(scan):
             raise Ended(str(Status.SKIPPED), reason)
         marks = Marks(score=self.values, stops=STOPS | {usual, method.params.get("iterations")})
-        with watch(marks):
+        with watch(marks) if method.name not in BY_VALUE else contextlib.nullcontext():
             volume = method.reconstruct(scan, "cpu")
-        total = marks.clock()
+        ended = time.perf_counter()
         if volume.status is not Status.OK:
             raise Ended(str(volume.status), volume.reason)
         end = self.values(volume.values)
         if not marks.count:
-            return (Mark(label=effort.label, seconds=total, values=end, default=effort.default),)
+            seconds = ended - marks.began
+            return (Mark(label=effort.label, seconds=seconds, values=end, default=effort.default),)
         # the volume that is returned may be finished, such as by a last cut at 0
-        passed = [m for m in marks.found if m[0] < marks.count] + [(marks.count, marks.last, end)]
+        passed = [m for m in marks.found if m[0] < marks.count] + [(marks.count, marks.seconds, end)]
+        around = marks.before + ended - marks.left
         return tuple(
             Mark(
                 label=f"{k} iteration{'s' * (k > 1)}",
-                seconds=seconds + total - marks.last,
+                seconds=seconds + around,
                 values=values,
                 default=k == min(usual or marks.count, marks.count),
             )
@@ -159,24 +162,27 @@ class Bench:
 
 @dataclass(slots=True, kw_only=True)
 class Marks:
-    """Watches a method: scores its volume at the stops, on a clock that leaves out the scoring."""
+    """Watches a method: scores its volume at the stops.
+
+    `seconds` are the method's own at its last iteration, without those of scoring; `before` is what passed until its
+    clock was started, and `left` when the last iteration had been seen.
+    """
 
     score: Callable[[torch.Tensor], dict[str, float]]
     stops: frozenset[Any]
     found: list[tuple[int, float, dict[str, float]]] = field(default_factory=list)
-    last: float = 0.0
+    began: float = field(default_factory=time.perf_counter)
+    before: float = 0.0
+    seconds: float = 0.0
+    left: float = 0.0
     count: int = 0
-    _away: float = 0.0
-    _began: float = field(default_factory=time.perf_counter)
 
-    def clock(self) -> float:
-        """Return the seconds that the method has run."""
-        return time.perf_counter() - self._began - self._away
-
-    def __call__(self, view_updates: int, seconds: float, volume: torch.Tensor) -> None:
-        """Take note of an iteration; the method's own seconds begin after its preparation, so they are not used."""
-        self.last = self.clock()
+    def __call__(self, _view_updates: int, seconds: float, volume: torch.Tensor) -> None:
+        """Take note of an iteration that ended `seconds` after the method's clock was started."""
+        if not self.count:
+            self.before = time.perf_counter() - self.began - seconds
         self.count += 1
+        self.seconds = seconds
         if self.count in self.stops:
-            self.found.append((self.count, self.last, self.score(volume)))
-        self._away += self.clock() - self.last
+            self.found.append((self.count, seconds, self.score(volume)))
+        self.left = time.perf_counter()

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import msgspec
 
 from benchmarks.host import Host
-from benchmarks.pareto_front import Pair, front, knee
+from benchmarks.pareto_front import Pair, knee
 from benchmarks.records import OK
 from ctsim.errors import InputError
 
@@ -27,6 +27,10 @@ VERSION = 1
 Part = Literal["simulator", "methods"]
 ERROR: dict[Part, str] = {"simulator": "rms", "methods": "rmse"}
 """The value of a mark that a part's fronts are drawn in."""
+
+
+NEAR = 0.05
+"""A share by which errors may differ and hardly matter: 0.4 dB."""
 
 
 class Setting(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -167,8 +171,22 @@ def failures(found: Sequence[Timed]) -> list[Timed]:
     return [t for identity, t in last.items() if not well[identity]]
 
 
+def enough(of: Sequence[Point]) -> Point:
+    """Return the fastest point whose error is within `NEAR` of the least."""
+    least = min(p.pair[1] for p in of)
+    return min((p for p in of if p.pair[1] <= (1 + NEAR) * least), key=lambda p: p.pair)
+
+
+def at_knee(of: Sequence[Point]) -> Point | None:
+    """Return the knee of the points' front."""
+    at = knee([p.pair for p in of])
+    return None if at is None else of[at]
+
+
 def recommended(of: Sequence[Point]) -> Point:
-    """Return the knee of the points' front, or, where it has none, the most accurate of them."""
-    pairs = [p.pair for p in of]
-    at = knee(pairs)
-    return of[front(pairs)[-1] if at is None else at]
+    """Return the fastest point that is near the least error; of the simulator, whose error falls on and on, the knee.
+
+    A front without a knee has the first.
+    """
+    found = at_knee(of) if of[0].setting.part == "simulator" else None
+    return enough(of) if found is None else found

@@ -2,8 +2,19 @@
 
 from collections.abc import Iterator, Sequence
 
-from benchmarks.pareto_front import beaten_by, front, knee
-from benchmarks.pareto_records import ERROR, Part, Point, Timed, failures, points, recommended
+from benchmarks.pareto_front import beaten_by, front
+from benchmarks.pareto_records import (
+    ERROR,
+    NEAR,
+    Part,
+    Point,
+    Timed,
+    at_knee,
+    enough,
+    failures,
+    points,
+    recommended,
+)
 
 HEADS: dict[Part, dict[str, str]] = {
     "simulator": {
@@ -16,7 +27,7 @@ HEADS: dict[Part, dict[str, str]] = {
 LOWER: dict[Part, tuple[str, ...]] = {"simulator": ("rms", "worst", "off_edges"), "methods": ("rmse",)}
 """The values that fronts can be drawn in: smaller is better."""
 ABOUT: dict[Part, str] = {
-    "simulator": "P = −ln(signal/open) without noise, against 16² rays a pixel in closed form and the whole spectrum",
+    "simulator": "P = −ln(signal/open) without noise, against up to 2¹⁴ exact rays a pixel and the whole spectrum",
     "methods": "protocol `tissue`: effective spectrum, inside the body dilated by 4, outside the metal dilated by 2",
 }
 
@@ -25,7 +36,8 @@ def summary(found: Sequence[Timed]) -> str:
     """Render the fronts, the defaults and each curve's knee; what failed or was skipped stands below."""
     out = [_provenance(found), ""]
     for group in groups(points(found)):
-        out += [*_front(group), "", *_defaults(group), "", *_curves(group), ""]
+        defaults = [*_defaults(group), ""] if len(LOWER[group[0].setting.part]) > 1 else []
+        out += [*_front(group), "", *defaults, *_curves(group), ""]
     bad = failures(found)
     if bad:
         out += ["| not measured | setting | status | reason |", "|---|---|---|---|"]
@@ -69,20 +81,16 @@ def _title(group: Sequence[Point]) -> str:
 def _front(group: Sequence[Point]) -> Iterator[str]:
     """Yield the table of the group's front in its main error."""
     part = group[0].setting.part
-    pairs = [p.pair for p in group]
-    at = knee(pairs)
+    marked = {"knee": at_knee(group), "**recommended**": recommended(group)}
     yield f"### {_title(group)}"
     yield ""
     yield f"The front, in {HEADS[part][ERROR[part]]}; {ABOUT[part]}."
     yield ""
     yield from _head("curve", "setting", "inputs", "s", *HEADS[part].values(), "")
-    for k in front(pairs):
+    for k in front([p.pair for p in group]):
         p = group[k]
-        note = "**knee: recommended**" if k == at else ""
+        note = ", ".join(name for name, marked_one in marked.items() if marked_one is p)
         yield _row(p.setting.curve, _named(p), p.setting.inputs or "–", _s(p), *_values(p), note)
-    if at is None:
-        yield ""
-        yield f"No point of the front lies below the chord between its ends; recommended: {_short(recommended(group))}."
 
 
 def _defaults(group: Sequence[Point]) -> Iterator[str]:
@@ -103,21 +111,23 @@ def _beaten(group: Sequence[Point], k: int, key: str) -> str:
 
 
 def _curves(group: Sequence[Point]) -> Iterator[str]:
-    """Yield the table of each curve's default, knee and most accurate point."""
+    """Yield the table of each curve's default, its knee, and what is near its least error."""
     part = group[0].setting.part
-    key = ERROR[part]
-    name = HEADS[part][key]
-    yield from _head("curve", "default", "s", name, "its knee", "s", name, "most accurate", "s", name)
+    name, near = HEADS[part][ERROR[part]], f"within {NEAR:.0%} of its least error"
+    yield from _head("curve", "default", "s", name, "beaten by", "knee", "s", name, near, "s", name)
     for curve, mine in curves(group).items():
         default = next((p for p in mine if p.default), None)
-        at = knee([p.pair for p in mine])
-        best = min(mine, key=lambda p: (p.values[key], p.pair[0]))
-        chosen = (default, None if at is None else mine[at], best)
-        yield _row(curve, *(cell for p in chosen for cell in _cells(p)))
+        rival = "–" if default is None else _rival(group, default)
+        yield _row(curve, *_cells(default), rival, *_cells(at_knee(mine)), *_cells(enough(mine)))
+
+
+def _rival(group: Sequence[Point], p: Point) -> str:
+    best, share = beaten_by([q.pair for q in group], group.index(p))
+    return "–" if group[best] is p else f"{_short(group[best])}, in {share:.2f} of the time"
 
 
 def _cells(p: Point | None) -> tuple[str, str, str]:
-    return ("–", "–", "–") if p is None else (p.label, _s(p), f"{p.pair[1]:.3g}")
+    return ("–", "–", "–") if p is None else (p.label, _s(p), f"{p.pair[1]:.2e}")
 
 
 def _fronts(group: Sequence[Point]) -> list[str]:
