@@ -9,7 +9,15 @@ import signal
 import sys
 from collections.abc import Callable
 
-OTHERS = {"inspect": "inspector", "peers": "peers", "reproduce": "reproduce", "skipping": "skipping", "report": "reports.report"}
+OTHERS = {
+    "inspect": "inspector",
+    "peers": "peers",
+    "reproduce": "reproduce",
+    "skipping": "skipping",
+    "report": "reports.report",
+    "ablation": "ablation",
+    "paper-tables": "paper_tables",
+}
 EXIT_USER, EXIT_INTERRUPTED = 2, 130
 
 

@@ -1,0 +1,185 @@
+"""`run-benchmark ablation DATA RESULTS`: what each part of the published splat method is worth.
+
+The rows are those of the paper's tables whose suite is "ablation" (`benchmarks/data/paper_tables.toml`): ordinary
+methods with parameters, so that records, resuming and time limits are those of `run-benchmark`. A run that several rows
+share is run once. Steps are a tenth of the published, and so are the times of densification.
+"""
+
+import statistics
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from ctsim.errors import InputError
+from ctsim.human import human_time
+
+if TYPE_CHECKING:
+    from benchmarks.records import Record
+    from benchmarks.run import Task
+
+SUITE = "ablation"
+NAME = "ablation.md"
+SECONDS = {"paper": 0.1, "r2": 0.1}
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Take the published splat method apart on the suite `ablation`, and print the paper's tables of it.
+
+    Scans that are missing are made; what RESULTS already holds is not run again.
+    """
+
+    data: tyro.conf.Positional[Path]
+    """The data folder; scans that are missing are made."""
+    results: tyro.conf.Positional[Path]
+    """The folder for records, tables and volumes."""
+    table: Annotated[tyro.conf.UseAppendAction[tuple[int, ...]], tyro.conf.arg(metavar="N")] = ()
+    """Only the rows of this table of the paper; may be given several times (default: all)."""
+    seconds: float | None = None
+    """Time limit of one run, its start included; each run then has a process of its own."""
+    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print the rows and what they will cost; run nothing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Variant:
+    """One run: scene, method, parameters, the label of its records, and the rows "table: name" that show it."""
+
+    scene: str
+    method: str
+    params: dict[str, Any]
+    label: str
+    rows: tuple[str, ...]
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command; 0 if every run ended well, 1 if one failed."""
+    given = tyro.cli(Arguments, prog="run-benchmark ablation", args=arguments)
+    listed = variants(given.table)
+    if given.dry_run:
+        sys.stdout.write(estimate(listed, given.data, given.results))
+        return 0
+    from benchmarks import make_dataset
+
+    scenes = list(dict.fromkeys(v.scene for v in listed))
+    code = make_dataset.main([SUITE, str(given.data), "--only", *scenes])
+    return code or _run(given, listed)
+
+
+def variants(numbers: tuple[int, ...] = ()) -> list[Variant]:
+    """Return the runs of the numbered tables, of all that are ablations where none is named.
+
+    Raises InputError for a table that is none.
+    """
+    from benchmarks import paper_layout
+
+    known = ablations()
+    for number in numbers:
+        if number not in known:
+            raise InputError(f"--table {number}: the ablations are tables {', '.join(map(str, known))}")
+    found: dict[tuple[str, str], Variant] = {}
+    for table in paper_layout.load().table:
+        for row in table.rows if table.number in (numbers or known) else ():
+            for column in table.columns:
+                p = table.planned(row, column)
+                name = f"{table.number}: {', '.join(filter(None, (*row.stubs, column.group)))}"
+                before = found[p.scene, p.label].rows if (p.scene, p.label) in found else ()
+                rows = tuple(dict.fromkeys((*before, name)))
+                found[p.scene, p.label] = Variant(
+                    scene=p.scene, method=p.method, params=p.params, label=p.label, rows=rows
+                )
+    return list(found.values())
+
+
+def ablations() -> tuple[int, ...]:
+    """Return the numbers of the paper's tables that are ablations."""
+    from benchmarks import paper_layout
+
+    return tuple(table.number for table in paper_layout.load().table if table.suite == SUITE)
+
+
+def _run(given: Arguments, listed: list[Variant]) -> int:
+    """Run what has no record, then render tables from all records, also after Ctrl-C."""
+    from tqdm import tqdm
+
+    from benchmarks import paper_tables, records, run, tables
+
+    options = run.Options(seconds=given.seconds, anchor=False)
+    given.results.mkdir(parents=True, exist_ok=True)
+    records.repair(given.results / records.NAME)
+    left = run.pending(tasks(listed, given.data), given.results, force=False)
+    ended = []
+    try:
+        with tqdm(total=len(left), unit="run", disable=not left) as bar:
+            for record in run.run_all(left, given.results, options):
+                bar.set_postfix_str(f"{record.run.scene} {record.label}: {record.status}")
+                bar.update()
+                ended.append(record.status)
+    finally:
+        found, _ = records.read_all(given.results)
+        if found:
+            tables.write(found, given.results)
+    text = paper_tables.text_of(found, "md", "paper", given.table or ablations())
+    (given.results / NAME).write_text(text, encoding="utf-8")
+    sys.stdout.write(f"{text}\nWritten: {given.results / NAME}; under all protocols table.md\n")
+    return 0 if set(ended) <= {records.OK} else 1
+
+
+def tasks(listed: list[Variant], data: Path) -> "list[Task]":
+    """Return the runs as tasks, scan by scan; those of scans that are not in `data` are left out.
+
+    Raises InputError for a method or a parameter that does not exist.
+    """
+    from benchmarks.methods import find
+    from benchmarks.run import Task
+    from ctsim.store import list_scans, open_scan
+
+    methods = {variant.label: find(variant.method, variant.params) for variant in listed}
+    folders = {folder.name: folder for folder in list_scans(data)} if data.is_dir() else {}
+    found = []
+    for scene in dict.fromkeys(variant.scene for variant in listed):
+        if scene in folders:
+            stored = open_scan(folders[scene])
+            labels = [variant.label for variant in listed if variant.scene == scene]
+            found += [Task(stored=stored, variant="metal", method=methods[label]) for label in labels]
+    return found
+
+
+def estimate(listed: list[Variant], data: Path, results: Path) -> str:
+    """Return what --dry-run prints: the runs, the rows that show them, what is recorded, and what the rest costs."""
+    from benchmarks import records
+    from benchmarks.run import pending
+
+    found = [r for r in records.read_all(results)[0] if r.status == records.OK and r.cost is not None]
+    there = tasks(listed, data)
+    left = {(task.stored.name, task.method.label) for task in pending(there, results, force=False)}
+    done = {(task.stored.name, task.method.label) for task in there} - left
+    took = {(r.run.scene, r.label): r.cost.wall for r in found if r.cost is not None}
+    rates, total = _rates(found), 0.0
+    lines = [("run", "scene", "rows", "state", "time")]
+    for v in listed:
+        key = (v.scene, v.label)
+        seconds = took[key] if key in done else rates[v.params["preset"]] * v.params["steps"]
+        total += 0 if key in done else seconds
+        state = "recorded" if key in done else "to run"
+        lines.append((v.label, v.scene, "; ".join(v.rows), state, human_time(seconds)))
+    widths = [max(len(line[k]) for line in lines) for k in range(4)]
+    text = "".join("  ".join([*(t.ljust(w) for t, w in zip(x, widths, strict=False)), x[4]]) + "\n" for x in lines)
+    scenes = dict.fromkeys(v.scene for v in listed if v.scene not in {task.stored.name for task in there})
+    if scenes:
+        names = " ".join(scenes)
+        text += f"scans to be made first: {names} (make-dataset {SUITE} {data} --dry-run --only {names})\n"
+    return f"{text}total: {len(listed) - len(done)} of {len(listed)} runs, {human_time(total)}\n"
+
+
+def _rates(found: "list[Record]") -> dict[str, float]:
+    """Return the seconds that a step of each preset takes, warm-up included: as recorded, else as measured once."""
+    known: dict[str, list[float]] = {}
+    for record in found:
+        preset, steps = (record.run.params.get(name) for name in ("preset", "steps"))
+        if preset in SECONDS and steps and record.cost is not None:
+            known.setdefault(preset, []).append((record.cost.wall + record.cost.warm_up) / steps)
+    return SECONDS | {preset: statistics.median(values) for preset, values in known.items()}
