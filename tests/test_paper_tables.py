@@ -1,0 +1,245 @@
+import sys
+
+import msgspec
+import pytest
+
+from benchmarks import cli, paper_layout, paper_tables, records
+from benchmarks.host import Host
+from benchmarks.make_dataset import load as load_suite
+from benchmarks.protocol import Score
+from benchmarks.records import Cost, Record, Run
+from ctsim.errors import InputError
+
+PAPER = paper_layout.load()
+TABLES = {table.number: table for table in PAPER.table}
+HOST = Host(cpu="A CPU", cores=2, threads=2, ram=1, system="", python="", versions={})
+
+
+def record(method="fdk", scene="lung-Fe", psnr=20.0, *, ssim=0.5, seed=1, scan="b", n_voxels=64, wall=61.0, **more):
+    params = more.pop("params", {})
+    run = Run(
+        scene=scene, scene_id=f"id-{scan}", scan=scan, seed=seed, method=method, params=params,
+        mask=more.pop("mask", "none"), protocol=more.pop("protocol", records.VERSION),
+    )  # fmt: skip
+    score = Score(
+        region="all voxels", reference="50 keV", alignment="none", data_range=0.25, n_voxels=n_voxels,
+        values={"psnr3d": psnr, "ssim3d": ssim},
+    )  # fmt: skip
+    planned = paper_layout.Planned(suite="", scene=scene, method=method, params=more.pop("overrides", {}))
+    status = more.pop("status", "ok")
+    return Record(
+        identity=run.identity, run=run, label=planned.label, inputs=more.pop("inputs", "counts only"), status=status,
+        scores={"paper": score} if status == "ok" else {}, host=HOST,
+        cost=Cost(wall=wall, cpu=2.5, peak_bytes=2**21, view_updates=60, device="cpu"), **more,
+    )  # fmt: skip
+
+
+def lines(text, start):
+    return [[c.strip() for c in x.strip("|").split("|")] for x in text.splitlines() if x.startswith(f"| {start} |")]
+
+
+def test_the_paper_has_nine_tables_of_146_figures():
+    assert list(TABLES) == list(range(1, 10))
+    figures = [text for table in PAPER.table for row in table.rows for text in row.figures if text]
+    assert len(figures) == 146  # counted in the paper's source
+    assert all(paper_layout.printed(text).number for text in figures)
+
+
+def test_figures_that_the_paper_prints_more_than_once_agree():
+    def row(number, *stubs):
+        (found,) = (r.figures for r in TABLES[number].rows if r.stubs == stubs)
+        return found
+
+    lung, teeth, broccoli = (row(3, "Ours (preset paper)")[k : k + 2] for k in (0, 2, 4))
+    assert lung == row(1, "Our model") == row(5, "Baseline with both") == row(6, "15") == row(7, "Lung")[2:]
+    assert (teeth, broccoli) == (row(7, "Teeth")[2:], row(7, "Broccoli")[2:])
+    assert row(5, "Baseline") == row(7, "Lung")[:2]
+    times = {r.stubs: r.figures for r in TABLES[4].rows}
+    assert {stubs: figures[2] for stubs, figures in times.items()} == {r.stubs: r.figures[1] for r in TABLES[8].rows}
+    for gamma, e_max in (r.stubs for r in TABLES[9].rows):
+        energy = float(e_max.partition(",")[0])
+        assert f"{(energy - 10) / (energy + 10):.3f}" == gamma
+
+
+def test_the_paper_comes_out_best_where_it_prints_itself_bold():
+    """It marks no more than its own column or row in tables 1, 3, 4, 5 and 7."""
+    empty = paper_tables.Measured.of([])
+    for number, ours in ((1, "Our model"), (3, "Ours (preset paper)"), (5, "Baseline with both")):
+        sheet = paper_tables.fill(TABLES[number], empty, "paper")
+        best = [
+            r.stubs[0] for r, c in zip(TABLES[number].rows, sheet.cells["paper"], strict=True) if c[0].place == "best"
+        ]
+        assert best == [ours]
+    for number, column in ((4, 2), (7, 2), (7, 3)):
+        cells = paper_tables.fill(TABLES[number], empty, "paper").cells["paper"]
+        assert all(row[column].place == "best" for row in cells)
+    places = [row[1].place for row in paper_tables.fill(TABLES[6], empty, "paper").cells["paper"]]
+    assert places[:4] == ["", "best", "best", "second"]  # 0.993 twice
+
+
+def test_every_cell_has_a_scene_of_a_bundled_suite():
+    suites = {p.suite for t in PAPER.table for r in t.rows for c in t.columns for p in [t.planned(r, c)]}
+    scenes = {suite: {scene.name for scene in load_suite(suite)} for suite in suites}
+    for table in PAPER.table:
+        for row in table.rows:
+            for column in table.columns:
+                planned = table.planned(row, column)
+                assert planned.scene in scenes[planned.suite], (table.number, row.stubs)
+
+
+def test_a_scene_of_one_suite_stands_for_no_other_grid():
+    """Records know a scene by its name only: the ablation's must differ from those of the large suites."""
+    large = {scene.name for suite in ("core", "real", "systems") for scene in load_suite(suite)}
+    assert not large & {scene.name for scene in load_suite("ablation")}
+
+
+def test_cells_hold_mean_and_spread_and_compete_within_their_side():
+    found = [
+        record("fdk", psnr=20.0),
+        record("fdk", psnr=22.0, seed=2, scan="c"),
+        record("limar", psnr=30.0, ssim=0.7, inputs="metal mask", mask="oracle", params={"insert": "fdk"}),
+        record("nmar", psnr=25.0, ssim=0.6, inputs="metal mask", mask="oracle", params={"insert": "mean"}),
+    ]
+    text = paper_tables.text_of(found, "md", "paper", (3,))
+    # std with ddof = 1 of 20 and 22 is √2; the paper's own stand beside
+    assert lines(text, "FDK")[0][1:5] == ["19.04", "21.00 ± 1.41", "0.924", "0.500 ± 0.000"]
+    assert lines(text, "LIMAR")[0][1:3] == ["19.83", "**30.00**"]
+    assert lines(text, "NMAR")[0][1:3] == ["<u>20.49</u>", "<u>25.00</u>"]
+    assert lines(text, "Ours (preset paper)")[0][1:3] == ["**29.19**", "–"]
+
+
+def test_the_caption_states_what_a_number_means():
+    found = [
+        record("fdk", seed=3),
+        record("limar", seed=3, inputs="metal mask", mask="oracle", params={"insert": "fdk"}),
+        record("limar", seed=4, scan="c", inputs="metal mask", mask="oracle", params={"insert": "fdk"}),
+    ]
+    text = paper_tables.text_of(found, "md", "paper", (3,))
+    for part in (
+        "Protocol paper: region all voxels; reference 50 keV; alignment none; data range 0.25 (lung-Fe) 1/mm",
+        "Seeds 3, 4, not all of them in each cell.",
+        "Grid: 64 voxels (lung-Fe).",
+        "Inputs: counts only (fdk); metal mask, oracle (limar).",
+        "Metal insertion: reconstructed like the rest (fdk); fdk (limar).",
+        "The phantoms differ from the paper's",
+    ):
+        assert part in text, part
+
+
+def test_times_are_written_as_the_paper_does_and_the_fastest_wins():
+    found = [
+        record("splat", "broccoli-Al", wall=3725.4, overrides={"preset": "paper"}),
+        record("splat", "broccoli-Al", wall=9.0),
+    ]
+    text = paper_tables.text_of(found, "md", "paper", (4,))
+    ((_, _, *cells), _) = [line for line in lines(text, "Synthetic") if line[1] in ("Broccoli", "Lung")]
+    assert cells[4:] == ["**16m 08s**", "<u>1h 02m 05s</u>", "**9.0s**"]
+    assert "Measured on A CPU, 2 threads, device cpu." in text and "Protocol cost" in text
+    assert [paper_layout.duration(s) for s in (0.04, 9.96, 59.6, 3599.7)] == ["0.0s", "10s", "1m 00s", "1h 00m 00s"]
+    assert paper_layout.seconds("2h 06m 55s") == 7615.0
+    with pytest.raises(InputError, match="a time must be like"):
+        paper_layout.seconds("2:06:55")
+
+
+def test_a_missing_cell_names_the_command_that_makes_it():
+    text = paper_tables.text_of([record("fdk", s) for s in ("lung-Fe", "teeth-Ti", "broccoli-Al")], "md", "paper")
+    table = dict(enumerate(text.split("## Table ")[1:], 1))
+    core = "`make-dataset core data/`, then `run-benchmark data/ results/ --scene lung-Fe --scene teeth-Ti"
+    assert (
+        f"{core} --scene broccoli-Al --method limar --method nmar --method splat --set splat.preset=paper`" in table[3]
+    )
+    assert "--method fdk" not in table[3] and "--set splat.preset=r2`" in table[3]
+    assert "there is no method acdnet, dicdnet" in table[3]
+    assert "`run-benchmark ablation data/ results/ --table 5`" in table[5]
+    assert "`make-dataset real data/`" in table[8] and "--scene walnut-Fe" in table[8]
+
+
+def test_the_commands_are_understood_and_make_the_label_of_the_cell():
+    """The flags lead `run-benchmark` to the very label that the cell looks for."""
+    import shlex
+
+    import tyro
+
+    from benchmarks.cli_run import Arguments
+    from benchmarks.methods import Method, parse_overrides
+
+    for table in PAPER.table:
+        for row in table.rows:
+            planned = table.planned(row, table.columns[-1])
+            given = tyro.cli(Arguments, args=["data", "results", *shlex.split(planned.flags)])
+            overrides = parse_overrides(given.set, given.method)[planned.method]
+            label = Method(name=planned.method, target="", inputs="", params={}, overrides=overrides).label
+            assert label == planned.label
+
+
+def test_a_failed_run_shows_its_status_and_its_reason():
+    found = [record("fdk", status="timeout", reason="did not end within 5 s"), record("nmar")]
+    text = paper_tables.text_of(found, "md", "paper", (3,))
+    assert lines(text, "FDK")[0][2] == "timeout" and lines(text, "NMAR")[0][2] == "20.00"
+    assert "- lung-Fe, fdk: timeout – did not end within 5 s" in text
+
+
+def test_folders_merge_and_the_newest_data_count(tmp_path, monkeypatch, capsys):
+    new, old = tmp_path / "new", tmp_path / "old"
+    for folder, when, scan, psnr in ((new, "2026-02", "b", 30.0), (old, "2026-01", "a", 10.0)):
+        records.append(folder / records.NAME, record("fdk", psnr=psnr, scan=scan, time=when))
+    records.append(old / records.NAME, record("fdk", "teeth-Ti", psnr=11.0, time="2026-01"))
+    monkeypatch.setattr(sys, "argv", ["run-benchmark", "paper-tables", str(new), str(old), "--table", "3"])
+    assert cli.run_benchmark() == 0
+    text = capsys.readouterr().out
+    assert lines(text, "FDK")[0][2] == "30.00" and lines(text, "FDK")[0][6] == "11.00"
+    assert "- lung-Fe: 1 records of older data are left out" in text
+
+
+def test_seeds_of_different_grids_are_not_averaged(tmp_path, monkeypatch, capsys):
+    for seed, size in ((1, 64), (2, 128)):
+        records.append(tmp_path / records.NAME, record(seed=seed, n_voxels=size))
+    monkeypatch.setattr(sys, "argv", ["run-benchmark", "paper-tables", str(tmp_path)])
+    assert cli.run_benchmark() == 2
+    said = capsys.readouterr().err
+    assert "'lung-Fe'" in said and "64 and 128 voxels" in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [(["nowhere"], "nowhere: there is no such folder"), ([".", "--table", "10"], "tables 1 to 9")],
+)
+def test_what_is_not_there_is_one_sentence(arguments, says, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["run-benchmark", "paper-tables", *arguments])
+    assert cli.run_benchmark() == 2
+    said = capsys.readouterr().err
+    assert says in said and said.count("\n") == 1
+
+
+def test_records_of_another_protocol_version_are_left_out_and_counted():
+    text = paper_tables.text_of([record("fdk", psnr=77.0, protocol=1)], "md", "paper", (3,))
+    assert "77.00" not in text and "1 of 1 records are of protocol version 1 and left out" in text
+
+
+def test_latex_is_booktabs_and_balanced():
+    text = paper_tables.text_of([record("fdk"), record("nmar", psnr=25.0)], "tex", "paper")
+    assert text.count(r"\begin{table}") == text.count(r"\bottomrule") == 9
+    for part in (
+        r"\textbf{25.00}",
+        r"\underline{20.00}",
+        r"\multicolumn{4}{c}{Lung}",
+        r"$\gamma$",
+        "-{}-scene lung-Fe",
+    ):
+        assert part in text, part
+    body = "\n".join(line for line in text.splitlines() if not line.startswith("%"))
+    assert body.count("{") == body.count("}") and not any(c in body for c in "–γ²±")
+    for table in body.split(r"\begin{tabular}{")[1:]:
+        width = len(table.partition("}")[0])
+        rows = table.partition(r"\midrule")[2].partition(r"\bottomrule")[0].strip().splitlines()
+        assert all(row.count("&") == width - 1 for row in rows)
+
+
+def test_a_table_with_a_hole_is_refused():
+    broken = msgspec.to_builtins(TABLES[1])
+    broken["rows"][0]["figures"] = ["26.51"]
+    with pytest.raises(msgspec.ValidationError, match="table 1, row GMM"):
+        msgspec.convert(broken, paper_layout.Table)
+    broken = msgspec.to_builtins(TABLES[1]) | {"scene": ""}
+    with pytest.raises(msgspec.ValidationError, match="expected suite, scene and method"):
+        msgspec.convert(broken, paper_layout.Table)
