@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 OTHERS = {
     "inspect": "inspector",
+    "pareto": "pareto",
     "peers": "peers",
     "reproduce": "reproduce",
     "skipping": "skipping",
