@@ -17,8 +17,9 @@ from ctsim.errors import InputError
 from ctsim.human import human_time
 
 if TYPE_CHECKING:
+    from benchmarks.methods import Method
     from benchmarks.records import Record
-    from benchmarks.run import Task
+    from benchmarks.run import Options, Task
 
 SUITE = "ablation"
 NAME = "ablation.md"
@@ -63,10 +64,13 @@ def main(arguments: list[str]) -> int:
         sys.stdout.write(estimate(listed, given.data, given.results))
         return 0
     from benchmarks import make_dataset
+    from benchmarks.run import Options
 
+    options = Options(seconds=given.seconds, anchor=False)
+    methods_of(listed)  # what cannot run shows before scans are made
     scenes = list(dict.fromkeys(v.scene for v in listed))
     code = make_dataset.main([SUITE, str(given.data), "--only", *scenes])
-    return code or _run(given, listed)
+    return code or _run(given, listed, options)
 
 
 def variants(numbers: tuple[int, ...] = ()) -> list[Variant]:
@@ -101,13 +105,12 @@ def ablations() -> tuple[int, ...]:
     return tuple(table.number for table in paper_layout.load().table if table.suite == SUITE)
 
 
-def _run(given: Arguments, listed: list[Variant]) -> int:
+def _run(given: Arguments, listed: list[Variant], options: "Options") -> int:
     """Run what has no record, then render tables from all records, also after Ctrl-C."""
     from tqdm import tqdm
 
     from benchmarks import paper_tables, records, run, tables
 
-    options = run.Options(seconds=given.seconds, anchor=False)
     given.results.mkdir(parents=True, exist_ok=True)
     records.repair(given.results / records.NAME)
     left = run.pending(tasks(listed, given.data), given.results, force=False)
@@ -129,15 +132,11 @@ def _run(given: Arguments, listed: list[Variant]) -> int:
 
 
 def tasks(listed: list[Variant], data: Path) -> "list[Task]":
-    """Return the runs as tasks, scan by scan; those of scans that are not in `data` are left out.
-
-    Raises InputError for a method or a parameter that does not exist.
-    """
-    from benchmarks.methods import find
+    """Return the runs as tasks, scan by scan; those of scans that are not in `data` are left out."""
     from benchmarks.run import Task
     from ctsim.store import list_scans, open_scan
 
-    methods = {variant.label: find(variant.method, variant.params) for variant in listed}
+    methods = methods_of(listed)
     folders = {folder.name: folder for folder in list_scans(data)} if data.is_dir() else {}
     found = []
     for scene in dict.fromkeys(variant.scene for variant in listed):

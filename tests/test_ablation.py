@@ -1,0 +1,133 @@
+import sys
+
+import msgspec
+import pytest
+from conftest import SMALLEST
+
+from benchmarks import ablation, cli, make_dataset, methods, records
+from benchmarks.make_dataset import load as load_suite
+
+STUB = """
+from ctsim.errors import InputError
+from reconstruct.fdk import reconstruct as fdk
+
+
+def reconstruct(scan, *, device, preset="fast", steps=None, response=None, basis=None, nodes=None, e_max=None):
+    if response == "known":
+        raise InputError("a known response needs a spectrum")
+    return fdk(scan, device=device)
+"""
+TABLES = {'name = "smallest"': "[defaults]", "[phantom]": "[defaults.phantom]", "[scanner]": "[defaults.scanner]"}
+LUNG, BROCCOLI = "ablation-lung-Fe", "ablation-broccoli-Al"
+BASE = {"preset": "paper", "steps": 2000}
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capsys):
+    """`run-benchmark ablation` on tiny scans of the suite's names, with a method that takes the splat's parameters."""
+    (tmp_path / "stub_splat.py").write_text(STUB, encoding="utf-8")
+    tiny = "".join(f'\n[[scene]]\nname = "{scene.name}"\n' for scene in load_suite("ablation"))
+    defaults = SMALLEST
+    for one, many in TABLES.items():
+        defaults = defaults.replace(one, many)
+    (tmp_path / "tiny.toml").write_text(defaults + tiny, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    monkeypatch.setitem(methods.TABLE, "splat", ("stub_splat:reconstruct", methods.COUNTS_ONLY))
+    make = make_dataset.main
+    monkeypatch.setattr(make_dataset, "main", lambda given: make(["tiny.toml", *given[1:]]))
+    yield lambda *more: run(monkeypatch, capsys, more)
+    sys.modules.pop("stub_splat", None)
+
+
+def run(monkeypatch, capsys, more):
+    monkeypatch.setattr(sys, "argv", ["run-benchmark", "ablation", "data", "results", *more])
+    code = cli.run_benchmark()
+    return code, capsys.readouterr()
+
+
+def label(**params):
+    return methods.Method(name="splat", target="", inputs="", params={}, overrides={**BASE, **params}).label
+
+
+def test_a_run_that_rows_share_is_listed_once_with_all_of_them():
+    found = {(v.scene, v.label): v for v in ablation.variants()}
+    assert len(found) == len(ablation.variants())
+    shared = found[LUNG, label()]
+    assert shared.rows == ("1: Our model", "5: Baseline with both", "6: 15", "7: Lung, Ours")
+    assert {v.params["response"] for v in found.values() if "response" in v.params} >= {"gmm", "free", "hinge", "tube"}
+    assert {v.params["nodes"] for v in found.values() if "nodes" in v.params} == {7, 15, 31, 63}
+    assert {v.params["e_max"] for v in found.values() if "e_max" in v.params} == {60.0, 120.0, 150.0}
+
+
+def test_one_table_needs_its_own_rows_only():
+    (baseline, *_) = ablation.variants((7,))
+    assert baseline.params == {"preset": "r2", "steps": 3000} and baseline.scene == BROCCOLI
+    assert len(ablation.variants((7,))) == 6
+    assert {v.scene for v in ablation.variants((9,))} == {BROCCOLI, *(f"{BROCCOLI}-{k}kV" for k in (60, 120, 150))}
+
+
+def test_the_scenes_are_those_that_the_rows_speak_of():
+    scenes = {scene.name: scene for scene in load_suite("ablation")}
+    assert set(scenes) == {v.scene for v in ablation.variants()}
+    for name, kvp in ((LUNG, 90), (BROCCOLI, 90), *((f"{BROCCOLI}-{k}kV", k) for k in (60, 120, 150))):
+        assert scenes[name].resolve().tube.kvp == kvp
+        assert [(f.material, f.thickness) for f in scenes[name].resolve().tube.filters] == [("Al", 0.5)]
+    assert scenes[LUNG].phantom.metal == "Fe" and len({s.resolve().geometry for s in scenes.values()}) == 1
+
+
+def test_rows_become_records_and_what_failed_is_tried_again(command, tmp_path):
+    code, shown = command("--table", "1", "--table", "7")
+    found, _ = records.read_all(tmp_path / "results")
+    runs = ablation.variants((1, 7))
+    assert {(r.run.scene, r.label) for r in found} == {(v.scene, v.label) for v in runs} and len(found) == len(runs)
+    assert {r.run.variant for r in found} == {"metal"}
+    assert code == 1  # one response needs what it is not given
+    assert [r.label for r in found if r.status == "error"] == [label(response="known")]
+    assert "## Table 1." in shown.out and "## Table 7." in shown.out and "## Table 3." not in shown.out
+    text = (tmp_path / "results" / "ablation.md").read_text(encoding="utf-8")
+    (known,) = [line for line in text.splitlines() if line.startswith("| Known |")]
+    assert known.split("|")[3].strip() == "error" and "a known response needs a spectrum" in text
+    ours = next(line for line in text.splitlines() if line.startswith("| Our model |"))
+    score = next(r.scores["paper"].values["psnr3d"] for r in found if (r.run.scene, r.label) == (LUNG, label()))
+    assert f"{score:.2f}" in ours
+    assert command("--table", "1", "--table", "7")[0] == 1
+    again, _ = records.read_all(tmp_path / "results")
+    assert [r.label for r in again[len(found) :]] == [label(response="known")]
+    assert (tmp_path / "results" / "table.md").exists()
+
+
+def test_a_dry_run_prints_rows_and_cost_and_writes_nothing(command, tmp_path):
+    code, shown = command("--dry-run", "--table", "7")
+    assert code == 0 and not (tmp_path / "data").exists() and not (tmp_path / "results").exists()
+    seconds = 3 * (2000 * ablation.SECONDS["paper"] + 3000 * ablation.SECONDS["r2"])
+    assert f"total: 6 of 6 runs, {ablation.human_time(seconds)}" in shown.out
+    assert "scans to be made first: ablation-broccoli-Al ablation-lung-Fe ablation-teeth-Ti" in shown.out
+    assert shown.out.count(" to run ") == 6
+    assert command("--table", "7")[0] == 0
+    code, shown = command("--dry-run", "--table", "7", "--table", "5")
+    lines = {line.partition("  ")[0]: line for line in shown.out.splitlines() if LUNG in line}
+    assert code == 0 and " recorded " in lines[label()] and "5: Baseline with both; 7: Lung, Ours" in lines[label()]
+    assert "total: 2 of 8 runs" in shown.out and "scans to be made" not in shown.out
+
+
+def test_the_cost_of_a_step_is_what_records_say():
+    from test_paper_tables import record
+
+    found = [record("splat", LUNG, wall=50.0, params=BASE), record("splat", LUNG, wall=70.0, params=BASE)]
+    found[0] = msgspec.structs.replace(found[0], cost=msgspec.structs.replace(found[0].cost, warm_up=30.0))
+    # (50 + 30) and 70 s for 2000 steps, the median between them
+    assert ablation._rates(found) == ablation.SECONDS | {"paper": pytest.approx(75 / 2000)}
+
+
+def test_a_time_limit_ends_a_run_with_a_record(command, tmp_path):
+    code, shown = command("--table", "9", "--seconds", "0.01")
+    found, _ = records.read_all(tmp_path / "results")
+    assert code == 1 and {r.status for r in found} == {"timeout"} and "| timeout |" in shown.out
+
+
+@pytest.mark.parametrize("arguments", [("--table", "3"), ("--table", "3", "--dry-run"), ("--seconds", "-1")])
+def test_what_makes_no_sense_is_one_sentence(command, arguments):
+    code, shown = command(*arguments)
+    assert code == 2 and shown.err.splitlines()[-1].startswith("run-benchmark ablation: ")
+    assert shown.err.count("run-benchmark ablation") == 1 and "Traceback" not in shown.err
