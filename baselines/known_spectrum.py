@@ -126,7 +126,7 @@ def _kvp(e_max: float) -> float:
     for _ in range(3):
         n = math.ceil((kvp - E_MIN) / max(0.25, kvp / 400))
         kvp = e_max + (kvp - E_MIN) / n / 2
-    return kvp
+    return round(kvp, 6)  # 19.9999999 would be outside the table that begins at 20
 
 
 def _median_path(scan: Scan, table: Table) -> float:
