@@ -131,8 +131,15 @@ def _run(given: Arguments, listed: list[Variant], options: "Options") -> int:
     return 0 if set(ended) <= {records.OK} else 1
 
 
+def methods_of(listed: list[Variant]) -> "dict[str, Method]":
+    """Return the methods by their labels. Raises InputError for a method or a parameter that does not exist."""
+    from benchmarks.methods import find
+
+    return {variant.label: find(variant.method, variant.params) for variant in listed}
+
+
 def tasks(listed: list[Variant], data: Path) -> "list[Task]":
-    """Return the runs as tasks, scan by scan; those of scans that are not in `data` are left out."""
+    """Return the runs as tasks, scene by scene; those of scenes that are not in `data` are left out."""
     from benchmarks.run import Task
     from ctsim.store import list_scans, open_scan
 
