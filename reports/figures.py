@@ -10,7 +10,9 @@ from typing import Any
 import matplotlib
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.text import Annotation
 from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.transforms import Bbox
 
 from benchmarks.columns import COLUMNS
 from benchmarks.records import Record
@@ -78,15 +80,31 @@ def worth(records: list[Record]) -> Figure | None:
         figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
         axes = figure.subplots()
         axes.scatter(both.wall, both.psnr, s=26, color=COLOURS[0])
-        for name, row in both.iterrows():
+        labels = [
             axes.annotate(str(name), (row.wall, row.psnr), xytext=(4, 3), textcoords="offset points", fontsize=8)
+            for name, row in both.sort_values("psnr", ascending=False).iterrows()
+        ]
         axes.set(xscale="log", xlabel="wall time a scan (s), warm", ylabel="mean PSNR3D (dB), protocol tissue")
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.margins(x=0.18, y=0.1)
         axes.grid(color=INK, alpha=0.18, lw=0.6)
+        _part(figure, labels)
     return figure
+
+
+def _part(figure: Figure, labels: list[Annotation]) -> None:
+    """Move labels down, the upper ones first, until none lies on one before it."""
+    figure.draw_without_rendering()
+    placed: list[Bbox] = []
+    for label in labels:
+        box, down = label.get_window_extent(), 0.0
+        while any(box.translated(0, -down).overlaps(other) for other in placed):
+            down += 2.0
+        placed.append(box.translated(0, -down))
+        x, y = label.xyann
+        label.xyann = (x, y - down * 72 / figure.dpi)
 
 
 def svg(figure: Figure, label: str) -> str:

@@ -51,8 +51,7 @@ function show({ section, images, slider }, k) {
   slider.setAttribute("aria-valuetext", images.said[k]);
   for (const image of all("img", section)) {
     const data = images[image.dataset.kind][image.dataset.row ?? "all"][k];
-    const type = image.classList.contains("stencil") ? "png" : "webp";
-    if (data) image.src = `data:image/${type};base64,${data}`;
+    if (data) image.src = `data:image/png;base64,${data}`;
     else image.removeAttribute("src");
   }
 }

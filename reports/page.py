@@ -105,8 +105,8 @@ def _slices(scenes: list[str], cases: list[Case]) -> str:
     )
     return (
         '<p class="caption">Errors are volume minus effective-spectrum reference. Slices normal to z, row 0 at the '
-        "bottom, cropped to the judged body. Stored in 8 bits over the stated window and compressed: for looking, "
-        "not for measuring. Metal is outlined, and grey in the errors because it is not judged.</p>"
+        "bottom, cropped to the judged body, in 8 bits over the stated window. Metal is outlined, and grey in the "
+        "errors because it is not judged.</p>"
         f'<fieldset class="look">{show}'
         '<label><input type="checkbox" name="ring" checked>metal outline</label></fieldset>'
         f'<details><summary>Methods</summary><fieldset class="look">{boxes}</fieldset></details>' + "".join(scenes)
@@ -156,7 +156,8 @@ def _caption(kept: Kept) -> str:
     psnr, ssim = values["psnr3d"], values["ssim3d"]
     said = "identical" if psnr is None else f"{psnr:.2f} dB"
     status = "" if record.status == OK else f" · {html.escape(record.status)}"
-    return f"<b>{html.escape(record.label)}</b> {said}" + ("" if ssim is None else f" · SSIM3D {ssim:.3f}") + status
+    said += "" if ssim is None else f" · SSIM3D {ssim:.3f}"
+    return f"<b>{html.escape(record.label)}</b> PSNR3D {said}{status}"
 
 
 def _images(case: Case, frame: slices.Frame, start: int, done: Callable[[], Any]) -> dict[str, Any]:
@@ -167,7 +168,7 @@ def _images(case: Case, frame: slices.Frame, start: int, done: Callable[[], Any]
     def encoded(make: Callable[..., slices.Image8], values: Any) -> list[str]:
         found = []
         for z in frame.z:
-            found.append(slices.webp(make(case, values, frame, z)))
+            found.append(slices.png(make(case, values, frame, z)))
             done()
         return found
 

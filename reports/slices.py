@@ -1,7 +1,7 @@
 """Slices for a page: 8 bits over the stated window, small enough to be carried in it.
 
-Volumes run from 0 to the window's top, errors from minus to plus the error scale. WebP at this quality moves a grey
-by one or two of 255: for looking, not for measuring.
+Volumes run from 0 to the window's top, errors from minus to plus the error scale. PNG keeps every grey; WebP at half
+the size would take the noise away.
 """
 
 import base64
@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from benchmarks.metrics import erode
 from reports.kept import Case
 
-QUALITY = 80
-FINE = 4  # points of an outline along a voxel, so that it is a line where metal is a few voxels wide
+OUTLINE = 200  # points across an image: an outline is one of them wide, however few the voxels are
 RING, UNJUDGED = (255, 176, 0), (140, 140, 140)  # as in the panels
 
 Image8 = NDArray[np.uint8]
@@ -68,16 +67,16 @@ def error_image(case: Case, values: NDArray[Any], frame: Frame, z: int) -> Image
     return quantised(inside.cut(error, 0), -case.look.error, case.look.error)
 
 
-def webp(image: Image8) -> str:
-    """Encode a grey image as WebP, base64."""
-    return _encoded(image, "L", format="WEBP", quality=QUALITY, method=4)
+def png(image: Image8) -> str:
+    """Encode a grey image as PNG, base64."""
+    return _encoded(image, "L", optimize=True)
 
 
 def stencil(mask: NDArray[np.bool_], colour: tuple[int, int, int]) -> str:
     """Encode a mask as a PNG of one colour, transparent elsewhere, base64; "" where there is nothing."""
     if not mask.any():
         return ""
-    return _encoded(mask.astype(np.uint8), "P", palette=(0, 0, 0, *colour), format="PNG", transparency=0, bits=1)
+    return _encoded(mask.astype(np.uint8), "P", palette=(0, 0, 0, *colour), transparency=0, bits=1)
 
 
 def _encoded(image: Image8, mode: str, palette: Sequence[int] = (), **options: Any) -> str:
@@ -88,14 +87,15 @@ def _encoded(image: Image8, mode: str, palette: Sequence[int] = (), **options: A
         picture = Image.frombytes("P", picture.size, picture.tobytes())
         picture.putpalette(palette)
     buffer = io.BytesIO()
-    picture.save(buffer, **options)
+    picture.save(buffer, format="PNG", **options)
     return base64.b64encode(buffer.getvalue()).decode()
 
 
 def metal_stencils(case: Case, frame: Frame, z: int) -> tuple[str, str]:
     """Return the metal's outline, drawn within it so that it hides no tissue, and the metal filled."""
     metal = frame.cut(case.truth.metal, z)
-    fine = np.kron(metal, np.ones((1, FINE, FINE), np.bool_))
+    n = max(1, round(OUTLINE / metal.shape[1]))
+    fine = np.kron(metal, np.ones((n, n), np.bool_))[None]
     ring = (fine & ~erode(np.repeat(fine, 3, axis=0))[1:2])[0]
     return stencil(ring, RING), stencil(metal, UNJUDGED)
 
@@ -104,4 +104,4 @@ def bytes_a_slice(case: Case) -> int:
     """Estimate the bytes of one slice of every volume, from the one through the most metal."""
     frame, z = frame_of(case, 1), case.at[0]
     pairs = ((volume_image, k) for k in case.kept), ((error_image, k) for k in case.kept)
-    return sum(len(webp(make(case, k.values, frame, z))) for group in pairs for make, k in group)
+    return sum(len(png(make(case, k.values, frame, z))) for group in pairs for make, k in group)
