@@ -5,11 +5,7 @@ are ‖A x − p‖_W / ‖p‖_W, so an empty volume has 1. Volumes are kept as
 within the field of view that some ray meets are unknowns; all others are and stay zero.
 """
 
-import contextlib
-import contextvars
 import math
-import time
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,27 +23,13 @@ from reconstruct.fdk import reconstruct as fdk
 from reconstruct.log import line_integrals
 from reconstruct.projector import Views, adjoint_columns, forward_columns
 from reconstruct.redundancy import ray_weights
+from reconstruct.watch import Stopwatch
+from reconstruct.watch import watch as watch
 
 Array = NDArray[np.float32]
-OnUpdate = Callable[[int, float, torch.Tensor], None]
 Weights = str | torch.Tensor
 WEIGHTS = ("none", "trace", "exp(-l)")
 WORST = 1.5  # a relative residual that no fit of pure noise reaches: one view fitted to another's gives √2
-
-_watcher: contextvars.ContextVar[OnUpdate | None] = contextvars.ContextVar("watcher", default=None)
-
-
-@contextlib.contextmanager
-def watch(on_update: OnUpdate) -> Iterator[None]:
-    """Call `on_update(view_updates, seconds, volume)` after each iteration of every method run within.
-
-    `volume` is float32 [z, y, x]; the seconds since the start leave out what `on_update` took.
-    """
-    token = _watcher.set(on_update)
-    try:
-        yield
-    finally:
-        _watcher.reset(token)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,7 +106,7 @@ class Course:
         self.view_updates = 0
         self.residuals: list[float] = []
         self.reason = ""
-        self._began, self._watching = time.perf_counter(), 0.0
+        self._stopwatch = Stopwatch()
 
     def note(self, x: Array, views: int, residual: float) -> bool:
         """Record an iteration that used `views` views; tell whether to go on.
@@ -135,10 +117,7 @@ class Course:
         self.residuals.append(residual)
         if not residual <= WORST:
             self.reason = f"the data residual of iteration {len(self.residuals)} is {residual:.3g}, an empty volume's 1"
-        if watcher := _watcher.get():
-            now = time.perf_counter()
-            watcher(self.view_updates, now - self._began - self._watching, torch.from_numpy(as_volume(x)))
-            self._watching += time.perf_counter() - now
+        self._stopwatch.show(self.view_updates, lambda: as_volume(x))
         return not self.reason
 
 

@@ -1,0 +1,70 @@
+"""Looking on while a method works: its volume on the way, at every iteration or at chosen times."""
+
+import contextlib
+import contextvars
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+OnUpdate = Callable[[int, float, torch.Tensor], None]
+
+
+class _Watcher:
+    """Whom to call, and the times in s that are still to come; None where every iteration is wanted."""
+
+    def __init__(self, on_update: OnUpdate, at: Sequence[float] | None) -> None:
+        self.on_update, self.at = on_update, None if at is None else sorted(at)
+
+
+_watcher: contextvars.ContextVar[_Watcher | None] = contextvars.ContextVar("watcher", default=None)
+
+
+@contextlib.contextmanager
+def watch(on_update: OnUpdate, *, at: Sequence[float] | None = None) -> Iterator[None]:
+    """Call `on_update(view_updates, seconds, volume)` after each iteration of every method run within.
+
+    With `at` it is called after the first iteration that ends at or after each of these times (s), once where one
+    iteration passes several. `volume` is float32 [z, y, x]; the seconds since the start leave out what the watching
+    took. Methods that do not iterate do not call.
+    """
+    token = _watcher.set(_Watcher(on_update, at))
+    try:
+        yield
+    finally:
+        _watcher.reset(token)
+
+
+class Stopwatch:
+    """A run's seconds, less what watching it took, and the times at which its watcher is still to be shown one."""
+
+    def __init__(self, seconds: float = 0.0) -> None:
+        """Start at `seconds`, those of an earlier part of the run."""
+        self._began, self._paused = time.perf_counter() - seconds, 0.0
+        self._watcher = _watcher.get()
+        at = self._watcher.at if self._watcher else None
+        self._at = None if at is None else [t for t in at if t > seconds or not seconds]
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the start."""
+        return time.perf_counter() - self._began - self._paused
+
+    def show(self, view_updates: int, volume: Callable[[], NDArray[np.float32]], *, whole: bool = True) -> None:
+        """Show the watcher, if there is one and it is due, the volume [z, y, x]; else `volume` is not called.
+
+        `whole` is False within an iteration: then only a time that has passed counts.
+        """
+        if self._watcher is None:
+            return
+        seconds = self.seconds
+        if self._at is None:
+            due = whole
+        else:
+            due = bool(self._at) and seconds >= self._at[0]
+            self._at = [t for t in self._at if t > seconds]
+        if due:
+            self._watcher.on_update(view_updates, seconds, torch.from_numpy(volume()))
+            self._paused += self.seconds - seconds
