@@ -105,11 +105,10 @@ class Bench:
             part="methods",
             scene=self.stored.name,
             data=f"{self.stored.content_hash}, protocol {VERSION}",
-            group="volumes",
+            group=method.inputs,
             curve=method.name,
             label=effort.label,
             params=method.params,
-            inputs=method.inputs,
             code=method.code,
             machine=machine,
         )
@@ -127,7 +126,8 @@ class Bench:
         scan = scan_for(method, self.stored, "metal")
         if reason := method.skip(scan):
             raise Ended(str(Status.SKIPPED), reason)
-        marks = Marks(score=self.values, stops=STOPS | {usual, method.params.get("iterations")})
+        stops = STOPS | {usual, method.params.get("iterations")}
+        marks = Marks(began=time.perf_counter(), score=self.values, stops=stops)
         with watch(marks) if method.name not in BY_VALUE else contextlib.nullcontext():
             volume = method.reconstruct(scan, "cpu")
         ended = time.perf_counter()
@@ -168,10 +168,10 @@ class Marks:
     clock was started, and `left` when the last iteration had been seen.
     """
 
+    began: float
     score: Callable[[torch.Tensor], dict[str, float]]
     stops: frozenset[Any]
     found: list[tuple[int, float, dict[str, float]]] = field(default_factory=list)
-    began: float = field(default_factory=time.perf_counter)
     before: float = 0.0
     seconds: float = 0.0
     left: float = 0.0

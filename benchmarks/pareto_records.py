@@ -36,7 +36,8 @@ NEAR = 0.05
 class Setting(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What determines a run: a part, a scene (`data` is its content's hash), and a choice with its parameters.
 
-    `curve` is a method or a kind of choice of the simulator, `label` the choice; points are compared within `group`.
+    `curve` is a method or a kind of choice of the simulator, `label` the choice; points are compared within `group`,
+    which is what methods need beside the counts.
     `code` hashes the sources, `machine` is processor and threads: times of another one are measured anew.
     """
 
@@ -47,7 +48,6 @@ class Setting(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     curve: str
     label: str
     params: dict[str, Any]
-    inputs: str = ""
     code: str = ""
     machine: str = ""
     version: int = VERSION

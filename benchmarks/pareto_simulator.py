@@ -39,7 +39,7 @@ USUAL = 1.5  # of the bundled suites
 FINER, FINEST = 16, 64
 """Of the reference: finer pixels along a side of a pixel, and rays in each."""
 CALM = 1e-4  # |ΔP| of the central ray alone, below which a pixel has no edge
-PROJECTIONS, SCATTER = "projections", "scatter"
+PROJECTIONS, SCATTER = "projections", "scatter, against the highest level"
 LEVELS: tuple[int, ...] = typing.get_args(typing.get_type_hints(Scatter)["level"])
 EXACT, BODY, VOXELS = "exact solids", "body in voxels, metal exact", "all in voxels"
 

@@ -35,8 +35,12 @@ ABOUT: dict[Part, str] = {
 def summary(found: Sequence[Timed]) -> str:
     """Render the fronts, the defaults and each curve's knee; what failed or was skipped stands below."""
     out = [_provenance(found), ""]
+    about = set()
     for group in groups(points(found)):
-        defaults = [*_defaults(group), ""] if len(LOWER[group[0].setting.part]) > 1 else []
+        part = group[0].setting.part
+        out += [] if part in about else [f"Error of {part}: {ABOUT[part]}.", ""]
+        about.add(part)
+        defaults = [*_defaults(group), ""] if len(LOWER[part]) > 1 else []
         out += [*_front(group), "", *defaults, *_curves(group), ""]
     bad = failures(found)
     if bad:
@@ -51,9 +55,9 @@ def every_point(found: Sequence[Timed]) -> str:
     for group in groups(points(found)):
         part = group[0].setting.part
         out += ["", f"### {_title(group)}: every point", ""]
-        out += _head("curve", "setting", "inputs", "s", "slowest", *HEADS[part].values(), "on the front in")
+        out += _head("curve", "setting", "s", "slowest", *HEADS[part].values(), "on the front in")
         out += [
-            _row(p.setting.curve, _named(p), p.setting.inputs or "–", _s(p), f"{max(p.seconds):.3g}", *_values(p), on)
+            _row(p.setting.curve, _named(p), _s(p), f"{max(p.seconds):.3g}", *_values(p), on)
             for p, on in zip(group, _fronts(group), strict=True)
         ]
     return "\n".join(out) + "\n"
@@ -84,13 +88,13 @@ def _front(group: Sequence[Point]) -> Iterator[str]:
     marked = {"knee": at_knee(group), "**recommended**": recommended(group)}
     yield f"### {_title(group)}"
     yield ""
-    yield f"The front, in {HEADS[part][ERROR[part]]}; {ABOUT[part]}."
+    yield f"The front, in {HEADS[part][ERROR[part]]}:"
     yield ""
-    yield from _head("curve", "setting", "inputs", "s", *HEADS[part].values(), "")
+    yield from _head("curve", "setting", "s", *HEADS[part].values(), "")
     for k in front([p.pair for p in group]):
         p = group[k]
         note = ", ".join(name for name, marked_one in marked.items() if marked_one is p)
-        yield _row(p.setting.curve, _named(p), p.setting.inputs or "–", _s(p), *_values(p), note)
+        yield _row(p.setting.curve, _named(p), _s(p), *_values(p), note)
 
 
 def _defaults(group: Sequence[Point]) -> Iterator[str]:

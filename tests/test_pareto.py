@@ -1,0 +1,363 @@
+import math
+import re
+import shlex
+import sys
+from collections import Counter
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+import tyro
+from conftest import SMALLEST
+from hypothesis import given
+from hypothesis import strategies as st
+
+from benchmarks import cli, pareto, pareto_figure, pareto_methods, pareto_simulator, pareto_table
+from benchmarks.host import host
+from benchmarks.methods import TABLE
+from benchmarks.pareto_front import beaten_by, front, knee
+from benchmarks.pareto_records import (
+    Mark,
+    Setting,
+    Timed,
+    append,
+    at_knee,
+    enough,
+    failures,
+    latest,
+    points,
+    read,
+    recommended,
+    runs,
+)
+from benchmarks.peer_cases import relative
+from ctsim.errors import InputError
+from ctsim.settings import Simulation
+from ctsim.types import Volume
+
+# few values, so that ties in one coordinate and in both occur
+PAIRS = st.lists(st.tuples(st.integers(1, 6), st.integers(1, 6)), min_size=1, max_size=12)
+
+
+@given(PAIRS)
+def test_the_front_is_what_no_other_point_beats(pairs):
+    def beats(a, b):
+        return a != b and a[0] <= b[0] and a[1] <= b[1]
+
+    found = front(pairs)
+    assert sorted(found) == [k for k, p in enumerate(pairs) if not any(beats(q, p) for q in pairs)]
+    assert [pairs[k] for k in found] == sorted(pairs[k] for k in found)
+
+
+@given(PAIRS)
+def test_what_beats_a_point_is_the_fastest_that_is_no_worse(pairs):
+    for k, (seconds, error) in enumerate(pairs):
+        best, share = beaten_by(pairs, k)
+        assert pairs[best][0] == min(s for s, e in pairs if e <= error)
+        assert share == pairs[best][0] / seconds
+        assert (pairs[best] == pairs[k]) == (k in front(pairs))
+
+
+def curve(x, y):
+    """Points whose logarithms are x and y."""
+    return [(math.exp(a), math.exp(b)) for a, b in zip(x, y, strict=True)]
+
+
+def test_the_knee_is_where_a_steep_line_meets_a_flat_one():
+    x = np.linspace(0, 10, 21)
+    steep_then_flat = np.where(x < 4, -3 * x, -12 - 0.1 * (x - 4))
+    pairs = curve(x, steep_then_flat)
+    assert knee(pairs) == 8  # x = 4
+    # in units of hours and of per mille it is the same point
+    assert knee([(s / 3600, 1000 * e) for s, e in pairs]) == 8
+    # points off the front do not count, though they lie far below the chord of others
+    assert knee([*pairs, (math.exp(11.0), 1.0), (0.5, math.exp(1.0))]) == 8
+
+
+def test_the_knee_of_a_smooth_curve_is_where_it_runs_along_its_chord():
+    # y = exp(−x) on [0, 4] has the slope of its chord, −(1 − exp(−4))/4, at x = −ln((1 − exp(−4))/4)
+    x = np.linspace(0, 4, 401)
+    at = knee(curve(x, np.exp(-x)))
+    assert at is not None
+    # half a step of the sampling
+    assert x[at] == pytest.approx(-math.log((1 - math.exp(-4)) / 4), abs=0.005 + 1e-9)
+
+
+def test_without_a_point_below_the_chord_there_is_no_knee():
+    x = np.linspace(0, 1, 11)
+    for y in (-3 * x, -x - x**2):  # straight, and bulging away from the origin
+        assert knee(curve(x, y)) is None
+    assert knee([(1.0, 2.0)]) is None
+    assert knee([(1.0, 2.0), (2.0, 1.0)]) is None
+
+
+# --- records -----------------------------------------------------------------------------------------
+
+
+def setting(label="a", curve="fdk", part="methods", **more):
+    fields = {"scene": "s", "data": "d", "group": "counts only", "params": {}, "machine": "m"}
+    return Setting(part=part, curve=curve, label=label, **{**fields, **more})
+
+
+def timed(of, *marks, status="ok"):
+    """A run whose marks are (label, seconds, error)."""
+    name = {"simulator": "rms", "methods": "rmse"}[of.part]
+    found = tuple(Mark(label=label, seconds=s, values={name: e}) for label, s, e in marks)
+    return Timed(setting=of, marks=found, status=status, reason="", host=host(), commit="c", time="t")
+
+
+def test_seconds_are_medians_over_the_runs_of_a_mark():
+    found = [timed(setting(), ("1", s, 0.5), ("2", 2 * s, 0.25)) for s in (3.0, 1.0, 9.0)]
+    assert [(p.label, p.pair) for p in points(found)] == [("1", (3.0, 0.5)), ("2", (6.0, 0.25))]
+
+
+def test_a_torn_line_costs_one_run_and_nothing_after_it(tmp_path):
+    path = tmp_path / "pareto.jsonl"
+    for _ in range(2):
+        append(path, timed(setting(), ("a", 1.0, 1.0)))
+    path.write_bytes(path.read_bytes()[:-20])
+    append(path, timed(setting("b"), ("b", 1.0, 1.0)))
+    found, torn = read(path)
+    assert [t.setting.label for t in found] == ["a", "b"] and torn == 1
+    path.write_text('{"setting": 1}\n')
+    with pytest.raises(InputError, match="line 1"):
+        read(path)
+
+
+def test_a_table_shows_the_newest_code_on_the_last_machine():
+    old, new, other = setting(code="1"), setting(code="2"), setting("b", machine="another")
+    found = [timed(other, ("b", 1, 1)), timed(old, ("a", 1, 1)), timed(new, ("a", 2, 1)), timed(new, ("a", 4, 1))]
+    assert [p.seconds for p in points(latest(found))] == [(2.0, 4.0)]
+    assert runs(found) == Counter({old.identity: 1, new.identity: 2, other.identity: 1})
+
+
+def test_only_what_never_ended_well_is_a_failure():
+    bad, good = setting("bad"), setting("good")
+    found = [timed(bad, status="error"), timed(good, status="error"), timed(good, ("good", 1, 1))]
+    assert [t.setting.label for t in failures(found)] == ["bad"]
+
+
+def test_recommended_are_near_the_least_error_for_methods_and_the_knee_for_the_simulator():
+    marks = [(str(k), 2.0**k, e) for k, e in enumerate((1.0, 0.1, 0.052, 0.0505, 0.05))]
+    method, simulator = (points([timed(setting(part=part), *marks)]) for part in ("methods", "simulator"))
+    assert (recommended(method).label, enough(method).label) == ("2", "2")  # 0.052 is within 5 % of 0.05
+    assert recommended(simulator) is at_knee(simulator)
+    assert recommended(simulator).label == "1"
+
+
+def test_each_setting_runs_once_a_round_and_a_resumed_command_goes_on():
+    calls = []
+
+    def task(label, kind, fails=False):
+        def run():
+            calls.append(label)
+            if fails:
+                raise pareto_methods.Ended("diverged", "so")
+            return (Mark(label=label, seconds=1.0, values={"rmse": 1.0}),)
+
+        def warm():
+            calls.append(f"warm {kind}")
+            return 0.5
+
+        return pareto.Task(setting=setting(label), run=run, kind=kind, warm=warm)
+
+    tasks = [task("a", "x"), task("b", "x"), task("c", "y", fails=True)]
+    # a has had one run already, so the first round is b's and c's
+    found = list(pareto.rounds(tasks, 3, Counter({tasks[0].setting.identity: 1})))
+    assert calls == ["warm x", "b", "warm y", "c", "a", "b", "a", "b"]
+    assert [(t.status, t.reason) for t in found if t.setting.label == "c"] == [("diverged", "so")]
+    assert [t.warm_up for t in found if t.warm_up is not None] == [0.5, 0.5]
+
+
+# --- methods -----------------------------------------------------------------------------------------
+
+
+def test_every_method_has_an_effort_and_one_default():
+    for name in TABLE:
+        found = pareto_methods.efforts(name)
+        assert sum(e.default for e in found) == 1, name
+        assert len({e.label for e in found}) == len(found), name
+    assert [e.label for e in pareto_methods.efforts("fdk")] == ["defaults"]
+    assert [e.method.overrides for e in pareto_methods.efforts("cgls")] == [{"iterations": 30}]
+
+
+def slow(scan, *, device, iterations=2):
+    """Take 5 s to begin, 1 s an iteration and 2 s to end, on the test's clock."""
+    from reconstruct.watch import Stopwatch
+
+    CLOCK[0] += 5
+    watch = Stopwatch()
+    for k in range(iterations):
+        CLOCK[0] += 1
+        watch.show(k, lambda: np.zeros(scan.geometry.n_voxel, np.float32))
+    CLOCK[0] += 2
+    return Volume(values=torch.full(scan.geometry.n_voxel, 0.01))
+
+
+CLOCK = [0.0]
+
+
+def test_the_clock_leaves_out_scoring_and_counts_what_begins_and_ends_a_run(smallest, monkeypatch):
+    monkeypatch.setattr("time.perf_counter", lambda: CLOCK[0])
+    monkeypatch.setitem(TABLE, "slow", (f"{__name__}:slow", "counts only"))
+    (folder,) = (path for path in smallest.iterdir() if (path / "scene.toml").exists())
+    bench = pareto_methods.Bench(folder)
+
+    def score(volume):
+        CLOCK[0] += 100
+        return {"rmse": float(volume.mean())}
+
+    monkeypatch.setattr(bench, "values", score)
+    (effort,) = pareto_methods.efforts("slow")
+    marks = bench.run(effort)
+    assert [(m.label, m.seconds, m.default) for m in marks] == [
+        ("1 iteration", 8.0, False),
+        ("2 iterations", 9.0, True),
+        ("3 iterations", 10.0, False),
+        ("4 iterations", 11.0, False),
+    ]
+    # the last has the volume that was returned
+    assert [m.values["rmse"] for m in marks] == pytest.approx([0, 0, 0, 0.01])
+
+
+def test_methods_end_to_end(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "2")
+    (tmp_path / "small.toml").write_text(SMALLEST, encoding="utf-8")
+    out = tmp_path / "out"
+    common = [str(out), "--suite", str(tmp_path / "small.toml"), "--part", "methods", "--repeats", "2"]
+    chosen = ["--method", "fdk", "--method", "cgls", "--method", "limar"]
+
+    def left():
+        assert pareto.main([*common, *chosen, "--dry-run"]) == 0
+        rows = capsys.readouterr().out.splitlines()[1:-1]
+        return {row.split()[2]: int(row.split()[3]) for row in rows}
+
+    assert left() == {"fdk": 2, "cgls": 2, "limar": 2} and not out.exists()
+    assert pareto.main([*common, *chosen]) == 0
+    text = capsys.readouterr().out
+    assert "### methods, smallest: counts only" in text and "### methods, smallest: metal mask" in text
+    assert "| fdk | defaults (default) |" in text
+    first = (out / "pareto.jsonl").read_bytes()
+    assert len(first.splitlines()) == 6
+    assert left() == {"fdk": 0, "cgls": 0, "limar": 0}
+    assert pareto.main([*common, *chosen]) == 0 and pareto.main([*common, "--table"]) == 0
+    assert (out / "pareto.jsonl").read_bytes() == first
+    assert (out / "pareto.md").read_text().count("| cgls | 15 iterations (default) |") >= 1
+    assert (out / "pareto.png").read_bytes().startswith(b"\x89PNG")
+
+
+# --- simulator ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return pareto_simulator.Bench(side=16, views=4)
+
+
+def test_the_defaults_are_among_the_choices():
+    found = {c.group: [x for x in pareto_simulator.choices() if x.group == c.group] for c in pareto_simulator.choices()}
+    for group, choices in found.items():
+        assert any(c.default for c in choices), group
+        assert len({(c.curve, c.label) for c in choices}) == len(choices)
+    usual = [c for c in pareto_simulator.choices() if c.default and c.simulation == Simulation() and c.grid is None]
+    assert len(usual) == 2  # of the projections, and without scatter
+
+
+def test_the_reference_is_converged_where_the_choices_are_not(bench):
+    best = bench.converged(pareto_simulator.FINER, pareto_simulator.FINEST)
+    half = bench.converged(pareto_simulator.FINER // 2, pareto_simulator.FINEST)
+    plain, default, finest = (
+        bench.run(pareto_simulator.Choice(curve="c", label=str(n), simulation=Simulation(subrays=n)))[0].values["rms"]
+        for n in (1, Simulation().subrays, 233)
+    )
+    # a quarter of the rays moves the reference by less than what the finest choice is off it
+    assert relative(half, best) < finest < default < plain
+
+
+def test_errors_are_those_of_p(bench):
+    exact, calm = bench._reference
+    assert calm.any() and not calm.all()
+    assert bench.errors(exact.astype(np.float32))["worst"] < 1e-6 * exact.max()  # float32
+    scattered = -np.log(np.exp(-exact) + 0.02).astype(np.float32)
+    assert bench.errors(scattered, 0.02)["worst"] < 1e-6 * exact.max()
+    off = exact.copy()
+    at = tuple(np.argwhere(~calm)[0])
+    off[at] += 0.5
+    found = bench.errors(off.astype(np.float32))
+    assert found["worst"] == pytest.approx(0.5, abs=1e-5) and found["off_edges"] < 1e-5
+    # one pixel of 0.5 among all
+    assert found["rms"] == pytest.approx(0.5 / math.sqrt((exact**2).sum()), rel=1e-4)
+
+
+def test_scatter_is_judged_with_scatter(bench):
+    off, on = (
+        bench.run(pareto_simulator.Choice(curve=pareto_simulator.SCATTER, label=str(k), level=k))[0].values["rms"]
+        for k in pareto_simulator.LEVELS
+    )
+    plain = bench.run(pareto_simulator.Choice(curve="c", label="c"))[0].values["rms"]
+    # scatter fills up the darkest pixels, whose error leads, so it can but lessen what edges leave; without it P is off
+    assert on < 2 * plain < off
+
+
+def test_simulator_end_to_end(tmp_path, monkeypatch, capsys, bench):
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "2")
+    few = [c for c in pareto_simulator.choices() if c.default or c.label == "4 sub-rays"]
+    monkeypatch.setattr(pareto_simulator, "choices", lambda: few)
+    monkeypatch.setattr(pareto_simulator, "Bench", lambda: bench)
+    assert pareto.main([str(tmp_path), "--part", "simulator", "--repeats", "1"]) == 0
+    text = capsys.readouterr().out
+    assert "### simulator, rods: projections (16² pixels, 4 views)" in text
+    # each default has its verdict in each error
+    verdicts = [line for line in text.splitlines() if line.startswith("- ") and "(default)" in line]
+    assert len(verdicts) == sum(c.default for c in few)
+    assert all(line.count("on the front in") + line.count("off it in") == 3 for line in verdicts)
+
+
+def test_verdicts_name_what_beats_a_default():
+    rows = [("a", 1.0, 0.5), ("b", 2.0, 0.5), ("c", 4.0, 0.1)]
+    of = [timed(setting(label, part="simulator"), (label, s, e)) for label, s, e in rows]
+    everything = {"rms": 0.0, "worst": 1.0, "off_edges": 1.0}
+    of = [
+        msgspec.structs.replace(
+            t,
+            marks=tuple(msgspec.structs.replace(m, values=everything | m.values, default=True) for m in t.marks),
+        )
+        for t in of
+    ]
+    text = pareto_table.summary(of)
+    assert "- fdk, b (default): off it in relative RMS of P (fdk, a is no worse in 0.50 of the time)" in text
+    assert "- fdk, c (default): on the front in relative RMS of P; off it in worst |ΔP| (fdk, a" in text
+    assert pareto_figure.draw(points(of)).axes
+
+
+# --- the command -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--repeats", "0"], "--repeats and --threads must be at least 1, got 0 and 2"),
+        (
+            ["--scene", "teeth"],
+            "--scene 'teeth': there is no such scene, expected one of simulator: rods; methods: lung-Fe",
+        ),
+        (["--part", "simulator", "--scene", "lung-Fe"], "expected one of simulator: rods"),
+        (["--method", "fdc"], "there is no method 'fdc'"),
+        (["--table"], "there are no records"),
+    ],
+)
+def test_bad_input_is_said_in_one_sentence(arguments, says, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["run-benchmark", "pareto", str(tmp_path / "out"), *arguments])
+    assert cli.run_benchmark() == 2
+    said = capsys.readouterr().err.strip()
+    assert says in said and "\n" not in said
+
+
+def test_the_page_gives_commands_that_exist():
+    text = (Path(__file__).parents[1] / "docs" / "pareto.md").read_text(encoding="utf-8")
+    lines = re.findall(r"^    run-benchmark pareto (.*)$", text, re.M)
+    assert len(lines) >= 3
+    for line in lines:
+        tyro.cli(pareto.Arguments, args=shlex.split(line, comments=True))
