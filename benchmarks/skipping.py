@@ -1,7 +1,7 @@
 """`run-benchmark skipping RESULTS`: what is left out, what that saves, and how far the results are apart.
 
-Records go to RESULTS/skipping.jsonl, one line a pair as it is measured; the table, RESULTS/skipping.md, shows the
-newest of each case, so that cases can be measured one by one.
+Records go to RESULTS/skipping.jsonl case by case; the table, RESULTS/skipping.md, shows the newest of each case, so
+that cases can be measured one by one. What this commit recorded on this machine is not measured again.
 """
 
 import dataclasses
@@ -9,14 +9,11 @@ import sys
 import tempfile
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import tyro
 
 from ctsim.errors import InputError
-
-if TYPE_CHECKING:
-    from benchmarks.skipping_tables import SkipRecord
 
 Case = Literal[
     "materials", "bricks", "rays", "energies", "edges", "scatter", "twin", "truth",
@@ -41,6 +38,8 @@ class Arguments:
     """Counted runs with and without each skip; the table shows medians."""
     size: Literal["core", "small"] = "core"
     """The scene lung-Fe of the suite core, or tiny grids that prove the command and say nothing about speed."""
+    force: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Measure again what is recorded of this commit on this machine."""
 
 
 def main(argv: list[str]) -> int:
@@ -51,35 +50,35 @@ def main(argv: list[str]) -> int:
     given.results.mkdir(parents=True, exist_ok=True)
     from benchmarks import skipping_tables
 
+    wanted = tuple(dict.fromkeys(given.case)) or CASES
     with tempfile.TemporaryDirectory(prefix="ctsim-skipping-") as folder:
-        found = _measure(given, Path(folder))
+        _measure(given, wanted, Path(folder))
     stored = skipping_tables.latest(skipping_tables.read(given.results / NAME), given.size, CASES)
     text = skipping_tables.render(stored)
     (given.results / "skipping.md").write_text(text, encoding="utf-8")
     sys.stdout.write(text + f"\nWritten: {given.results}/skipping.md; records in {NAME}\n")
-    return 0 if all(record.measured.held for record in found) else 1
+    return 0 if all(r.measured.held for r in stored if r.measured.case in wanted) else 1
 
 
-def _measure(given: Arguments, folder: Path) -> "list[SkipRecord]":
-    """Measure case by case; what is measured is stored at once."""
+def _measure(given: Arguments, wanted: tuple[Case, ...], folder: Path) -> None:
+    """Measure the wanted cases that are not recorded; a case is stored as soon as it is measured."""
     from benchmarks import host, skipping_cases, skipping_methods, skipping_tables
 
+    path = given.results / NAME
+    here, now = host.host(), host.commit()  # of the code that is loaded, whatever is committed meanwhile
+    known = set() if given.force else skipping_tables.known(path, given.size, given.repeats, (here, now))
     setup = skipping_cases.Setup(size=given.size, repeats=given.repeats, folder=folder)
     cases = skipping_cases.CASES | skipping_methods.CASES
-    found = []
-    host.commit()  # remembered: the code that is loaded, whatever is committed meanwhile
     began = datetime.now(UTC).isoformat(timespec="microseconds")
-    for case in tuple(dict.fromkeys(given.case)) or CASES:
+    for case in wanted:
+        if case in known:
+            sys.stderr.write(f"{case}: recorded already\n")
+            continue
         sys.stderr.write(f"{case} …\n")
-        for pair in cases[case](setup):
+        measured = [pair.measure(given.repeats) for pair in cases[case](setup)]
+        time = datetime.now(UTC).isoformat(timespec="seconds")
+        for one in measured:
             record = skipping_tables.SkipRecord(
-                measured=pair.measure(given.repeats),
-                size=given.size,
-                host=host.host(),
-                commit=host.commit(),
-                time=datetime.now(UTC).isoformat(timespec="seconds"),
-                run=began,
+                measured=one, size=given.size, host=here, commit=now, time=time, run=began
             )
-            skipping_tables.append(given.results / NAME, record)
-            found.append(record)
-    return found
+            skipping_tables.append(path, record)

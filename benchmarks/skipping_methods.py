@@ -17,6 +17,7 @@ from baselines.metal import Trace, find_metal
 from baselines.nmar import Normalise, normalised
 from baselines.prior import Choice, choose_prior
 from benchmarks import cli_run, make_dataset
+from benchmarks.cli import EXIT_INTERRUPTED
 from benchmarks.methods import find
 from benchmarks.run import scan_for
 from benchmarks.skipping_cases import Case, Pair, Setup, largest
@@ -35,10 +36,15 @@ MOVED, MOVED_AT = 1e-5, "tests/test_fdk.py"
 
 
 def quietly(command: Callable[[list[str]], int], *arguments: str | Path) -> None:
-    """Run a command of ours without what it says; raise RuntimeError with that where it fails."""
+    """Run a command of ours without what it says; raise RuntimeError with that where it fails.
+
+    Raises KeyboardInterrupt where the command was interrupted and says so by its exit code.
+    """
     said = io.StringIO()
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
         code = command([str(argument) for argument in arguments])
+    if code == EXIT_INTERRUPTED:
+        raise KeyboardInterrupt
     if code:
         raise RuntimeError(f"exit code {code}: {said.getvalue().strip()}")
 
@@ -191,13 +197,13 @@ def recorded_run(setup: Setup) -> Iterator[Pair[list[NDArray[np.float32]]]]:
     results = setup.folder / "results"
 
     def volumes(*flags: str) -> list[NDArray[np.float32]]:
-        quietly(cli_run.main, setup.folder / "data", results, "--method", "nmar", *flags)
+        quietly(cli_run.main, setup.folder / "data", results, "--method", "limar", *flags)
         return [read_volume(path) for path in sorted((results / "volumes").glob("*.tif"))]
 
     yield Pair(
         case="record",
         scene=name,
-        what="run-benchmark of a run that is recorded, NMAR on the scan and its twin",
+        what="run-benchmark of a run that is recorded, LIMAR on the scan and its twin",
         skipping=volumes,
         whole=functools.partial(volumes, "--force"),
         difference=lambda a, b: largest(list(zip(a, b, strict=True))),

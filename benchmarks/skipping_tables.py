@@ -61,9 +61,22 @@ def append(path: Path, record: SkipRecord) -> None:
 
 
 def read(path: Path) -> list[SkipRecord]:
-    """Read the records of a skipping file."""
+    """Read the records of a skipping file; one that is not there has none."""
+    if not path.exists():
+        return []
     decoder = msgspec.json.Decoder(SkipRecord)
     return [decoder.decode(line) for line in path.read_bytes().splitlines() if line.strip()]
+
+
+def known(path: Path, size: str, repeats: int, at: tuple[Host, str]) -> set[str]:
+    """Return the cases recorded at `size`, with so many runs, on this machine by this commit: `at` = (host, commit).
+
+    Code that differs from its commit, or has none, knows nothing.
+    """
+    if at[1] == "unknown" or at[1].endswith("+changes"):
+        return set()
+    found = [r for r in read(path) if (r.size, r.host, r.commit) == (size, *at)]
+    return {r.measured.case for r in found if len(r.measured.skipping) >= repeats}
 
 
 def latest(records: Sequence[SkipRecord], size: str, order: Sequence[str]) -> list[SkipRecord]:

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks import cli, make_dataset, skipping, skipping_cases, skipping_methods, skipping_tables
+from benchmarks import cli, host, make_dataset, skipping, skipping_cases, skipping_methods, skipping_tables
 from benchmarks.skipping_cases import Pair, Setup
 from ctsim.bricks import MIXED
 from ctsim.errors import InputError
@@ -30,9 +30,9 @@ def pairs(case, tmp_path):
     return list((skipping_cases.CASES | skipping_methods.CASES)[case](small(tmp_path)))
 
 
-def fake(difference, limit=1.0):
+def fake(difference, limit=1.0, case="rays"):
     return Pair(
-        case="rays",
+        case=case,
         scene="none",
         what="nothing",
         skipping=lambda: 0.0,
@@ -72,15 +72,40 @@ def test_a_difference_beyond_what_is_stated_ends_with_one(tmp_path, monkeypatch,
     assert "NO" not in out and out.count("| rays |") == 2  # the newest run alone
 
 
-def test_what_was_measured_stays_when_a_later_case_is_interrupted(tmp_path, monkeypatch):
-    def interrupted(setup):
-        yield fake(0.0)
-        raise KeyboardInterrupt
+def test_an_interrupted_command_goes_on_from_the_case_it_was_in(tmp_path, monkeypatch, capsys):
+    done = []
 
-    monkeypatch.setitem(skipping_cases.CASES, "rays", interrupted)
-    monkeypatch.setattr("sys.argv", ["run-benchmark", "skipping", str(tmp_path), "--case", "rays"])
+    def once(setup):
+        done.append("rays")
+        yield fake(0.0)
+
+    def interrupted(setup):
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr(host, "commit", lambda: "a" * 40)
+    monkeypatch.setitem(skipping_cases.CASES, "rays", once)
+    monkeypatch.setitem(skipping_cases.CASES, "energies", interrupted)
+    words = [str(tmp_path), "--case", "rays", "--case", "energies", "--repeats", "2"]
+    monkeypatch.setattr("sys.argv", ["run-benchmark", "skipping", *words])
     assert cli.run_benchmark() == cli.EXIT_INTERRUPTED
     assert len(skipping_tables.read(tmp_path / skipping.NAME)) == 1
+    monkeypatch.setitem(skipping_cases.CASES, "energies", lambda setup: iter([fake(5.0, case="energies")]))
+    assert cli.run_benchmark() == 1 and done == ["rays"]
+    assert "rays: recorded already" in capsys.readouterr().err
+    assert cli.run_benchmark() == 1  # what is recorded is judged again
+    for change in (["--force"], ["--size", "small"], ["--repeats", "3"]):
+        before = len(done)
+        skipping.main([*words, *change])
+        assert len(done) == before + 1, change
+    monkeypatch.setattr(host, "commit", lambda: "a" * 40 + "+changes")
+    before = len(done)
+    assert [skipping.main(words), skipping.main(words)] == [1, 1] and len(done) == before + 2
+
+
+def test_an_interrupted_make_dataset_interrupts_the_command():
+    with pytest.raises(KeyboardInterrupt):
+        skipping_methods.quietly(lambda words: cli.EXIT_INTERRUPTED)
 
 
 def test_arrays_that_are_not_finite_are_apart():
