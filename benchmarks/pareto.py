@@ -46,7 +46,7 @@ class Arguments:
     suite: str = SUITE
     """The suite, or TOML file, that the methods' scenes are from."""
     method: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME")] = ()
-    """Only this method of the table; may be given several times (default: all)."""
+    """Only this method, or module:function of your own; may be given several times (default: all of the table)."""
     repeats: int = 3
     """Rounds: counted runs of each setting; the table shows medians."""
     threads: int = 2
@@ -73,6 +73,8 @@ def main(argv: list[str]) -> int:
     if given.repeats < 1 or given.threads < 1:
         raise InputError(f"--repeats and --threads must be at least 1, got {given.repeats} and {given.threads}")
     wanted = _scenes(given)
+    if "methods" in wanted and not given.table:
+        _efforts(given)  # a name that is wrong is said before the first run, not after the simulator's
     if given.dry_run:
         return _dry_run(given, wanted)
     failed = 0

@@ -31,7 +31,7 @@ from ctsim.types import Phantom, Scanner
 from phantoms.scanners import preset
 
 SCENE = "rods"
-SIDE, VIEWS, CHECKED = 128, 24, 2
+SIDE, VIEWS, CHECKED = 96, 16, 2
 TOLERANCES, SUBRAYS = (1e-2, 1e-3, 1e-4, 1e-5), (1, 4, 8, 13, 21, 34, 55, 89, 144, 233)
 GRIDS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
 """Label voxels along an axis, in detector pixels along one."""
