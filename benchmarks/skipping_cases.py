@@ -263,7 +263,7 @@ def energies(setup: Setup) -> Iterator[Pair[list[NDArray[np.float32]]]]:
         unit="P",
         limit=1.1 * plan.settings.tolerance,  # between the paths tried it is up to a tenth more
         stated="simulation.tolerance and docs/physics.md",
-        note=f"with sub-rays counted by its own mean, one edge pixel moves {moved:.2g}" if moved else "",
+        note=f"sub-rays counted by its own mean attenuation move edge pixels by up to {moved:.2g}" if moved else "",
     )
 
 
