@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from benchmarks.paper_tables import ABLATION
 from ctsim.errors import InputError
 from ctsim.human import human_time
 
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from benchmarks.records import Record
     from benchmarks.run import Options, Task
 
-SUITE = "ablation"
 NAME = "ablation.md"
 SECONDS = {"paper": 0.1, "r2": 0.1}
 
@@ -69,7 +69,7 @@ def main(arguments: list[str]) -> int:
     options = Options(seconds=given.seconds, anchor=False)
     methods_of(listed)  # what cannot run shows before scans are made
     scenes = list(dict.fromkeys(v.scene for v in listed))
-    code = make_dataset.main([SUITE, str(given.data), "--only", *scenes])
+    code = make_dataset.main([ABLATION, str(given.data), "--only", *scenes])
     return code or _run(given, listed, options)
 
 
@@ -102,7 +102,7 @@ def ablations() -> tuple[int, ...]:
     """Return the numbers of the paper's tables that are ablations."""
     from benchmarks import paper_layout
 
-    return tuple(table.number for table in paper_layout.load().table if table.suite == SUITE)
+    return tuple(table.number for table in paper_layout.load().table if table.suite == ABLATION)
 
 
 def _run(given: Arguments, listed: list[Variant], options: "Options") -> int:
@@ -177,7 +177,7 @@ def estimate(listed: list[Variant], data: Path, results: Path) -> str:
     scenes = dict.fromkeys(v.scene for v in listed if v.scene not in {task.stored.name for task in there})
     if scenes:
         names = " ".join(scenes)
-        text += f"scans to be made first: {names} (make-dataset {SUITE} {data} --dry-run --only {names})\n"
+        text += f"scans to be made first: {names} (make-dataset {ABLATION} {data} --dry-run --only {names})\n"
     return f"{text}total: {len(listed) - len(done)} of {len(listed)} runs, {human_time(total)}\n"
 
 

@@ -38,11 +38,19 @@ def lines(text, start):
     return [[c.strip() for c in x.strip("|").split("|")] for x in text.splitlines() if x.startswith(f"| {start} |")]
 
 
-def test_the_paper_has_nine_tables_of_146_figures():
-    assert list(TABLES) == list(range(1, 10))
-    figures = [text for table in PAPER.table for row in table.rows for text in row.figures if text]
-    assert len(figures) == 146  # counted in the paper's source
-    assert all(paper_layout.printed(text).number for text in figures)
+# How many figures each table has in the paper's source, and their sum, times in seconds: added up from the LaTeX.
+SUMS = {
+    1: (6, 86.413), 2: (10, 153.665), 3: (54, 580.962), 4: (24, 104303), 5: (8, 102.711),
+    6: (8, 117.966), 7: (12, 166.142), 8: (16, 19637), 9: (8, 94.2581),
+}  # fmt: skip
+
+
+def test_no_figure_of_the_paper_is_mistyped():
+    found = {}
+    for number, table in TABLES.items():
+        numbers = [paper_layout.printed(text).number for row in table.rows for text in row.figures if text]
+        found[number] = (len(numbers), round(sum(n for n in numbers if n is not None), 4))
+    assert found == SUMS
 
 
 def test_figures_that_the_paper_prints_more_than_once_agree():
