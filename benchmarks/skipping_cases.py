@@ -356,8 +356,8 @@ def truth(setup: Setup) -> Iterator[Pair[Images]]:
     )
 
 
-Case = Callable[[Setup], Iterator[Pair[Any]]]
-CASES: dict[str, Case] = {
+Pairs = Callable[[Setup], Iterator[Pair[Any]]]
+CASES: dict[str, Pairs] = {
     "materials": materials,
     "bricks": bricks,
     "rays": rays,

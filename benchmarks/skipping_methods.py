@@ -18,9 +18,9 @@ from baselines.nmar import Normalise, normalised
 from baselines.prior import Choice, choose_prior
 from benchmarks import cli_run, make_dataset
 from benchmarks.cli import EXIT_INTERRUPTED
-from benchmarks.methods import find
+from benchmarks.methods import Method, find
 from benchmarks.run import scan_for
-from benchmarks.skipping_cases import Case, Pair, Setup, largest
+from benchmarks.skipping_cases import Pair, Pairs, Setup, largest
 from benchmarks.volumes import read_volume
 from ctsim.store import StoredScan, open_scan
 from ctsim.types import Scan
@@ -102,6 +102,11 @@ def chosen(trace: Trace, scan: Scan, first: torch.Tensor) -> Choice:
     return choice
 
 
+def corrected(method: Method, scan: Scan) -> torch.Tensor:
+    """Correct a scan by a method as it is."""
+    return method.reconstruct(scan, "cpu").values
+
+
 def regardless(scan: Scan, name: str) -> torch.Tensor:
     """Correct a scan as LIMAR or NMAR would, did they not look whether there is metal."""
     first = fdk(scan).values
@@ -126,14 +131,11 @@ def metal_free(setup: Setup) -> Iterator[Pair[torch.Tensor]]:
         method = find(name)
         scan = scan_for(method, stored, "metal_free")
 
-        def stopping(run: Any = method, scan: Scan = scan) -> torch.Tensor:
-            return run.reconstruct(scan, "cpu").values
-
         yield Pair(
             case="metal-free",
             scene=f"{stored.name}, twin",
             what=f"all that {name.upper()} does after FDK where there is no metal",
-            skipping=stopping,
+            skipping=functools.partial(corrected, method, scan),
             whole=functools.partial(regardless, scan, name),
             difference=volumes_apart,
             unit="1/mm",
@@ -211,4 +213,4 @@ def recorded_run(setup: Setup) -> Iterator[Pair[list[NDArray[np.float32]]]]:
     )
 
 
-CASES: dict[str, Case] = {"metal-free": metal_free, "rows": rows, "scan": stored_scan, "record": recorded_run}
+CASES: dict[str, Pairs] = {"metal-free": metal_free, "rows": rows, "scan": stored_scan, "record": recorded_run}

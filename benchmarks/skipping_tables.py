@@ -8,6 +8,7 @@ from statistics import median
 import msgspec
 
 from benchmarks.host import Host
+from ctsim.errors import InputError
 
 CORE = "core"
 
@@ -61,11 +62,19 @@ def append(path: Path, record: SkipRecord) -> None:
 
 
 def read(path: Path) -> list[SkipRecord]:
-    """Read the records of a skipping file; one that is not there has none."""
+    """Read the records of a skipping file; one that is not there has none.
+
+    Raises InputError where a line is no record.
+    """
     if not path.exists():
         return []
-    decoder = msgspec.json.Decoder(SkipRecord)
-    return [decoder.decode(line) for line in path.read_bytes().splitlines() if line.strip()]
+    decoder, found = msgspec.json.Decoder(SkipRecord), []
+    for number, line in enumerate(path.read_bytes().splitlines(), 1):
+        try:
+            found.append(decoder.decode(line))
+        except msgspec.MsgspecError as error:
+            raise InputError(f"{path}, line {number}: expected a record of run-benchmark skipping: {error}") from None
+    return found
 
 
 def known(path: Path, size: str, repeats: int, at: tuple[Host, str]) -> set[str]:
@@ -90,22 +99,9 @@ def latest(records: Sequence[SkipRecord], size: str, order: Sequence[str]) -> li
 def render(records: Sequence[SkipRecord]) -> str:
     """Render measurements as Markdown."""
     head = (
-        "case",
-        "what is left out",
-        "scene",
-        "with (s)",
-        "without (s)",
-        "gain",
-        "largest difference",
-        "allowed",
-        "held",
+        "case | what is left out | scene | with (s) | without (s) | gain | largest difference | allowed | held | note"
     )
-    out = [
-        _provenance(records[-1]),
-        "",
-        "| " + " | ".join((*head, "note")) + " |",
-        "|---|---|---|--:|--:|--:|--:|---|---|---|",
-    ]
+    out = [_provenance(records), "", f"| {head} |", "|---|---|---|--:|--:|--:|--:|---|---|---|"]
     out += ["| " + " | ".join(_cells(record.measured)) + " |" for record in records]
     if records[-1].size != CORE:
         out += ["", "Grids this small are all overhead: they prove the command, not what a skip is worth."]
@@ -116,15 +112,17 @@ def _cells(m: Measured) -> tuple[str, ...]:
     difference = "not finite" if m.difference is None else f"{m.difference:.2g} {m.unit}" if m.difference else "0"
     allowed = m.stated if not m.limit else f"≤ {m.limit:.2g} ({m.stated})"
     seconds = (f"{median(s):.4f}" for s in (m.skipping, m.whole))
-    held = "–" if m.limit is None else "yes" if m.held else "NO"
+    held = "NO" if not m.held else "–" if m.limit is None else "yes"
     return m.case, m.what, m.scene, *seconds, f"{m.gain:.2f}", difference, allowed, held, m.note
 
 
-def _provenance(record: SkipRecord) -> str:
-    h = record.host
+def _provenance(records: Sequence[SkipRecord]) -> str:
+    """Say where and by what code; cases that were measured one by one may be of several commits."""
+    h, times = records[-1].host, sorted(record.time for record in records)
+    commits = dict.fromkeys(r.commit[:12] + "+changes" * r.commit.endswith("+changes") for r in records)
     return (
-        f"{record.time}, commit {record.commit[:12]}{'+changes' if record.commit.endswith('+changes') else ''}, "
-        f"{h.cpu}, {h.cores} cores, {h.threads} threads, Python {h.python}, numba {h.versions.get('numba', '?')}; "
-        f"size {record.size}. Medians of {len(record.measured.skipping)} interleaved runs; the gain is the median over "
-        "pairs of the time without the skip over that with it."
+        f"{times[0]} to {times[-1]}, commit {', '.join(commits)}, {h.cpu}, {h.cores} cores, {h.threads} threads, "
+        f"Python {h.python}, numba {h.versions.get('numba', '?')}; size {records[-1].size}. Medians of "
+        f"{min(len(r.measured.skipping) for r in records)} or more interleaved runs; the gain is the median over pairs "
+        "of the time without the skip over that with it."
     )
