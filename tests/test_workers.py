@@ -1,0 +1,286 @@
+"""Several processes and a Dask cluster give what one process gives, also when one of them is killed at work."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import pytest
+from test_cli import stopped
+
+from benchmarks import cli, workers
+from benchmarks.workers import Cluster, Local, Lost, open_pool, threads_of
+from ctsim.errors import InputError
+
+SUITE = """
+[defaults.scanner]
+n_views = 12
+n_detector = [10, 12]
+n_voxel = [10, 14, 22]
+[defaults.phantom]
+recipe = "validation"
+n_voxel = [16, 16, 16]
+
+[[scene]]
+name = "steel"
+phantom = { metal = "Fe" }
+scanner = { n_views = 200 }  # is finished last, though it is first
+
+[[scene]]
+name = "rods"
+
+[[scene]]
+name = "bare"
+phantom = { metal = "none" }
+"""
+METHODS = ("--method", "fdk", "--method", "test_workers:fatal_once", "--no-keep-volumes")
+
+
+def fatal_once(scan, *, device):
+    """FDK, but the first process that asks is killed."""
+    from reconstruct.fdk import reconstruct
+
+    _die_once(Path(os.environ["CTSIM_TEST_MARK"]))
+    return reconstruct(scan, device=device)
+
+
+def _die_once(mark):
+    try:
+        mark.touch(exist_ok=False)
+    except FileExistsError:
+        return
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def set_mark(path):
+    os.environ["CTSIM_TEST_MARK"] = path
+
+
+def kill_a_writer(pids: Callable[[], Iterable[int]], data: Path) -> threading.Thread:
+    """Kill, once it is seen to write into an unfinished scene, one of the processes."""
+
+    def writes(pid: int) -> bool:
+        try:
+            opened = [os.readlink(f"/proc/{pid}/fd/{n}") for n in os.listdir(f"/proc/{pid}/fd")]
+        except OSError:
+            return False
+        return any(name.startswith(str(data)) and ".partial/" in name for name in opened)
+
+    def watch():
+        end = time.monotonic() + 60
+        while time.monotonic() < end:
+            for pid in filter(writes, pids()):
+                os.kill(pid, signal.SIGKILL)
+                killed.append(pid)
+                return
+            time.sleep(0.002)
+
+    killed: list[int] = []
+    thread = threading.Thread(target=watch)
+    thread.killed = killed  # type: ignore[attr-defined]
+    thread.start()
+    return thread
+
+
+def children() -> list[int]:
+    return [int(pid) for pid in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()]
+
+
+def make(data: Path, *flags: str) -> int:
+    from benchmarks.make_dataset import main
+
+    suite = data.with_suffix(".toml")
+    suite.write_text(SUITE, encoding="utf-8")
+    return main([str(suite), str(data), *flags])
+
+
+def score(data: Path, results: Path, *flags: str) -> int:
+    from benchmarks.cli_run import main
+
+    return main([str(data), str(results), *METHODS, *flags])
+
+
+def scores(results: Path) -> dict:
+    """Return what was measured of each run, and fail where one was recorded twice."""
+    from benchmarks import records
+
+    found, torn = records.read_all(results)
+    assert not torn and len({r.identity for r in found}) == len(found)
+    return {r.identity: (r.label, r.place, r.status, r.scores) for r in found}
+
+
+def tables(results: Path) -> str:
+    """Return the tables as text, without the one of times."""
+    text = (results / "table.md").read_text(encoding="utf-8")
+    rows = (results / "table.csv").read_text(encoding="utf-8").splitlines()
+    parts = text.split("\n## ")
+    return "\n## ".join(p for p in parts if not p.startswith("cost")) + "\n".join(r for r in rows if ",cost," not in r)
+
+
+@pytest.fixture(scope="module")
+def serial(tmp_path_factory) -> Path:
+    """A folder with `data` and `results`, made by one process."""
+    folder = tmp_path_factory.mktemp("serial")
+    os.environ["CTSIM_TEST_MARK"] = str(folder / "mark")
+    (folder / "mark").touch()
+    assert make(folder / "data") == 0
+    assert score(folder / "data", folder / "results") == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A scheduler and two workers, each a process with one thread."""
+    import dask.config
+    from distributed import Client, LocalCluster
+
+    dask.config.set({"distributed.scheduler.allowed-failures": 1})
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL") as found,
+        Client(found) as client,
+    ):
+        yield found.scheduler_address, client
+
+
+def same_data(one: Path, other: Path) -> bool:
+    """Compare names, recipes and checksums, and the order in which scenes are listed."""
+    from ctsim.manifest import verify
+
+    return verify(other) == [] and (one / "index.jsonl").read_bytes() == (other / "index.jsonl").read_bytes()
+
+
+def same_results(one: Path, other: Path) -> bool:
+    assert scores(one) == scores(other)
+    assert tables(one) == tables(other)
+    return True
+
+
+def test_two_workers_make_the_same_dataset_though_one_is_killed(serial, tmp_path):
+    killer = kill_a_writer(children, tmp_path / "data")
+    assert make(tmp_path / "data", "--workers", "2") == 0
+    killer.join()
+    assert killer.killed and same_data(serial / "data", tmp_path / "data")
+
+
+def test_two_workers_score_the_same_though_one_is_killed(serial, tmp_path, monkeypatch):
+    monkeypatch.setenv("CTSIM_TEST_MARK", str(tmp_path / "mark"))
+    assert score(serial / "data", tmp_path / "results", "--workers", "2") == 0
+    assert (tmp_path / "mark").exists() and same_results(serial / "results", tmp_path / "results")
+
+
+def test_a_cluster_makes_the_same_dataset_though_a_worker_is_killed(serial, cluster, tmp_path):
+    address, client = cluster
+    killer = kill_a_writer(lambda: client.run(os.getpid).values(), tmp_path / "data")
+    assert make(tmp_path / "data", "--scheduler", address) == 0
+    killer.join()
+    assert killer.killed and same_data(serial / "data", tmp_path / "data")
+
+
+def test_a_cluster_scores_the_same_though_a_worker_is_killed(serial, cluster, tmp_path, monkeypatch):
+    address, client = cluster
+    monkeypatch.setenv("CTSIM_TEST_MARK", str(tmp_path / "mark"))  # for the worker that follows the killed one
+    client.run(set_mark, str(tmp_path / "mark"))
+    assert score(serial / "data", tmp_path / "results", "--scheduler", address) == 0
+    assert (tmp_path / "mark").exists() and same_results(serial / "results", tmp_path / "results")
+
+
+def job(given: str) -> str:
+    if given == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if given == "refuse":
+        raise InputError("not this one")
+    return f"{given} with {os.environ['NUMBA_NUM_THREADS']}"
+
+
+@pytest.mark.parametrize("kind", ["local", "cluster"])
+def test_a_job_that_kills_its_process_each_time_is_given_up_and_the_others_done(kind, request, monkeypatch):
+    monkeypatch.setattr(workers, "TRIES", 2)
+    with Local(2) if kind == "local" else Cluster(request.getfixturevalue("cluster")[0]) as pool:
+        answers = dict(a for a in pool.answers(str if kind == "cluster" else job, ["one"]) if a)
+        found = dict(a for a in pool.answers(job, ["die", "two"]) if a is not None)
+    assert answers[0].startswith("one") and isinstance(found[0], Lost) and found[1].startswith("two")
+    assert kind == "cluster" or "signal SIGKILL" in found[0].reason
+
+
+def test_what_a_job_refuses_is_raised_here_and_the_cores_are_shared():
+    with Local(2) as pool:
+        assert [a for a in pool.answers(job, ["one"]) if a] == [(0, f"one with {threads_of(2)['NUMBA_NUM_THREADS']}")]
+        with pytest.raises(InputError, match="not this one"):
+            list(pool.answers(job, ["refuse"]))
+
+
+def test_threads_are_the_cores_through_the_workers_but_never_more_than_were_set(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
+    monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
+    monkeypatch.setenv("OMP_NUM_THREADS", "2,1")
+    assert threads_of(2) == {"NUMBA_NUM_THREADS": "4", "OMP_NUM_THREADS": "2"}
+    assert threads_of(3)["NUMBA_NUM_THREADS"] == "2" and threads_of(99)["NUMBA_NUM_THREADS"] == "1"
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--workers", "0"], "expected 1 or more"),
+        (["--workers", "2", "--scheduler", "tcp://127.0.0.1:9"], "exclude each other"),
+        (["--scheduler", "tcp://127.0.0.1:9"], "no Dask scheduler answers there"),  # the port of `discard`
+        (["--scheduler", "nonsense://x"], "no Dask scheduler answers there"),
+    ],
+)
+def test_workers_that_cannot_be_had_are_one_sentence(serial, tmp_path, monkeypatch, capsys, flags, said):
+    monkeypatch.setattr(workers, "CONNECT", 0.3)
+    suite = tmp_path / "suite.toml"
+    suite.write_text(SUITE, encoding="utf-8")
+    for module, arguments in (
+        ("make_dataset", [suite, tmp_path / "data", "--only", "bare"]),
+        ("cli_run", [serial / "data", tmp_path / "results"]),
+    ):
+        assert cli.guarded("command", f"benchmarks.{module}", [*map(str, arguments), *flags]) == 2
+        error = capsys.readouterr().err
+        assert said in error and error.count("\n") == 1
+    assert not (tmp_path / "data").exists() and not (tmp_path / "results").exists()
+
+
+def test_a_cluster_without_the_package_is_one_sentence(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"pip install 'ctsim\[cluster\]'"):
+        open_pool(1, "tcp://127.0.0.1:9")
+
+
+def test_sigterm_ends_the_workers_and_keeps_what_they_noted(serial, tmp_path):
+    (tmp_path / "data.toml").write_text(SUITE, encoding="utf-8")
+    data = tmp_path / "data"
+    arguments = (data.with_suffix(".toml"), data, "--workers", "2")
+    code, said = stopped("make_dataset", arguments, tmp_path, (data / ".steel.partial" / "counts.tif").exists)
+    assert code == 130 and "interrupted" in said and "Traceback" not in said
+    assert not any(data.glob(".*.lock"))  # no worker is at it any more
+    assert make(data) == 0 and same_data(serial / "data", data)
+
+
+def test_workers_end_with_a_command_that_is_killed(tmp_path):
+    code = (
+        "from benchmarks.workers import Local; from test_workers import wait\n"
+        f"with Local(2) as pool: list(pool.answers(wait, [{str(tmp_path / 'pid')!r}]))"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    ) as it:
+        until((tmp_path / "pid").exists)
+        it.kill()
+    until(lambda: not Path(f"/proc/{(tmp_path / 'pid').read_text()}").exists())
+
+
+def wait(path: str) -> None:
+    Path(path + ".new").write_text(str(os.getpid()))
+    os.rename(path + ".new", path)
+    time.sleep(60)
+
+
+def until(true: Callable[[], bool]) -> None:
+    end = time.monotonic() + 30
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.01)
