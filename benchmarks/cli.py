@@ -18,6 +18,7 @@ OTHERS = {
     "report": "reports.report",
     "ablation": "ablation",
     "paper-tables": "paper_tables",
+    "stress": "stress",
 }
 EXIT_USER, EXIT_INTERRUPTED = 2, 130
 

@@ -1,0 +1,127 @@
+"""`run-benchmark stress OUT`: what is hard on the numbers, each case with an expected outcome.
+
+Rows go to OUT/stress.jsonl as they end, the table to OUT/stress.md. A row that was as expected is not run again while
+its sources stay as they are.
+"""
+
+import dataclasses
+import difflib
+import sys
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from ctsim.errors import InputError
+
+if TYPE_CHECKING:
+    from benchmarks.stress_cases import Case
+    from benchmarks.stress_records import StressRecord
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Put simulator, methods and splat kernels under numerical stress; exit code 1 if anything is not as expected.
+
+    A row fails where it misses its oracle, is not finite, raises, warns, crashes or does not end.
+    """
+
+    results: tyro.conf.Positional[Path]
+    """The folder for stress.jsonl and stress.md; made if it is not there."""
+    short: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Small grids; every case, in about two minutes on two cores."""
+    case: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
+    """Only this case; may be given several times (default: all)."""
+    seconds: float = 120.0
+    """Time limit of one row, compilation included."""
+    force: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Run again what was as expected."""
+    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
+    """List the rows and what they are expected to cost, running nothing."""
+
+
+def main(argv: list[str]) -> int:
+    """Run the command; 0 if every row is as expected, 1 if one is not."""
+    given = tyro.cli(Arguments, prog="run-benchmark stress", args=argv)
+    if not given.seconds > 0:
+        raise InputError(f"--seconds must be positive, got {given.seconds:g}")
+    from benchmarks import stress_records
+    from benchmarks.stress_cases import FULL, SHORT
+
+    side = SHORT if given.short else FULL
+    cases = _chosen(catalogue(), given.case)
+    wanted = [stress_records.identity_of(c, side) for c in cases]
+    found = stress_records.latest(stress_records.read(given.results / stress_records.NAME), wanted)
+    done = set() if given.force else {r.identity for r in found if r.ok}
+    left = [c for c, identity in zip(cases, wanted, strict=True) if identity not in done]
+    if given.dry_run:
+        _list(left, len(cases), short=given.short)
+        return 0
+    given.results.mkdir(parents=True, exist_ok=True)
+    _work(left, side, given)
+    return _report(stress_records.latest(stress_records.read(given.results / stress_records.NAME), wanted), given)
+
+
+def catalogue() -> "list[Case]":
+    """Return all cases."""
+    from benchmarks import stress_methods, stress_simulator, stress_splats
+
+    return stress_simulator.cases() + stress_splats.cases() + stress_methods.cases()
+
+
+def _chosen(cases: "list[Case]", names: Sequence[str]) -> "list[Case]":
+    known = list(dict.fromkeys(c.name for c in cases))
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=3)
+            hint = f"did you mean {' or '.join(near)}?" if near else f"expected one of {', '.join(known)}"
+            raise InputError(f"--case {name!r}: {hint}")
+    return [c for c in cases if not names or c.name in names]
+
+
+def _work(left: "list[Case]", side: int, given: Arguments) -> None:
+    """Carry out the rows that are left; each is stored as it ends."""
+    from tqdm import tqdm
+
+    from benchmarks import host, stress_records
+    from benchmarks.stress_worker import Worker
+
+    commit, machine = host.commit(), host.host()  # of the code that is loaded, whatever is committed meanwhile
+    with Worker("benchmarks.stress", given.seconds) as worker, tqdm(left, unit="row", disable=not left) as bar:
+        for case in bar:
+            bar.set_postfix_str(f"{case.name}, {case.subject}")
+            outcome = worker.run(case, side)
+            by = (machine, commit, datetime.now(UTC).isoformat(timespec="seconds"))
+            stress_records.append(
+                given.results / stress_records.NAME, stress_records.record_of(case, side, outcome, by)
+            )
+            if not outcome.ok:
+                tqdm.write(f"{case.name}, {case.subject}: {outcome.found}", file=sys.stderr)
+
+
+def _report(found: "list[StressRecord]", given: Arguments) -> int:
+    """Write the table and say what is not as expected; return the exit code."""
+    from benchmarks import stress_records
+
+    path = given.results / stress_records.TABLE_NAME
+    path.write_text(stress_records.render(found), encoding="utf-8")
+    wrong = [r for r in found if not r.ok]
+    for r in wrong:
+        sys.stdout.write(f"NOT AS EXPECTED: {r.case}, {r.subject}: {r.found}\n")
+    sys.stdout.write(f"{len(found) - len(wrong)} of {len(found)} rows are as expected. Written: {path}\n")
+    return 1 if wrong else 0
+
+
+def _list(left: "list[Case]", n_all: int, *, short: bool) -> None:
+    """Print the rows that would run, case by case, and their cost."""
+    by_case: dict[str, list[Case]] = {}
+    for case in left:
+        by_case.setdefault(case.name, []).append(case)
+    for name, rows in by_case.items():
+        seconds = sum(c.seconds[0 if short else 1] for c in rows)
+        subjects = ", ".join(c.subject for c in rows)
+        sys.stdout.write(f"{name:20s} {len(rows):3d} rows {seconds:6.1f} s  {rows[-1].what}: {subjects}\n")
+    total = sum(c.seconds[0 if short else 1] for c in left)
+    sys.stdout.write(f"{len(left)} of {n_all} rows to run, about {total:.0f} s on two cores and as long to compile\n")
