@@ -121,11 +121,17 @@ def _scene(case: Case, frame: slices.Frame, done: Callable[[], Any]) -> str:
     tiles += [_tile(case, frame, str(k), _caption(kept), kept.record.label) for k, kept in enumerate(case.kept)]
     data = json.dumps(_images(case, frame, start, done), separators=(",", ":")).replace("<", "\\u003c")
     return (
-        f'<section class="scene" id="scene-{name}"><h3>{name}</h3><div class="control">'
+        f'<section class="scene" id="scene-{name}"><h3>{name}</h3>{_step(frame)}<div class="control">'
         f'<input type="range" min="0" max="{len(frame.z) - 1}" value="{start}" aria-label="slice of {name}">'
         f"<output></output></div>{_legends(case)}"
         f'<div class="tiles">{"".join(tiles)}</div><script type="application/json">{data}</script></section>\n'
     )
+
+
+def _step(frame: slices.Frame) -> str:
+    """Say which slices are left out, if any are."""
+    step = frame.z[1] - frame.z[0] if len(frame.z) > 1 else 1
+    return f'<p class="caption">One slice in {step} is here, to keep the file small.</p>' if step > 1 else ""
 
 
 def _tile(case: Case, frame: slices.Frame, row: str, caption: str, label: str) -> str:

@@ -7,8 +7,12 @@ the environment variable CTSIM_FIGURES names, else `figures/`.
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
+
+if TYPE_CHECKING:
+    from reports.kept import Case
 
 
 def text(markdown: str) -> None:
@@ -34,6 +38,19 @@ def figure(drawing: Figure, name: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     drawing.savefig(path, dpi=110)
     sys.stdout.write(f"Figure: {path}\n\n")
+
+
+def slices(case: "Case", name: str) -> None:
+    """Show a case's viewer; a script draws what it shows first."""
+    from reports.view import figure as drawn
+    from reports.view import first_state, viewer
+
+    if _in_jupyter():
+        from IPython.display import display  # pyright: ignore[reportMissingImports]
+
+        display(viewer(case))
+    else:
+        figure(drawn(case, first_state(case)), name)
 
 
 def table(head: list[str], rows: list[list[str]]) -> None:

@@ -23,7 +23,7 @@ from pathlib import Path
 from benchmarks.records import read_all
 from benchmarks.tables import render
 from ctsim.errors import InputError
-from reports import figures, kept, show, view
+from reports import figures, kept, show
 
 DATA, RESULTS = (Path(os.environ.get(f"CTSIM_{name.upper()}", name)) for name in ("data", "results"))
 records, _ = read_all(RESULTS)
@@ -47,9 +47,9 @@ for number, (_, drawing) in enumerate(figures.drawn(records)):
 
 # %% [markdown]
 # ## Slices
-# The slice through the most metal, one window for all, and the signed errors. In Jupyter, `view.viewer(case)` puts
-# sliders around the same pictures.
+# One slice, window and level for all methods, and their signed errors; first the slice through the most metal. In
+# Jupyter there are sliders around it.
 
 # %%
 for case in kept.first_cases(DATA, records, RESULTS):
-    show.figure(view.figure(case, view.first_state(case)), f"results-{case.stored.name}")
+    show.slices(case, f"results-{case.stored.name}")
