@@ -81,7 +81,12 @@ def main(arguments: list[str]) -> int:
         tables.write(records.read_all(given.results)[0], given.results)
         _show(given.results)
         return 0
-    return _compute(given)
+    try:
+        return _compute(given)
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        raise OSError(error.errno, error.strerror or str(error), str(given.results)) from error  # a full disk
 
 
 def _compute(given: Arguments) -> int:

@@ -21,7 +21,7 @@ from benchmarks.artefact import water_attenuation
 from benchmarks.intermediates import Intermediates
 from benchmarks.protocol import Stored, Truth, truth_of
 from benchmarks.records import OK, Record, latest
-from benchmarks.volumes import identity_of
+from benchmarks.volumes import identity_of, map_volume
 
 PLANES = ((0, "z"), (1, "y"))
 TOP, ERROR = 2.5, 1.0
@@ -60,8 +60,6 @@ def cut(metal: NDArray[np.bool_], body: NDArray[np.bool_]) -> tuple[int, int, in
 
 def write_panels(records: list[Record], scans: list[Stored], results: Path) -> list[Path]:
     """Draw panels/SCENE.png for every scan that has kept volumes; return what was written."""
-    import tifffile
-
     written = []
     for stored in scans:
         rows = []
@@ -70,7 +68,7 @@ def write_panels(records: list[Record], scans: list[Stored], results: Path) -> l
             mine = record.run.scan == stored.content_hash and record.run.variant == "metal" and record.scores
             if mine and path is not None and identity_of(path) == record.identity:
                 shown = intermediates.read(intermediates.path_of(path), record.identity)
-                rows.append(Row(caption=_caption(record), volume=tifffile.memmap(path, mode="r"), shown=shown))
+                rows.append(Row(caption=_caption(record), volume=map_volume(path), shown=shown))
         if rows:
             path = results / "panels" / f"{stored.name}.png"
             path.parent.mkdir(parents=True, exist_ok=True)

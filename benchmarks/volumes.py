@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.errors import InputError
+from ctsim.tiffstack import write_all
 
 
 def write_volume(path: Path, values: NDArray[np.float32], identity: str = "") -> None:
@@ -22,7 +23,16 @@ def write_volume(path: Path, values: NDArray[np.float32], identity: str = "") ->
     aside = path.with_name(path.name + ".part")
     text = {"axes": "ZYX", "unit": "1/mm", "run": identity}
     try:
-        tifffile.imwrite(aside, values, photometric="minisblack", metadata=text)
+        tifffile.imwrite(aside, shape=values.shape, dtype=np.float32, photometric="minisblack", metadata=text)
+        with tifffile.TiffFile(aside) as laid_out:
+            offset = laid_out.series[0].dataoffset
+        if offset is None:
+            raise RuntimeError(f"{aside}: tifffile did not lay the volume out in one piece")
+        handle = os.open(aside, os.O_WRONLY)
+        try:
+            write_all(handle, np.ascontiguousarray(values, np.float32), offset)  # says why a disk refuses
+        finally:
+            os.close(handle)
         os.replace(aside, path)
     finally:
         with contextlib.suppress(OSError):
@@ -39,6 +49,19 @@ def identity_of(path: Path) -> str | None:
     except (OSError, ValueError, AttributeError, tifffile.TiffFileError):
         return None
     return found if isinstance(found, str) and found else None
+
+
+def map_volume(path: Path) -> NDArray[np.float32]:
+    """Map a kept volume [z, y, x] in 1/mm, reading nothing yet.
+
+    Raises InputError where the file is damaged.
+    """
+    import tifffile
+
+    try:
+        return tifffile.memmap(path, mode="r")
+    except (ValueError, tifffile.TiffFileError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); run the method again with --force") from None
 
 
 def read_volume(path: Path) -> NDArray[np.float32]:

@@ -1,0 +1,197 @@
+"""Runs commands in forks of one process that has imported and compiled all, so that a run costs what its work costs.
+
+`Forks` starts this file as that process and asks it for runs: to the end, killed after some time, killed at the n-th
+change of a file (half of what was to be written is then written), or against a small or a read-only disk.
+"""
+
+import ctypes
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+CLONE_NEWNS, CLONE_NEWUSER = 0x00020000, 0x10000000
+CAPABILITIES_3 = 0x20080522
+LARGEST = 8192  # less than a volume of the tests
+COUNTED = ("write", "pwrite", "fsync", "fdatasync", "replace", "rename", "unlink", "mkdir", "ftruncate")
+
+
+@dataclass(frozen=True)
+class Run:
+    """How a run ended: exit code (negative for a signal), what it said, seconds, changes of files."""
+
+    code: int
+    said: str
+    seconds: float
+    changes: int
+
+
+class Forks:
+    """The process that forks; a context manager."""
+
+    def __enter__(self) -> Self:
+        one = {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "NUMBA_THREADING_LAYER": "workqueue"}  # survive a fork
+        self._process = subprocess.Popen(
+            [sys.executable, __file__],
+            env={**os.environ, **one},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.communicate(timeout=60)
+
+    def run(self, *command: object, **how: Any) -> Run:
+        """Run a command in a fork; `how` is seconds= or change= to be killed at, disk=(empty folder, bytes), powerless=True.
+
+        With here=True it is run in the process that forks, which has compiled it then.
+        """
+        assert self._process.stdin and self._process.stdout
+        self._process.stdin.write(json.dumps({"command": [str(word) for word in command], **how}) + "\n")
+        self._process.stdin.flush()
+        return Run(**json.loads(self._process.stdout.readline()))
+
+
+def serve() -> None:
+    """Import, then answer requests from stdin until it closes."""
+    import tqdm
+
+    tqdm.tqdm.monitor_interval = 0  # a fork would lose its thread
+    import benchmarks.cli_run
+    import benchmarks.make_dataset
+    import benchmarks.panels
+    import benchmarks.schedule
+    import phantoms.scene
+
+    assert all((benchmarks.cli_run, benchmarks.make_dataset, benchmarks.panels, benchmarks.schedule, phantoms.scene))
+    benchmarks.panels.DPI = 20  # a picture is to be there; most of the time it would be drawn
+    for line in sys.stdin:
+        sys.stdout.write(json.dumps(attempt(**json.loads(line))) + "\n")
+        sys.stdout.flush()
+
+
+def attempt(command: list[str], here: bool = False, seconds: float | None = None, **how: Any) -> dict[str, Any]:
+    """Do what `Forks.run` asks for."""
+    begun = time.perf_counter()
+    said, counted = os.memfd_create("said"), os.memfd_create("counted")
+    if here:
+        before = os.dup(1), os.dup(2)
+        os.dup2(said, 1)
+        os.dup2(said, 2)
+        code = call(command)
+        os.dup2(before[0], 1)
+        os.dup2(before[1], 2)
+    else:
+        child = os.fork()
+        if not child:
+            os.dup2(said, 1)
+            os.dup2(said, 2)
+            be(command, counted, **how)
+        while (ended := os.waitpid(child, os.WNOHANG))[0] == 0:
+            if seconds is not None and time.perf_counter() - begun >= seconds:
+                os.kill(child, signal.SIGKILL)
+                seconds = None
+            time.sleep(0.0005)
+        code = os.waitstatus_to_exitcode(ended[1])
+    text = os.pread(said, 10**6, 0).decode()
+    changes = int(os.pread(counted, 20, 0) or b"0")
+    os.close(said)
+    os.close(counted)
+    return {"code": code, "said": text, "seconds": time.perf_counter() - begun, "changes": changes}
+
+
+def be(command: list[str], counted: int, change: int | None = None, disk: Any = None, powerless: bool = False) -> None:
+    """Be the command."""
+    code = 99
+    try:
+        if disk:
+            from benchmarks import make_dataset
+
+            make_dataset._SPARE = -(2**40)  # else a disk that is too small would be refused before the first byte
+            disk = disk if small_disk(*disk) else None
+        if powerless:
+            drop_powers()
+        changes = count_changes(change)
+        code = call(command)
+        os.pwrite(counted, str(changes[0]).encode(), 0)
+        if disk:
+            subprocess.run(["cp", "-a", disk[0], disk[0] + ".left"], check=True)  # it vanishes with this process
+    except BaseException:
+        traceback.print_exc()
+        sys.stderr.flush()
+    finally:
+        os._exit(code)
+
+
+def call(command: list[str]) -> int:
+    """Call a command as its console script does."""
+    from benchmarks import cli
+
+    sys.argv = command
+    code = {"make-dataset": cli.make_dataset, "run-benchmark": cli.run_benchmark}[command[0]]()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    return code
+
+
+def count_changes(deadly: int | None) -> list[int]:
+    """Count the calls that change files; at number `deadly` do half of a write, or nothing, and be killed."""
+    count = [0]
+
+    def counting(name: str, real: Any) -> Any:
+        def call(*given: Any, **more: Any) -> Any:
+            count[0] += 1
+            if count[0] == deadly:
+                if name in ("write", "pwrite"):
+                    data = memoryview(given[1])
+                    real(given[0], data[: data.nbytes // 2], *given[2:])
+                os.kill(os.getpid(), signal.SIGKILL)
+            return real(*given, **more)
+
+        return call
+
+    for name in COUNTED:
+        setattr(os, name, counting(name, getattr(os, name)))
+    return count
+
+
+def small_disk(folder: str, size: int) -> bool:
+    """Mount a disk of `size` bytes on an empty folder, seen by this process alone; return whether it is there.
+
+    Where the system does not let a user do so, no file can grow beyond `LARGEST` bytes instead.
+    """
+    libc = ctypes.CDLL(None)
+    user, group = os.getuid(), os.getgid()
+    try:
+        if libc.unshare(CLONE_NEWUSER | CLONE_NEWNS):
+            raise PermissionError
+        for name, text in (("setgroups", "deny"), ("uid_map", f"{user} {user} 1"), ("gid_map", f"{group} {group} 1")):
+            Path(f"/proc/self/{name}").write_text(text)
+        if libc.mount(b"tmpfs", folder.encode(), b"tmpfs", 0, f"size={size}".encode()):
+            raise PermissionError
+    except OSError:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (LARGEST, LARGEST))
+        return False
+    return True
+
+
+def drop_powers() -> None:
+    """Give up all capabilities, so that modes of files bind root too."""
+
+    class Header(ctypes.Structure):
+        _fields_ = (("version", ctypes.c_uint32), ("pid", ctypes.c_int))
+
+    ctypes.CDLL(None).capset(ctypes.byref(Header(CAPABILITIES_3, 0)), (ctypes.c_uint32 * 6)())
+
+
+if __name__ == "__main__":
+    serve()
