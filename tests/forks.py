@@ -51,7 +51,7 @@ class Forks:
         self._process.communicate(timeout=60)
 
     def run(self, *command: object, **how: Any) -> Run:
-        """Run a command in a fork; `how` is seconds= or change= to be killed at, disk=(empty folder, bytes), powerless=True.
+        """Run a command in a fork, killed at seconds= or change=, on a disk=(empty folder, bytes), or powerless=True.
 
         With here=True it is run in the process that forks, which has compiled it then.
         """

@@ -1,0 +1,156 @@
+"""Which runs come first, what they are said to take, records of several machines, and tables in any order of ends."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+from test_run import double
+from test_tables import record
+
+from benchmarks import records, run, schedule, tables
+from benchmarks.methods import Method
+from benchmarks.schedule import Costs, ordered
+from benchmarks.workers import Lost
+from ctsim.errors import InputError
+
+OPTIONS = run.Options(keep_volumes=False)
+
+
+def method(name: str) -> Method:
+    return Method(name=name, target="test_run:good", inputs="counts only", params={})
+
+
+def listed(*names: str) -> list[run.Task]:
+    """Return the runs of methods on two scans, each with its twin."""
+    return run.tasks([double(Path("a")), double(Path("b"))], [method(name) for name in names], OPTIONS)
+
+
+def took(name: str, seconds: float, status: str = "ok", **more):
+    found = record(name, status=status, **more)
+    assert found.cost is not None
+    return msgspec.structs.replace(found, cost=msgspec.structs.replace(found.cost, wall=seconds))
+
+
+def order(names: tuple[str, ...], found) -> list[str]:
+    groups = ordered(listed(*names), Costs(found))
+    assert all([t.variant for t in g] == ["metal_free", "metal"] for g in groups)  # the twin, then what it judges
+    assert [g[0].place[0] for g in groups] == [0, 1] * len(names)  # a whole row before the next method
+    return [g[0].method.name for g in groups[::2]]
+
+
+def test_cheap_methods_come_first():
+    known = [took("fdk", 9.0), took("limar", 2.0), took("splat", 800.0)]
+    assert order(("splat", "fdk", "limar"), known) == ["limar", "fdk", "splat"]
+    # one that never ran counts as dear as the dearest before it in the methods table
+    assert order(("splat", "my:method", "nmar", "fdk", "limar"), known) == [
+        "limar",
+        "fdk",
+        "nmar",
+        "splat",
+        "my:method",
+    ]
+    assert order(("splat", "my:method", "fdk"), []) == ["fdk", "splat", "my:method"]
+    assert order(("b:b", "a:a"), [took("a:a", 1.0, "timeout")]) == ["b:b", "a:a"]  # a failure says nothing of the cost
+
+
+def test_the_cost_of_a_run_is_that_of_its_scan_else_the_methods_median():
+    found = [took("fdk", 1.0, scene="box", seed=3), took("fdk", 5.0, scene="x"), took("fdk", 9.0, scene="y")]
+    twin, scan = listed("fdk")[:2]
+    assert (Costs(found).task(scan), Costs(found).task(twin), Costs([]).task(scan)) == (1.0, 5.0, None)
+    text = schedule.text(ordered(listed("fdk", "splat")[:4], Costs(found)), 8, Costs(found)).splitlines()
+    assert [line.split() for line in text[:3]] == [
+        ["fdk", "box", "(metal-free)", "5", "s"],
+        ["fdk", "box", "1", "s"],
+        ["splat", "box", "(metal-free)", "unknown"],
+    ]
+    assert text[-1].startswith("total: 4 of 8 runs, 6 s") and text[-1].endswith("never run: splat")
+
+
+def test_a_dry_run_writes_nothing(smallest, tmp_path, capsys):
+    from benchmarks.cli_run import main
+
+    assert main([str(smallest), str(tmp_path / "results"), "--dry-run"]) == 0
+    assert "2 of 2 runs" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == []
+
+
+class Fake:
+    """A pool that answers what it is told to."""
+
+    def __init__(self, *answers):
+        self._answers = answers
+
+    def answers(self, function, jobs):
+        yield None
+        yield from enumerate(self._answers)
+
+
+def test_a_run_whose_process_dies_is_a_failure_on_record(tmp_path):
+    groups = ordered(listed("fdk")[:2], Costs([]))
+    found = [r for _, r in schedule.work(groups, tmp_path, OPTIONS, Fake(Lost("it died")))]
+    assert [(r.status, r.reason, r.run.variant) for r in found] == [
+        ("error", "it died", "metal_free"),
+        ("error", "it died", "metal"),
+    ]
+    assert records.read_all(tmp_path)[0] == found
+
+
+def test_a_worker_with_other_code_is_refused(tmp_path):
+    groups = ordered(listed("fdk")[:2], Costs([]))
+    strange = [msgspec.json.encode(record(variant=v)) for v in ("metal_free", "metal")]
+    with pytest.raises(InputError, match="a worker has another version"):
+        list(schedule.work(groups, tmp_path, OPTIONS, Fake(strange)))
+    assert records.read_all(tmp_path)[0] == []
+
+
+def placed(name: str, scene: str, place: tuple[int, int], **more):
+    return msgspec.structs.replace(record(name, scene, **more), place=place)
+
+
+def test_tables_do_not_depend_on_which_run_ended_first():
+    given = [
+        placed(name, scene, (i, k), variant=variant, seed=seed)
+        for i, scene in enumerate(("teeth", "lung"))
+        for k, name in enumerate(("my:net", "nmar", "fdk", "a:lab"))
+        for variant in ("metal_free", "metal")
+        for seed in (1, 2)
+    ]
+    expected = tables.render(given, "md"), tables.summary(given).to_csv()
+    for other in (given[::-1], given[::3] + given[1::3] + given[2::3], sorted(given, key=lambda r: r.identity)):
+        assert (tables.render(other, "md"), tables.summary(other).to_csv()) == expected
+    shown = records.latest(given[::-1])
+    assert list(dict.fromkeys(r.run.scene for r in shown)) == ["teeth", "lung"]
+    assert list(dict.fromkeys(r.label for r in shown)) == ["fdk", "nmar", "my:net", "a:lab"]
+
+
+def at(time: str, found, **more):
+    return msgspec.structs.replace(found, time=f"2026-01-01T00:00:{time}+00:00", **more)
+
+
+def test_results_of_several_machines_are_collected_once(tmp_path):
+    here, there, third = (tmp_path / name for name in ("here", "there", "deep/third"))
+    new = record("fdk", psnr=30.0)
+    old = msgspec.structs.replace(new.run, code="old")
+    for folder, found in (
+        (here, [at("20", new), at("21", record("nmar", status="error"))]),
+        (there, [at("05", new, run=old, identity=old.identity), at("30", record("nmar"), volume="volumes/n.tif")]),
+        (third, [at("40", record("nmar", status="error")), at("41", record("splat"))]),
+    ):
+        for r in found:
+            records.append(folder / records.NAME, r)
+    assert records.collect(here, [there, third]) == {there: 2, third: 1}
+    assert records.collect(here, [there, third, here]) == {there: 0, third: 0, here: 0}
+    shown = {r.label: r for r in records.latest(records.read_all(here)[0])}
+    assert shown["fdk"].run.code == ""  # the older code came last, but does not supersede
+    assert shown["nmar"].status == "ok" and (here / (shown["nmar"].volume or "")).resolve() == there / "volumes/n.tif"
+    assert set(shown) == {"fdk", "nmar", "splat"}
+    with pytest.raises(InputError, match="no records"):
+        records.collect(here, [tmp_path / "nothing"])
+
+
+def test_collecting_renders_the_tables(tmp_path, capsys):
+    from benchmarks.cli_run import main
+
+    records.append(tmp_path / "there" / records.NAME, record("fdk"))
+    assert main([str(tmp_path / "data"), str(tmp_path / "here"), "--collect", str(tmp_path / "there")]) == 0
+    assert "| counts only | fdk |" in capsys.readouterr().out and (tmp_path / "here/table.csv").exists()
