@@ -8,6 +8,7 @@ import itertools
 import re
 
 _CELL = re.compile(r"(?<!\\)\|")
+_RULE = re.compile(r"[|:\- ]+")
 
 
 def to_html(text: str) -> str:
@@ -50,7 +51,7 @@ def _block(lines: list[str]) -> str:
         return f"<h{level}>{inline(first[level:].strip())}</h{level}>"
     if first.startswith("- "):
         return "<ul>" + "".join(f"<li>{inline(line[2:])}</li>" for line in lines) + "</ul>"
-    if first.startswith("|") and len(lines) > 1:
+    if first.startswith("|") and len(lines) > 1 and _RULE.fullmatch(lines[1]):
         return _table(lines)
     return f"<p>{inline(' '.join(lines))}</p>"
 
@@ -60,14 +61,17 @@ def _cells(line: str) -> list[str]:
 
 
 def _table(lines: list[str]) -> str:
-    """Render a table whose columns "scene: metric" stand together under their scene."""
+    """Render a table whose columns "scene: metric" stand together under their scene; short rows are filled up."""
     head, rule, *rows = map(_cells, lines)
     numeric = [mark.endswith(":") for mark in rule]
-    groups = [title.partition(": ") if number else ("", "", title) for title, number in zip(head, numeric, strict=True)]
+    groups = [
+        title.partition(": ") if number else ("", "", title) for title, number in zip(head, numeric, strict=False)
+    ]
     body = []
     for row in rows:
         kinds = ((' class="num"' if number else "") for number in numeric)
-        body.append("".join(f"<td{kind}>{inline(cell)}</td>" for kind, cell in zip(kinds, row, strict=True)))
+        cells = row + [""] * (len(head) - len(row))
+        body.append("".join(f"<td{kind}>{inline(cell)}</td>" for kind, cell in zip(kinds, cells, strict=False)))
     return (
         '<div class="wide"><table><thead>'
         + _head(groups, numeric)

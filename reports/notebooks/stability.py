@@ -26,6 +26,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
+from benchmarks import stress_records
 from ctsim.detector import Detector
 from ctsim.geometry import Geometry
 from ctsim.kernels import joseph_reference
@@ -117,6 +118,26 @@ show.text(f"Threads {', '.join(map(str, volumes))}: {'bitwise equal' if same els
 
 # %% [markdown]
 # ## The stress suite
-# What `run-benchmark stress` recorded, if it was run into this results folder.
+# What `run-benchmark stress` recorded, if it was run into this results folder: the last record of each row, blue where
+# it ended as expected. What did not is named with what was found.
 
 # %%
+last = {(r.case, r.subject, r.side): r for r in stress_records.read(RESULTS / stress_records.NAME)}
+rows = list(last.values())
+if rows:
+    wrong = [r for r in rows if not r.ok]
+    named = "".join(f"- {r.case}, {r.subject}: {r.found}\n" for r in wrong)
+    show.text(f"{len(rows) - len(wrong)} of {len(rows)} rows are as expected.\n\n{named}")
+    show.text("\n".join(stress_records.by_case(rows)))
+    cases, subjects = (list(dict.fromkeys(getattr(r, name) for r in rows)) for name in ("case", "subject"))
+    drawing = Figure(figsize=(2.5 + 0.3 * len(subjects), 1.8 + 0.22 * len(cases)), layout="constrained")
+    axes = drawing.subplots()
+    for ok, colour in ((True, COLOURS[0]), (False, COLOURS[5])):
+        at = [(subjects.index(r.subject), cases.index(r.case)) for r in rows if r.ok == ok]
+        axes.scatter([x for x, _ in at], [y for _, y in at], s=28, marker="s", color=colour)
+    axes.set_xticks(range(len(subjects)), labels=subjects, rotation=90, fontsize=8)
+    axes.set_yticks(range(len(cases)), labels=cases, fontsize=8)
+    axes.invert_yaxis()
+    show.figure(drawing, "stability-stress")
+else:
+    show.text(f"There are no stress records in `{RESULTS}`; `run-benchmark stress {RESULTS}` makes them.")
