@@ -1,8 +1,10 @@
 """The published splat methods as wholes: on a small scan without noise of a sphere, and their loss's gradients."""
 
 import dataclasses
+import itertools
 import math
 
+import msgspec
 import numba
 import numpy as np
 import pytest
@@ -11,10 +13,13 @@ import torch
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.types import Scan, Status
-from reconstruct.log import line_integrals
-from reconstruct.splat import adam, densify, published
-from reconstruct.splat.published import PRESETS, Objective, Settings, fit_published, seed_splats
-from reconstruct.splat.response import make_response
+from reconstruct.splat import adam, densify
+from reconstruct.splat.learner import LEAST_VALUE, seed_splats
+from reconstruct.splat.objective import Objective
+from reconstruct.splat.published import Progress, fit_published, read_out, reconstruct
+from reconstruct.splat.published_settings import PRESETS, Settings, changed
+from reconstruct.splat.volume import voxelise
+from reconstruct.watch import watch
 
 GEOMETRY = Geometry(
     dso=200.0,
@@ -26,7 +31,7 @@ GEOMETRY = Geometry(
     n_views=20,
 )
 RADIUS, MU = 10.0, 0.03  # mm, 1/mm
-SCHEDULE = densify.Schedule(every=2000, most=600)
+SCHEDULE = densify.Schedule(first=20_000)
 PAPER, R2 = (dataclasses.replace(PRESETS[name], steps=200, n_splats=400, schedule=SCHEDULE) for name in ("paper", "r2"))
 
 
@@ -51,49 +56,180 @@ def sphere(mu=MU, i0=1e6) -> Scan:
     return Scan(geometry=GEOMETRY, counts=(i0 * torch.exp(-p)).float(), flat=torch.full((36, 40), i0), i0=i0)
 
 
-def course(scan: Scan, settings: Settings):
-    seen: list[tuple[int, float, float, int]] = []
-    return fit_published(scan, settings, on_step=lambda *step: seen.append(step)), seen
+def course(scan: Scan, settings: Settings, every: int = 1):
+    seen: list[Progress] = []
+    return fit_published(scan, settings, on_progress=seen.append, every=every), seen
 
 
 @pytest.mark.parametrize("settings", [PAPER, R2], ids=["paper", "r2"])
 def test_the_loss_falls_and_the_same_seed_gives_the_same_bits(settings):
     volume, seen = course(sphere(), settings)
-    losses = [loss for _, loss, _, _ in seen]
-    # 20 views a turn; it starts from 1/6 of the sum of densities that neighbours overlap to
-    assert np.mean(losses[-20:]) < 0.5 * np.mean(losses[:5])
+    losses = [step.loss for step in seen]
+    # 20 views a turn; it starts from FDK's volume, blurred by what 400 splats can show. Measured: 0.45 and 0.53
+    assert np.mean(losses[-20:]) < 0.6 * np.mean(losses[:5])
     assert volume.status is Status.OK and volume.details["view_updates"] == 200
-    assert [k for k, *_ in seen] == list(range(1, 201)) and seen[-1][3] == volume.details["splats"]
-    assert all(b >= a for a, b in zip([s for *_, s, _ in seen], [s for *_, s, _ in seen[1:]], strict=False))
     assert torch.isfinite(volume.values).all()
     z, y, x = GEOMETRY.voxel_centres()
     distance = np.sqrt(z[:, None, None] ** 2 + y[:, None] ** 2 + x**2)
     inside, outside = volume.values.numpy()[distance < 8], volume.values.numpy()[distance > 13]
     assert inside.mean() > 5 * abs(outside.mean())
-    short = dataclasses.replace(settings, steps=30, schedule=densify.Schedule(every=7000, most=600))
+    often = densify.Schedule(first=5, every=7, last=20_000, most=600)
+    short = dataclasses.replace(settings, steps=30, schedule=often, schedule_steps=30)
     first, again = (fit_published(sphere(), short) for _ in range(2))
     other = fit_published(sphere(), dataclasses.replace(short, seed=1))
     assert torch.equal(first.values, again.values) and not torch.equal(first.values, other.values)
     assert first.details["splats"] > 400
 
 
+def test_progress_says_where_the_fit_stands():
+    volume, seen = course(sphere(), dataclasses.replace(PAPER, steps=30), every=10)
+    assert [p.step for p in seen] == [10, 20, 30] and {p.steps for p in seen} == {30}
+    assert all(a.seconds < b.seconds for a, b in itertools.pairwise(seen))
+    assert seen[0].remaining == pytest.approx(2 * seen[0].seconds) and seen[-1].remaining == 0
+    assert seen[-1].splats == volume.details["splats"] and seen[0].eta.sum() == pytest.approx(1)
+
+
 def test_the_response_is_learned_only_where_it_is_to_be():
-    short = dataclasses.replace(PAPER, steps=20)
-    assert fit_published(sphere(), short).details["response"]["theta"] != [0.2, 1.0]
-    held = dataclasses.replace(short, theta=(1.0, 1.0), learn_response=False)
-    assert fit_published(sphere(), held).details["response"]["theta"] == [1.0, 1.0]
-    volume = published.paper(sphere(), steps=2, e_max=60.0)
-    assert volume.details["view_updates"] == 2
-    assert not torch.equal(volume.values, published.paper(sphere(), steps=2).values)
-    assert published.r2(sphere(), steps=2).details["response"] == {"name": "mono", "theta": []}
+    def theta(**changes):
+        return reconstruct(sphere(), steps=20, n_splats=200, **changes).details["response"]["theta"]
+
+    learned = theta()
+    assert learned != [0.2, 1.0] and learned == pytest.approx([0.2, 1.0], abs=0.021)  # 20 steps of at most 1e-3
+    assert theta(theta=(0.5, 0.9), learn_response=False) == [0.5, 0.9]
+    assert theta(theta=[0.5, 0.9]) != [0.5, 0.9]
+    assert theta(response="flat") == [1.0, 1.0]
+    assert theta(basis="constant") == [0.2, 1.0]
+    assert theta(preset="r2") == []
+    volumes = [reconstruct(sphere(), steps=2, n_splats=200, e_max=e_max).values for e_max in (60.0, None)]
+    assert not torch.equal(*volumes)
+
+
+def test_a_response_matters_only_where_attenuation_depends_on_energy():
+    """Shares of the response sum to 1, so that P = La for a constant density, whatever they are."""
+
+    def run(**changes):
+        return reconstruct(sphere(), steps=3, n_splats=200, **changes).values
+
+    assert torch.equal(run(basis="constant", response="mono"), run(basis="constant", response="paper"))
+    for basis in ("paper", "klein-nishina", "photoelectric"):
+        assert not torch.equal(run(basis=basis, response="flat"), run(basis=basis, response="paper")), basis
 
 
 def test_nothing_seen_and_no_time_give_what_there_is():
-    for reconstruct in (published.paper, published.r2):
-        empty = reconstruct(sphere(mu=0.0), steps=5)
-        assert empty.status is Status.OK and not empty.values.any() and "no voxel" in empty.reason
-    volume = published.paper(sphere(), seconds=0.0)
+    for preset in ("paper", "r2"):
+        empty = reconstruct(sphere(mu=0.0), preset=preset, steps=5)
+        assert empty.status is Status.OK and not empty.reason
+        assert not empty.values.any() and "no voxel" in empty.details["limitation"]
+    volume = reconstruct(sphere(), seconds=0.0)
     assert volume.details["view_updates"] == 0 and volume.values.any()
+
+
+def test_densities_are_handed_over_and_read_at_any_energy():
+    def run(**changes):
+        return reconstruct(sphere(), steps=20, n_splats=400, **changes)
+
+    at_centre = run()
+    a, b = (at_centre.details["densities"][name] for name in ("rho_a", "rho_b"))
+    assert a.shape == b.shape == GEOMETRY.n_voxel and a.any() and b.any()
+    np.testing.assert_allclose(at_centre.values, a + b, rtol=1e-5, atol=1e-9)
+    # 90 keV are 1.8 of the range's centre
+    np.testing.assert_allclose(run(readout=90.0).values, a + b / 1.8**3, rtol=1e-5, atol=1e-9)
+    hardened = run(readout="hardened")
+    weight = ((hardened.values.numpy() - a).sum() / b.sum()).item()
+    np.testing.assert_allclose(hardened.values, a + weight * b, rtol=1e-4, atol=1e-7)
+    assert 1.8**-3 < weight < 0.2**-3 and hardened.details["read-out"].startswith("hardened")
+    assert list(run(preset="r2").details["densities"]) == ["rho_a"]
+    assert list(run(basis="photoelectric").details["densities"]) == ["rho_b"]
+
+
+def test_the_hardened_read_out_knows_no_gauge():
+    """κ → c·κ with ρb → ρb/c changes no projection; the densities' sum, attenuation at Ē = 1, falls."""
+    objective, parameters, response = problem(sphere())
+    splats, c = objective.activation.splats(parameters), 2.5
+    moved = dataclasses.replace(splats, densities=splats.densities / np.array([1, c], np.float32))
+    other = dataclasses.replace(response, b=response.b * c)
+    p, q = (objective.line_integrals(objective.paths(s, 0), r)[0] for s, r in ((splats, response), (moved, other)))
+    np.testing.assert_allclose(p, q, rtol=1e-4, atol=1e-6)  # both in float32
+
+    def read(objective, splats, response):
+        weights, _ = read_out(splats, response, objective)
+        return voxelise(splats, GEOMETRY, splats.densities @ weights[:, None])
+
+    hard = dataclasses.replace(objective, settings=dataclasses.replace(PAPER, readout="hardened"))
+    first, second = read(hard, splats, response), read(hard, moved, other)
+    np.testing.assert_allclose(first, second, rtol=1e-4, atol=1e-7)
+    assert np.abs(read(objective, moved, other) - read(objective, splats, response)).max() > 0.01 * first.max()
+
+
+class Interrupted(Exception):
+    pass
+
+
+@pytest.mark.parametrize("held_out", [0, 3])
+def test_an_interrupted_fit_goes_on_to_the_same_bits(held_out, tmp_path, monkeypatch):
+    monkeypatch.setattr("reconstruct.splat.checkpoint.EVERY", 0.0)
+    often = densify.Schedule(first=5, every=7, last=20_000, most=600)
+    whole = dataclasses.replace(PAPER, steps=40, schedule=often, schedule_steps=40, held_out=held_out)
+    kept = dataclasses.replace(whole, checkpoints=str(tmp_path))
+    steps: list[int] = []
+
+    def interrupt(progress: Progress) -> None:
+        steps.append(progress.step)
+        if steps == [9, 18, 27]:
+            raise Interrupted
+
+    with pytest.raises(Interrupted):
+        fit_published(sphere(), kept, on_progress=interrupt, every=9)
+    assert len(list(tmp_path.iterdir())) == 1
+    found = fit_published(sphere(), kept, on_progress=interrupt, every=9)
+    assert steps == [9, 18, 27, 27, 36]  # the step that was cut off had been taken, but not written
+    assert torch.equal(found.values, fit_published(sphere(), whole).values)
+    assert not list(tmp_path.iterdir())
+
+
+def test_time_that_ran_out_can_be_given_later(tmp_path):
+    settings = dataclasses.replace(PAPER, steps=30, checkpoints=str(tmp_path))
+    early = fit_published(sphere(), dataclasses.replace(settings, seconds=1e-9))
+    assert early.details["view_updates"] == 0 and len(list(tmp_path.iterdir())) == 1
+    late = fit_published(sphere(), settings)
+    assert late.details["view_updates"] == 30 and not list(tmp_path.iterdir())
+
+
+def test_a_damaged_checkpoint_is_refused_and_another_scan_s_not_taken(tmp_path):
+    settings = dataclasses.replace(PAPER, steps=30, checkpoints=str(tmp_path), seconds=0.0)
+    fit_published(sphere(), settings)
+    fit_published(sphere(mu=0.02), settings)
+    fit_published(sphere(), dataclasses.replace(settings, seed=1))
+    files = sorted(tmp_path.iterdir())
+    assert len(files) == 3
+    for file in files:
+        file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(InputError, match="delete it"):
+        fit_published(sphere(), settings)
+    with pytest.raises(InputError, match="cannot be read"):
+        fit_published(sphere(), dataclasses.replace(settings, checkpoints=str(files[0])))
+
+
+def test_a_fit_ends_when_views_it_does_not_see_gain_no_more():
+    settings = dataclasses.replace(PAPER, steps=2000, n_splats=150, held_out=4, patience=2)
+    volume, seen = course(sphere(i0=50.0), settings)  # noise to be fitted
+    about, done = volume.details["held_out"], volume.details["view_updates"]
+    assert about["views"] == [4, 8, 11, 15] and seen[-1].step == done < 2000
+    assert about["step"] % 16 == 0 and 0 < about["step"] <= done
+    # what is returned is the state at that step: the rates of a run of as many steps would be others
+    best = []
+    with watch(lambda updates, seconds, values: best.append((updates, values))):
+        again = fit_published(sphere(i0=50.0), settings)
+    np.testing.assert_allclose(dict(best)[about["step"]], again.values, rtol=1e-4, atol=1e-8)
+    assert torch.equal(again.values, volume.values)
+
+
+def test_a_fit_can_be_watched():
+    seen = []
+    with watch(lambda updates, seconds, volume: seen.append((updates, volume))):
+        volume = fit_published(sphere(), dataclasses.replace(PAPER, steps=40))
+    assert [updates for updates, _ in seen] == [20, 40]
+    np.testing.assert_allclose(seen[-1][1], volume.values, rtol=1e-4, atol=1e-8)
 
 
 def test_counts_that_are_not_finite_say_nothing():
@@ -103,21 +239,18 @@ def test_counts_that_are_not_finite_say_nothing():
     volume, seen = course(dataclasses.replace(scan, counts=counts), dataclasses.replace(PAPER, steps=40))
     assert volume.details["clamped_pixels"] == 20 * 4 + 16
     assert volume.status is Status.OK and torch.isfinite(volume.values).all()
-    assert all(math.isfinite(loss) for _, loss, _, _ in seen)
+    assert all(math.isfinite(step.loss) for step in seen)
     objective, parameters, response = problem(dataclasses.replace(scan, counts=counts))
+    assert not objective.p[~objective.valid].any() and not objective.valid[:, 17:19, 17:19].any()
     before = objective(parameters, response, 0, 0).loss
-    objective.p[0, 17:19, 17:19] += 1.0
-    assert objective(parameters, response, 0, 0).loss == before
-    objective.p[0, 20, 20] += 1.0
-    assert objective(parameters, response, 0, 0).loss != before
+    objective.valid[0, 17:19, 17:19] = True  # 0 seen where the sphere is
+    assert objective(parameters, response, 0, 0).loss > before + 1e-3
 
 
 def problem(scan, settings=PAPER):
     """The loss, what is learned and the response at the start."""
-    objective = Objective.of(scan, settings)
-    given = seed_splats(objective.p, GEOMETRY, settings)
-    # half of what is seen, so that no pixel's difference changes its sign, and no needle is at a bound
-    response = make_response(settings.response, e_max=90.0)
+    objective, response = Objective.of(scan, settings), settings.make_response(90.0)
+    given = seed_splats(objective.p, GEOMETRY, settings, response)
     return objective, objective.activation.parameters(given), response
 
 
@@ -134,15 +267,14 @@ def test_the_response_has_the_whole_loss_s_finite_differences():
         assert terms.theta[k] == pytest.approx(numeric, rel=0.01)
 
 
-@pytest.mark.parametrize("channels", ["ab", "b"])
-def test_densities_have_the_whole_loss_s_finite_differences(channels):
-    n = len(channels)
-    settings = dataclasses.replace(PAPER, channels=channels, start=(0.075,) * n, density_rates=(0.01,) * n)
+@pytest.mark.parametrize("basis", ["paper", "klein-nishina", "constant", "photoelectric"])
+def test_densities_have_the_whole_loss_s_finite_differences(basis):
+    settings = dataclasses.replace(PAPER, basis=basis)
     scan = sphere()
     scan.counts[:, 10:20, 15:25] = torch.nan  # what does not count pulls at nothing
     objective, parameters, response = problem(scan, settings)
-    terms, step = objective(parameters, response, 3, 0), 0.02
-    for channel in range(len(channels)):
+    terms, step = objective(parameters, response, 3, 0), 0.004  # few pixels' differences change their sign
+    for channel in range(len(settings.channels)):
         moved = []
         for sign in (1, -1):
             shifted = parameters["densities"].copy()
@@ -169,35 +301,78 @@ def test_tv_pulls_at_densities_as_its_finite_difference_says():
 
 
 def test_splats_are_seeded_as_published():
-    scan = sphere()
-    p, _ = line_integrals(scan, slice(None))
-    given, unit = seed_splats(p.numpy(), GEOMETRY, PAPER), adam.unit_length(GEOMETRY)
-    assert len(given) == 400 and unit == 16 and np.all(np.diff(given.positions[:, 2]) >= 0)
+    objective, _, response = problem(sphere())
+    given = seed_splats(objective.p, GEOMETRY, PAPER, response)
+    assert len(given) == 400 and adam.unit_length(GEOMETRY) == 16 and np.all(np.diff(given.positions[:, 2]) >= 0)
     assert len(np.unique(given.positions, axis=0)) == 400 and np.all(given.densities > 0)
     np.testing.assert_allclose(given.densities[:, 0], 10 * given.densities[:, 1], rtol=1e-6)
-    assert given.densities[:, 0].min() * unit > 0.075 * 0.005
+    assert given.densities[:, 0].min() > 0.075 * LEAST_VALUE
     apart = np.linalg.norm(given.positions[:, None] - given.positions, axis=2)
     nearest = np.sort(apart, axis=1)[:, 1:4]
     np.testing.assert_allclose(given.scales[:, 1], np.sqrt((nearest**2).mean(1)), rtol=1e-5)
-    few = seed_splats(p.numpy(), GEOMETRY, dataclasses.replace(PAPER, n_splats=2))
+    few = seed_splats(objective.p, GEOMETRY, dataclasses.replace(PAPER, n_splats=2), response)
     assert len(few) == 2 and np.all(few.scales == 1.0)
 
 
-def test_a_short_run_is_a_shortened_long_one():
+def test_one_density_begins_with_the_same_line_integrals_whatever_its_energy():
+    def start(basis):
+        objective, parameters, response = problem(sphere(mu=1e-4, i0=1e9), dataclasses.replace(PAPER, basis=basis))
+        return objective.line_integrals(objective.paths(objective.activation.splats(parameters), 0), response)[0]
+
+    assert not start("constant").any()  # nothing is above 0.005 1/mm
+    objective, parameters, response = problem(sphere(), dataclasses.replace(PAPER, basis="photoelectric"))
+    splats = objective.activation.splats(parameters)
+    # ρb times its mean b is what the other basis begins with
+    constant = problem(sphere(), dataclasses.replace(PAPER, basis="constant"))
+    other = constant[0].activation.splats(constant[1]).densities
+    np.testing.assert_allclose(splats.densities * (response.eta @ response.b), other, rtol=1e-5)
+
+
+def test_a_short_run_begins_to_densify_as_late_as_a_long_one():
     long, short = PRESETS["paper"].times(), dataclasses.replace(PRESETS["paper"], steps=2000).times()
     assert (long.first, long.last, long.every) == (500, 15000, 100)
-    assert (short.first, short.last, short.every) == (50, 1500, 10) and short.pull == long.pull
-    assert dataclasses.replace(PRESETS["r2"], steps=60).times().every == 1
+    assert (short.first, short.last, short.every) == (500, 1500, 100) and short.pull == long.pull == 5e-5
 
 
-def test_settings_that_make_no_sense_are_refused():
-    with pytest.raises(InputError, match="steps"):
-        Settings(steps=0)
-    with pytest.raises(InputError, match="seconds"):
-        Settings(seconds=-1.0)
-    with pytest.raises(InputError, match="as many"):
-        Settings(channels="a")
-    with pytest.raises(InputError, match="positive"):
-        Settings(start=(0.1, 0.0))
-    with pytest.raises(InputError, match="device"):
-        published.r2(sphere(), device="cuda")
+def test_presets_change_as_told_and_none_leaves_them():
+    assert changed("paper", {}) == PRESETS["paper"] == Settings()
+    r2 = changed("r2", {"steps": None, "response": None, "seed": 3})
+    assert r2 == dataclasses.replace(PRESETS["r2"], seed=3) and (r2.steps, r2.channels, r2.tv_share) == (
+        30000,
+        "a",
+        0.05,
+    )
+    with pytest.raises(InputError, match="preset must be one of paper, r2"):
+        changed("fast", {})
+    with pytest.raises(InputError, match="no 'stepps'"):
+        reconstruct(sphere(), stepps=3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"steps": 0}, "steps"),
+        ({"seconds": -1.0}, "seconds"),
+        ({"held_out": -1}, "held_out"),
+        ({"patience": 0}, "patience"),
+        ({"basis": "water"}, "basis must be one of"),
+        ({"response": "tubes"}, "response must be one of"),
+        ({"response": "mono"}, "basis must be 'constant'"),
+        ({"response": "flat", "theta": (1.0, 1.0)}, "no theta"),
+        ({"readout": "soft"}, "hardened"),
+        ({"readout": 0.0}, "positive energy"),
+        ({"held_out": 20}, "below the 20 views"),
+        ({"theta": (2.0, 1.0)}, "theta"),
+        ({"device": "cuda"}, "device"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        reconstruct(sphere(), **changes)
+
+
+def test_poses_are_refused_in_a_sentence():
+    poses = tuple(tuple(row) for row in GEOMETRY.pose_array().tolist())
+    scan = dataclasses.replace(sphere(), geometry=msgspec.structs.replace(GEOMETRY, poses=poses))
+    with pytest.raises(InputError, match="FDK"):
+        reconstruct(scan, steps=1)

@@ -4,12 +4,14 @@ A unit is half the volume's widest side, so that the volume is [−1, 1]³; rate
 Positions stay mm, and P stays P: densities are learned per unit and divided by its length.
 """
 
+import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit, prange
 from numpy.typing import NDArray
-from scipy.special import expit
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -25,6 +27,7 @@ RATES = {"positions": 2e-4, "scales": 5e-3, "rotations": 1e-3, "densities": 0.01
 DECAY = 0.1  # of a rate over the whole run
 FIRST, SECOND, EPS = 0.9, 0.999, 1e-15
 SCALES = (0.0005, 0.5)  # units, R2-Gaussian's bounds
+ONE = np.float32(1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,13 +42,10 @@ class Activation:
 
     def splats(self, parameters: Parameters) -> Splats:
         """Return the splats that `parameters` stand for."""
-        low, high = self.bounds
-        scales = low + (high - low) * expit(parameters["scales"])
+        scales, densities = np.empty_like(parameters["scales"]), np.empty_like(parameters["densities"])
+        _activate(parameters["scales"], parameters["densities"], self._numbers(), scales, densities)
         return Splats(
-            positions=parameters["positions"],
-            scales=scales.astype(np.float32),
-            densities=(np.logaddexp(0, parameters["densities"]) / self.unit).astype(np.float32),
-            rotations=parameters["rotations"],
+            positions=parameters["positions"], scales=scales, densities=densities, rotations=parameters["rotations"]
         )
 
     def parameters(self, splats: Splats) -> dict[str, Array]:
@@ -71,15 +71,20 @@ class Activation:
         """Take a gradient by `splats` to their `parameters`."""
         if by_splats.rotations is None:
             raise InputError("the published methods learn rotations; expected a gradient in them")
-        low, high = self.bounds
-        share = (splats.scales - low) / (high - low)
-        inner = share * (1 - share) * (high - low) / splats.scales  # d log s/dx
+        scales, densities = np.empty_like(parameters["scales"]), np.empty_like(parameters["densities"])
+        given = (splats.scales, parameters["densities"], by_splats.log_scales, by_splats.densities)
+        _through(given, self._numbers(), scales, densities)
         return {
             "positions": by_splats.positions,
-            "scales": (by_splats.log_scales * inner).astype(np.float32),
+            "scales": scales,
             "rotations": by_splats.rotations,
-            "densities": (by_splats.densities * expit(parameters["densities"]) / self.unit).astype(np.float32),
+            "densities": densities,
         }
+
+    def _numbers(self) -> tuple[np.float32, np.float32, np.float32]:
+        """Return the least scale, the range of scales, and 1/unit."""
+        low, high = self.bounds
+        return np.float32(low), np.float32(high - low), np.float32(1 / self.unit)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,8 +109,8 @@ def activation(geometry: Geometry) -> Activation:
 
 def no_moments(parameters: Parameters) -> Moments:
     """Return the moments before the first step."""
-    zeros = {name: np.zeros_like(value) for name, value in parameters.items()}
-    return Moments(first=zeros, second=zeros)
+    first, second = ({name: np.zeros_like(value) for name, value in parameters.items()} for _ in range(2))
+    return Moments(first=first, second=second)
 
 
 def rate(start: float | Array, step: int, steps: int) -> float | Array:
@@ -113,19 +118,52 @@ def rate(start: float | Array, step: int, steps: int) -> float | Array:
     return start * DECAY ** (min(step, steps) / steps)
 
 
-def step(
-    parameters: Parameters, gradient: Parameters, moments: Moments, rates: Mapping[str, float | Array]
-) -> tuple[dict[str, Array], Moments]:
-    """Take one step of Adam (Kingma and Ba 2015) and return the new parameters and moments.
+def step(parameters: Parameters, gradient: Parameters, moments: Moments, rates: Mapping[str, float | Array]) -> Moments:
+    """Take one step of Adam (Kingma and Ba 2015): parameters and moments change in place; return them counted on.
 
-    `rates` are numbers, or arrays that broadcast, such as one rate a channel.
+    `rates` are numbers, or one a channel (the last axis).
     """
-    count, out, first, second = moments.steps + 1, {}, {}, {}
+    count = moments.steps + 1
+    corrections = np.float32(1 / (1 - FIRST**count)), np.float32(1 / (1 - SECOND**count))
     for name, value in parameters.items():
-        g = gradient[name]
-        first[name] = FIRST * moments.first[name] + (1 - FIRST) * g
-        second[name] = SECOND * moments.second[name] + (1 - SECOND) * g * g
-        root = np.sqrt(second[name] / np.float32(1 - SECOND**count)) + np.float32(EPS)
-        change = rates[name] / (1 - FIRST**count) * (first[name] / root)
-        out[name] = (value - change).astype(np.float32)
-    return out, Moments(first=first, second=second, steps=count)
+        n = value.shape[-1]
+        rows = [a if a.ndim == 2 else a[None] for a in (gradient[name], moments.first[name], moments.second[name])]
+        of_channel = np.full(n, rates[name], np.float32)
+        _step(value if value.ndim == 2 else value[None], rows[0], rows[1], rows[2], of_channel, corrections)
+    return dataclasses.replace(moments, steps=count)
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _step(values, gradient, first, second, rates, corrections):
+    of_first, of_second = corrections
+    for i in prange(values.shape[0]):
+        for c in range(values.shape[1]):
+            g = gradient[i, c]
+            m = np.float32(FIRST) * first[i, c] + np.float32(1 - FIRST) * g
+            v = np.float32(SECOND) * second[i, c] + np.float32(1 - SECOND) * g * g
+            first[i, c], second[i, c] = m, v
+            values[i, c] -= rates[c] * (m * of_first) / (math.sqrt(v * of_second) + np.float32(EPS))
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _activate(scales, densities, numbers, out_scales, out_densities):
+    low, span, per_unit = numbers
+    for i in prange(scales.shape[0]):
+        for k in range(scales.shape[1]):
+            out_scales[i, k] = low + span / (ONE + math.exp(-scales[i, k]))
+        for c in range(densities.shape[1]):
+            x = densities[i, c]
+            # log(1 + eˣ) without overflow
+            out_densities[i, c] = (max(x, np.float32(0)) + math.log1p(math.exp(-abs(x)))) * per_unit
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _through(given, numbers, out_scales, out_densities):
+    scales, densities, by_log_scales, by_densities = given
+    low, span, per_unit = numbers
+    for i in prange(scales.shape[0]):
+        for k in range(scales.shape[1]):
+            share = (scales[i, k] - low) / span
+            out_scales[i, k] = by_log_scales[i, k] * share * (ONE - share) * span / scales[i, k]  # d log s/dx
+        for c in range(densities.shape[1]):
+            out_densities[i, c] = by_densities[i, c] / (ONE + math.exp(-densities[i, c])) * per_unit

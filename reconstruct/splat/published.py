@@ -1,371 +1,246 @@
-"""The published splat methods as one loop: R²-Gaussian (Zha et al. 2024) and its polychromatic successor.
+"""The published splat methods: R²-Gaussian (Zha et al. 2024), its polychromatic successor, and the steps between.
 
-A step projects the splats into one view by EWA and takes a step of Adam down L1 + 0.25 (1 − SSIM). "paper" learns two
-densities a splat and the response's r and Ē_th; "r2" one density and no response, and adds 0.05 TV of a brick.
-
-R2-Gaussian scales scenes to [−1, 1]³. Here lengths stay mm and P stays P, which is not homogeneous once it is
-polychromatic, so densities are learned per unit, half the volume's widest side: v = unit·μ of the FDK volume. 0.005 is
-little then (water is near 0.7 in 60 mm): it keeps all but what FDK shows at or below air.
-
-Rates and the times of densification scale with the number of steps: a run of a tenth of the steps densifies as often,
-on a tenth of the views, and so adds as many splats to a fit that has come less far.
-
-Where the publications leave it open: clamped pixels are 0 in both images that a loss compares; SSIM's range is the
-greatest P; views come in a new random order each pass; TV pulls at densities only, not at places and shapes.
+A step projects the splats into one view by EWA and takes a step of Adam down L1 + 0.25 (1 − SSIM). What a preset says
+stands in `published_settings`, what a step does in `learner` and `objective`.
 """
 
 import dataclasses
 import math
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Unpack
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
-from ctsim import rng
 from ctsim.errors import InputError
-from ctsim.geometry import Geometry
 from ctsim.types import Scan, Status, Volume
-from reconstruct.fdk import fdk
-from reconstruct.log import line_integrals
-from reconstruct.splat import adam, densify
-from reconstruct.splat import response as responses
-from reconstruct.splat.adam import Activation, Array
-from reconstruct.splat.loss import SSIM_SHARE, TV_SHARE, brick, l1_ssim, total_variation
+from reconstruct.splat.adam import Array
+from reconstruct.splat.checkpoint import Checkpoint, identity_of
+from reconstruct.splat.learner import LEAST_VALUE, Learner, seed_splats, splats_of
 from reconstruct.splat.model import Splats
-from reconstruct.splat.project import Projector
-from reconstruct.splat.response import Response, make_response
-from reconstruct.splat.volume import voxelise, voxelise_adjoint
+from reconstruct.splat.objective import Objective
+from reconstruct.splat.published_settings import Changes, Settings, changed
+from reconstruct.splat.response import Response, basis_functions, tangent
+from reconstruct.splat.volume import voxelise
+from reconstruct.watch import Stopwatch
 
-NEIGHBOURS = 3  # whose distance is a splat's first scale
-LEAST_DENSITY = 1e-10  # per unit, to which densities are raised when they are learned anew
-Channels = Literal["a", "b", "ab"]
-OnStep = Callable[[int, float, float, int], None]
-"""Called after a step with its number, from 1, its loss, the seconds since the start, and the number of splats."""
+VIEWS = 12  # that the hardening of the read-out is measured in
+BETTER = 1e-3  # share by which held-out views must be met better to count
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """What a preset says; densities and lengths are per unit and in units.
+class Progress:
+    """Where a fit stands: `step` of `steps`, seconds so far and still to go, the loss before the last step.
 
-    `channels` are the path values that splats have a density for, `start` those densities as shares of v and
-    `density_rates` their learning rates, one each. `theta` starts the response, None its own start; it stays there
-    where `learn_response` is False. `e_max` (keV) replaces the scan's, for another γ. `schedule` is that of
-    `schedule_steps` steps. Raises InputError for values that make no sense.
+    `eta` [node] are the shares of the response, `splats` the number of splats.
     """
 
-    steps: int = 20_000
-    schedule_steps: int = 20_000
-    seed: int = 0
-    seconds: float = math.inf
-    response: responses.Name = "paper"
-    basis: responses.Basis = "paper"
-    nodes: int | None = None
-    theta: tuple[float, ...] | None = None
-    learn_response: bool = True
-    e_max: float | None = None
-    channels: Channels = "ab"
-    start: tuple[float, ...] = (0.075, 0.0075)
-    n_splats: int = 50_000
-    least_value: float = 0.005
-    ssim_share: float = SSIM_SHARE
-    tv_share: float = 0.0
-    rates: Mapping[str, float] = field(default_factory=lambda: dict(adam.RATES))
-    density_rates: tuple[float, ...] = (0.01, 0.1)
-    response_rate: float = 1e-3
-    schedule: densify.Schedule = field(default_factory=densify.Schedule)
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "schedule_steps", "n_splats"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not self.seconds >= 0:
-            raise InputError(f"seconds must be at least 0, got {self.seconds}")
-        if not len(self.channels) == len(self.start) == len(self.density_rates):
-            raise InputError(
-                f"channels {self.channels!r} need as many start values and rates, got {self.start} "
-                f"and {self.density_rates}"
-            )
-        if min(self.start) <= 0:
-            raise InputError(f"start must be positive, got {self.start}")
-
-    def times(self) -> densify.Schedule:
-        """Return the schedule for the number of steps."""
-        share, given = self.steps / self.schedule_steps, self.schedule
-        return dataclasses.replace(
-            given,
-            first=round(given.first * share),
-            last=round(given.last * share),
-            every=max(1, round(given.every * share)),
-        )
+    step: int
+    steps: int
+    seconds: float
+    remaining: float
+    loss: float
+    eta: NDArray[np.float64]
+    splats: int
 
 
-PRESETS = {
-    "paper": Settings(),
-    "r2": Settings(
-        steps=30_000,
-        schedule_steps=30_000,
-        response="mono",
-        channels="a",
-        start=(0.15,),
-        density_rates=(0.01,),
-        tv_share=TV_SHARE,
-    ),
-}
+OnProgress = Callable[[Progress], None]
 
 
-def paper(
-    scan: Scan,
-    *,
-    device: str = "cpu",
-    steps: int = 20_000,
-    seconds: float = math.inf,
-    seed: int = 0,
-    response: responses.Name = "paper",
-    e_max: float | None = None,
+def reconstruct(scan: Scan, *, device: str = "cpu", preset: str = "paper", **changes: Unpack[Changes]) -> Volume:
+    """Reconstruct by a preset, "paper" or "r2", with `changes` of its settings; attenuation in 1/mm.
+
+    Raises InputError as `changed` and `fit_published` do.
+    """
+    return fit_published(scan, changed(preset, changes), device=device)
+
+
+def fit_published(
+    scan: Scan, settings: Settings, *, device: str = "cpu", on_progress: OnProgress | None = None, every: int = 100
 ) -> Volume:
-    """Reconstruct by the polychromatic method as published; the volume is ρa + ρb, attenuation at Ē = 1 in 1/mm.
+    """Reconstruct `scan` with `settings`; `on_progress` is called after each `every` steps.
 
-    `response` is one of `make_response`, `e_max` (keV) replaces the scan's greatest energy. Raises InputError as
-    `fit_published` does.
-    """
-    settings = dataclasses.replace(
-        PRESETS["paper"], steps=steps, seconds=seconds, seed=seed, response=response, e_max=e_max
-    )
-    return fit_published(scan, settings, device=device)
-
-
-def r2(scan: Scan, *, device: str = "cpu", steps: int = 30_000, seconds: float = math.inf, seed: int = 0) -> Volume:
-    """Reconstruct by R2-Gaussian as published, 1/mm. Raises InputError as `fit_published` does."""
-    settings = dataclasses.replace(PRESETS["r2"], steps=steps, seconds=seconds, seed=seed)
-    return fit_published(scan, settings, device=device)
-
-
-def fit_published(scan: Scan, settings: Settings, *, device: str = "cpu", on_step: OnStep | None = None) -> Volume:
-    """Reconstruct `scan` with `settings`; the volume is the densities' sum, attenuation at Ē = 1 in 1/mm.
-
-    After `seconds` it returns what there is. Raises InputError for another device than the CPU, for poses (FDK seeds
-    the splats), and for a response that does not exist.
+    After the settings' seconds it returns what there is. `watch` is shown a volume each pass over the views, or at the
+    times it asks for. The volume's details hold "densities": the volumes of ρa and ρb [z, y, x] in 1/mm as "rho_a" and
+    "rho_b", those there are. Raises InputError for another device than the CPU, for poses (FDK seeds the splats), for a
+    response that does not exist, and for a checkpoint that is damaged.
     """
     if torch.device(device).type != "cpu":
         raise InputError(f"the published splat methods run on device 'cpu' only, got {device!r}")
-    began = time.perf_counter()
+    if settings.held_out >= scan.geometry.n_views:
+        raise InputError(f"held_out must be below the {scan.geometry.n_views} views, got {settings.held_out}")
+    stopwatch = Stopwatch()
     objective = Objective.of(scan, settings)
-    splats = seed_splats(objective.p, scan.geometry, settings)
-    e_max = scan.e_max if settings.e_max is None else settings.e_max
-    curve = make_response(
-        settings.response, e_max=e_max, basis=settings.basis, nodes=settings.nodes, theta=settings.theta
-    )
-    details: dict[str, Any] = {"read-out": "at Ē = 1", "clamped_pixels": int((~objective.valid).sum())}
+    response = settings.make_response(scan.e_max)
+    splats = seed_splats(objective.p, scan.geometry, settings, response)
+    clamped = int(objective.valid.size - objective.valid.sum())
     if not len(splats):
-        reason = f"no voxel of the FDK volume is above {settings.least_value:g} per unit, so there is no splat to fit"
-        details |= {"splats": 0, "view_updates": 0}
-        return Volume(values=torch.zeros(scan.geometry.n_voxel), reason=reason, details=details)
-    learner = _Learner(objective, splats, curve)
-    done, value = 0, math.nan
-    while done < settings.steps and time.perf_counter() - began < settings.seconds:
-        value = learner.step(done)
-        done += 1
-        if on_step is not None:
-            on_step(done, value, time.perf_counter() - began, len(learner))
-    found = learner.splats()
-    values = voxelise(found, scan.geometry, found.densities.sum(1, keepdims=True), mean=False)[0]
-    finite = bool(np.isfinite(values).all()) and (done == 0 or math.isfinite(value))
-    details |= {"splats": len(found), "view_updates": done, "seconds": time.perf_counter() - began}
-    details["response"] = {"name": curve.name, "theta": list(learner.response.trainable)}
-    return Volume(
-        values=torch.from_numpy(values),
-        status=Status.OK if finite else Status.NONFINITE,
-        reason="" if finite else "the reconstruction or its loss holds values that are not finite",
-        details=details,
-    )
+        reason = f"no voxel of the FDK volume is above {LEAST_VALUE:g} 1/mm, so there is no splat to fit"
+        details = {"clamped_pixels": clamped, "splats": 0, "view_updates": 0, "limitation": reason}
+        return Volume(values=torch.zeros(scan.geometry.n_voxel), details=details)
+    held_out = np.unique(np.linspace(0, scan.geometry.n_views - 1, settings.held_out + 2).round().astype(int)[1:-1])
+    views = np.setdiff1d(np.arange(scan.geometry.n_views), held_out)
+    run = _Run(Learner(objective, splats, response, views), held_out.tolist(), stopwatch)
+    if settings.checkpoints:
+        run.resume(Checkpoint(folder=Path(settings.checkpoints), identity=_identity(scan, settings)))
+    run.go(on_progress, every)
+    volume = run.volume()
+    volume.details["clamped_pixels"] = clamped
+    return volume
 
 
-def seed_splats(p: NDArray[np.float32], geometry: Geometry, settings: Settings) -> Splats:
-    """Draw voxels of the FDK volume of `p` [view, v, u] that are above the least value; the splats are sorted by z.
-
-    A scale is the root mean square distance to the three nearest others, the density a share of the voxel's.
-    """
-    volume, unit = fdk(torch.from_numpy(p), geometry).numpy(), adam.unit_length(geometry)
-    found = np.flatnonzero(volume.ravel() * unit > settings.least_value)
-    draws = rng.uniform(rng.stream_key(_scene(settings), "seeds", 0), found.size)[:, 0]
-    found = np.sort(found[np.argsort(draws, kind="stable")[: settings.n_splats]])
-    k, j, i = np.unravel_index(found, volume.shape)
-    z, y, x = geometry.voxel_centres()
-    positions = np.stack([x[i], y[j], z[k]], 1)
-    scales = np.full(len(found), max(geometry.d_voxel))
-    if len(found) > NEIGHBOURS:
-        distances, _ = KDTree(positions).query(positions, k=NEIGHBOURS + 1)
-        scales = np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1))
-    return Splats(
-        positions=positions.astype(np.float32),
-        scales=np.repeat(scales[:, None], 3, 1).astype(np.float32),
-        densities=(volume.ravel()[found][:, None] * np.array(settings.start)).astype(np.float32),
-        rotations=np.tile(np.array([1, 0, 0, 0], np.float32), (len(found), 1)),
-    )
+def _identity(scan: Scan, settings: Settings) -> str:
+    """Hash what the state of a run depends on, which its end, its read-out and where it is kept are not."""
+    return identity_of(scan, dataclasses.replace(settings, seconds=math.inf, readout=None, checkpoints=""))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Terms:
-    """A view's loss, its gradients by what is learned and by θ [T], and by the centres' places in pixels [splat]."""
+class _Run:
+    """A learner on its way to the end, which may be that of time or of what held-out views gain."""
 
-    loss: float
-    parameters: dict[str, Array]
-    theta: NDArray[np.float64]
-    centres: Array
+    def __init__(self, learner: Learner, held_out: list[int], stopwatch: Stopwatch) -> None:
+        self.learner, self.held_out, self.stopwatch = learner, held_out, stopwatch
+        self.settings, self.done, self.loss = learner.settings, 0, math.nan
+        self.checkpoint: Checkpoint | None = None
+        self.best: dict[str, NDArray[Any]] = {}
+        self.best_misfit, self.best_step, self.idle = math.inf, 0, 0
 
+    def go(self, on_progress: OnProgress | None, every: int) -> None:
+        """Take the steps that are left."""
+        settings, stopwatch = self.settings, self.stopwatch
+        while self.done < settings.steps and stopwatch.seconds < settings.seconds and self.idle < settings.patience:
+            self.loss = self.learner.step(self.done)
+            self.done += 1
+            whole = self.done % len(self.learner.views) == 0
+            if self.held_out and (whole or self.done == settings.steps):
+                self._judge()
+            if on_progress is not None and self.done % every == 0:
+                on_progress(self.progress())
+            stopwatch.show(self.done, self.values, whole=whole)
+            if self.checkpoint is not None and self.checkpoint.due():
+                self.checkpoint.write(self._state())
+        if self.checkpoint is not None:
+            if stopwatch.seconds < settings.seconds:
+                self.checkpoint.remove()
+            else:
+                self.checkpoint.write(self._state())
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Objective:
-    """The loss of one view: line integrals `p` and which of them count, `valid`, [view, v, u]."""
-
-    settings: Settings
-    projector: Projector
-    activation: Activation
-    p: NDArray[np.float32]
-    valid: NDArray[np.bool_]
-    data_range: float
-
-    @classmethod
-    def of(cls, scan: Scan, settings: Settings) -> "Objective":
-        """Take the logarithm of a scan."""
-        p, clamped = line_integrals(scan, slice(None))
-        valid = ~clamped.numpy()
-        return cls(
-            settings=settings,
-            projector=Projector(geometry=scan.geometry, tolerance=np.inf, box=False),
-            activation=adam.activation(scan.geometry),
-            p=p.numpy(),
-            valid=valid,
-            data_range=max(float(p.numpy().max(where=valid, initial=0.0)), 1e-6),
+    def progress(self) -> Progress:
+        """Say where the fit stands."""
+        seconds = self.stopwatch.seconds
+        left = seconds / self.done * (self.settings.steps - self.done)
+        return Progress(
+            step=self.done,
+            steps=self.settings.steps,
+            seconds=seconds,
+            remaining=min(left, max(0.0, self.settings.seconds - seconds)),
+            loss=self.loss,
+            eta=self.learner.response.eta,
+            splats=len(self.learner),
         )
 
-    def __call__(self, parameters: Mapping[str, Array], response: Response, view: int, step: int) -> Terms:
-        """Return the loss and gradients of `view`; `step` chooses the brick of TV."""
-        splats = self.activation.splats(parameters)
-        la, lb = self._paths(splats, view)
-        p, by_a, by_b = responses.evaluate(response, la, lb)
-        valid, n_u = self.valid[view], self.p.shape[2]
-        target, there = np.where(valid, self.p[view], 0), np.where(valid, p[:, :n_u], 0)
-        value, by_p = l1_ssim(there, target, self.data_range, self.settings.ssim_share)
-        pull = np.zeros_like(p)
-        pull[:, :n_u] = by_p * valid
-        slopes = {"a": by_a, "b": by_b}
-        images = np.stack([pull * slopes[c] for c in self.settings.channels])
-        by_splats = self.projector.gradient(splats, images, view)
-        if self.settings.tv_share:
-            tv, by_densities = self._tv(splats, step)
-            value += self.settings.tv_share * tv
-            by_splats = dataclasses.replace(by_splats, densities=by_splats.densities + by_densities)
-        return Terms(
-            loss=value,
-            parameters=self.activation.gradient(parameters, splats, by_splats),
-            theta=responses.theta_gradient(response, la, lb, pull),
-            centres=by_splats.centres,
-        )
+    def _judge(self) -> None:
+        """Keep the state that meets the held-out views best, and count the passes without one that is better."""
+        misfit = self.learner.objective.misfit(self.learner.splats(), self.learner.response, self.held_out)
+        self.idle += 1
+        if not misfit >= self.best_misfit * (1 - BETTER):
+            self.idle = 0
+        if not misfit >= self.best_misfit:
+            self.best, self.best_misfit, self.best_step = self.learner.state(), misfit, self.done
 
-    def _paths(self, splats: Splats, view: int) -> tuple[Array, Array]:
-        """Return La and Lb [v, u + 8]; a channel without densities is 0."""
-        given = self.projector.forward(splats.shapes(), splats.densities, [view])[0]
-        paths = dict(zip(self.settings.channels, given, strict=True))
-        zero = np.zeros_like(given[0])
-        return np.ascontiguousarray(paths.get("a", zero)), np.ascontiguousarray(paths.get("b", zero))
+    def _state(self) -> dict[str, NDArray[Any]]:
+        numbers = np.array([self.done, self.best_step, self.idle])
+        reals = np.array([self.stopwatch.seconds, self.loss, self.best_misfit])
+        best = {f"best.{name}": value for name, value in self.best.items()}
+        return {**self.learner.state(), **best, "run.numbers": numbers, "run.reals": reals}
 
-    def _tv(self, splats: Splats, step: int) -> tuple[float, Array]:
-        """Return TV of a brick of the volume per unit, and the settings' share of its gradient by densities (1/mm)."""
-        part = brick(self.projector.geometry, _scene(self.settings), step)
-        volume = voxelise(splats, part, splats.densities.sum(1, keepdims=True), mean=False)[0]
-        tv, by_volume = total_variation(volume * np.float32(self.activation.unit))
-        scaled = (by_volume * (self.settings.tv_share * self.activation.unit)).astype(np.float32)
-        return tv, voxelise_adjoint(splats, part, scaled[None], mean=False)
+    def resume(self, checkpoint: Checkpoint) -> None:
+        """Go on where the checkpoint stands, if it does, and keep it."""
+        self.checkpoint = checkpoint
+        if (state := checkpoint.read()) is None:
+            return
+        try:
+            self.learner.restore(state)
+            self.done, self.best_step, self.idle = state["run.numbers"].tolist()
+            seconds, self.loss, self.best_misfit = state["run.reals"].tolist()
+        except (KeyError, ValueError) as error:
+            raise InputError(f"checkpoint {checkpoint.path} is damaged ({error}): delete it to start anew") from None
+        self.best = {k.removeprefix("best."): v for k, v in state.items() if k.startswith("best.")}
+        self.stopwatch = Stopwatch(seconds + self.stopwatch.seconds)
 
+    def _found(self) -> tuple[Splats, Response]:
+        learner = self.learner
+        if not self.best:
+            return learner.splats(), learner.response
+        theta = self.best["theta"].astype(np.float64)
+        response = learner.response.with_theta(theta.tolist()) if self.settings.learns else learner.response
+        return splats_of(self.best, learner.objective.activation), response
 
-class _Learner:
-    """Splats and response on their way, with Adam's moments and the pulls since the last densification."""
+    def values(self) -> Array:
+        """Return the volume as it is, read out as settings say, [z, y, x] in 1/mm."""
+        splats, response = self.learner.splats(), self.learner.response
+        weights, _ = read_out(splats, response, self.learner.objective)
+        geometry = self.learner.objective.projector.geometry
+        return voxelise(splats, geometry, splats.densities @ weights[:, None], mean=False)[0]
 
-    def __init__(self, objective: Objective, splats: Splats, response: Response) -> None:
-        self.objective, self.response = objective, response
-        self.settings, self._schedule = objective.settings, objective.settings.times()
-        self._parameters = objective.activation.parameters(splats)
-        self._moments = adam.no_moments(self._parameters)
-        self._theta = {"theta": np.array(response.trainable, np.float32)}
-        self._theta_moments = adam.no_moments(self._theta)
-        self._forget(len(splats))
-
-    def __len__(self) -> int:
-        return len(self._pulls)
-
-    def splats(self) -> Splats:
-        """Return the splats as they are."""
-        return self.objective.activation.splats(self._parameters)
-
-    def step(self, done: int) -> float:
-        """Take the step after `done` steps; return the loss before it."""
-        n_views, n_u = len(self.objective.p), self.objective.p.shape[2]
-        turn, place = divmod(done, n_views)
-        draws = rng.uniform(rng.stream_key(_scene(self.settings), "views", turn), n_views)[:, 0]
-        view = int(np.argsort(draws, kind="stable")[place])
-        terms = self.objective(self._parameters, self.response, view, done)
-        self._pulls += densify.screen_pull(terms.centres, n_u)
-        self._seen += terms.centres > 0
-        rates = {name: adam.rate(start, done, self.settings.steps) for name, start in self._rates().items()}
-        self._parameters, self._moments = adam.step(self._parameters, terms.parameters, self._moments, rates)
-        if self.settings.learn_response and self.response.trainable:
-            self._learn_response(terms.theta, done)
-        if self._schedule.is_due(done + 1):
-            self._densify(done + 1)
-        return terms.loss
-
-    def _rates(self) -> dict[str, float | Array]:
-        unit = self.objective.activation.unit
-        densities = np.array(self.settings.density_rates, np.float32)
-        given = self.settings.rates
-        return {
-            "positions": given["positions"] * unit,
-            "scales": given["scales"],
-            "rotations": given["rotations"],
-            "densities": densities,
+    def volume(self) -> Volume:
+        """Return the result: what met held-out views best, if any are, else the last state."""
+        splats, response = self._found()
+        weights, how = read_out(splats, response, self.learner.objective)
+        densities = voxelise(splats, self.learner.objective.projector.geometry, mean=False)
+        values = np.einsum("c,czyx->zyx", weights, densities)
+        finite = bool(np.isfinite(values).all()) and (self.done == 0 or math.isfinite(self.loss))
+        details: dict[str, Any] = {
+            "read-out": how,
+            "splats": len(splats),
+            "view_updates": self.done,
+            "seconds": self.stopwatch.seconds,
+            "response": {"name": self.settings.response, "theta": list(response.trainable)},
+            "densities": {f"rho_{c}": density for c, density in zip(self.settings.channels, densities, strict=True)},
         }
-
-    def _learn_response(self, gradient: NDArray[np.float64], done: int) -> None:
-        rates = {"theta": adam.rate(self.settings.response_rate, done, self.settings.steps)}
-        by_theta = {"theta": gradient.astype(np.float32)}
-        self._theta, self._theta_moments = adam.step(self._theta, by_theta, self._theta_moments, rates)
-        low, high = self.response.bounds().T
-        self._theta = {"theta": np.clip(self._theta["theta"], low, high).astype(np.float32)}
-        self.response = self.response.with_theta(np.clip(self._theta["theta"].astype(np.float64), low, high).tolist())
-
-    def _densify(self, done: int) -> None:
-        activation, pull = self.objective.activation, self._pulls / np.maximum(self._seen, 1)
-        key = rng.stream_key(_scene(self.settings), "split", done)
-        splats, origin = densify.densify(self.splats(), pull, activation.unit, self._schedule, key)
-        splats, order = sorted_by_z(splats)
-        # a density that underflowed is no softplus; one channel may be 0 where the other is not
-        densities = np.maximum(splats.densities, np.float32(LEAST_DENSITY / activation.unit))
-        splats = dataclasses.replace(splats, densities=densities)
-        self._parameters = activation.parameters(splats)
-        self._moments = densify.carried(self._moments, origin[order])
-        self._forget(len(splats))
-
-    def _forget(self, n: int) -> None:
-        self._pulls, self._seen = np.zeros(n), np.zeros(n, np.int64)
+        if self.held_out:
+            details["held_out"] = {"views": self.held_out, "misfit": self.best_misfit, "step": self.best_step}
+        return Volume(
+            values=torch.from_numpy(values),
+            status=Status.OK if finite else Status.NONFINITE,
+            reason="" if finite else "the reconstruction or its loss holds values that are not finite",
+            details=details,
+        )
 
 
-def sorted_by_z(splats: Splats) -> tuple[Splats, NDArray[np.int64]]:
-    """Return the splats in the order of their height, which keeps neighbours near in memory, and that order."""
-    order = np.argsort(splats.positions[:, 2], kind="stable")
-    rotations = None if splats.rotations is None else splats.rotations[order]
-    return Splats(
-        positions=splats.positions[order],
-        scales=splats.scales[order],
-        densities=splats.densities[order],
-        rotations=rotations,
-    ), order
+def read_out(splats: Splats, response: Response, objective: Objective) -> tuple[Array, str]:
+    """Return by what each density counts in the volume, float32 [channel], and in words at which energy that is.
+
+    "hardened" reads what one more mm adds to P behind the median path of the rays that meet something: attenuation in
+    the beam as the object leaves it, which the data fix whatever the response is.
+    """
+    settings = objective.settings
+    if settings.basis == "constant":
+        return np.ones(1, np.float32), "one density for all energies"
+    if settings.readout == "hardened":
+        la, lb = _median_paths(splats, objective)
+        by_a, by_b = tangent(response, (la, lb), 1.0)
+        how = f"hardened by the object: behind La = {la:.3g}, Lb = {lb:.3g}"
+    elif settings.readout is None:
+        by_a, by_b, how = 1.0, 1.0, "at Ē = 1"
+    else:
+        a, b = basis_functions(np.array([settings.readout]), response.basis, response.e_max)
+        by_a, by_b, how = float(a[0]), float(b[0]), f"at {settings.readout:g} keV"
+    return np.array([{"a": by_a, "b": by_b}[c] for c in settings.channels], np.float32), how
 
 
-def _scene(settings: Settings) -> str:
-    return f"published-{settings.seed}"
+def _median_paths(splats: Splats, objective: Objective) -> tuple[float, float]:
+    """Return the medians of La and Lb over rays that meet something, where P is above a hundredth of its greatest."""
+    n_views = objective.projector.geometry.n_views
+    met: list[Array] = []
+    for view in np.unique(np.linspace(0, n_views - 1, min(VIEWS, n_views)).round().astype(int)):
+        paths = objective.paths(splats, int(view))[..., : objective.p.shape[2]]
+        both = np.stack([np.zeros_like(paths[0]), paths[0]]) if len(paths) == 1 else paths
+        met.append(both[:, objective.p[view] > 0.01 * objective.data_range])
+    rays = np.concatenate(met, 1)
+    if not rays.shape[1]:
+        return 0.0, 0.0
+    la, lb = np.median(rays, 1)
+    return float(la), float(lb)

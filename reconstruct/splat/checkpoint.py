@@ -1,0 +1,79 @@
+"""A long fit kept on disk while it runs, so that it can go on after an interruption to the same last bit."""
+
+import hashlib
+import io
+import time
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.durable import write_synced
+from ctsim.errors import InputError
+from ctsim.types import Scan
+
+EVERY = 60.0  # seconds from one writing to the next
+State = Mapping[str, NDArray[Any]]
+
+
+@dataclass(slots=True, kw_only=True)
+class Checkpoint:
+    """Arrays by name in `folder`, in a file that is named after what they belong to.
+
+    A file is replaced whole: after a crash it holds the old arrays or the new ones.
+    """
+
+    folder: Path
+    identity: str
+    _written: float = field(default_factory=time.perf_counter)
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.folder / f"{self.identity}.npz"
+
+    def due(self) -> bool:
+        """Say whether it is time to write."""
+        return time.perf_counter() - self._written >= EVERY
+
+    def write(self, state: State) -> None:
+        """Write arrays. Raises InputError where the folder cannot be written to."""
+        buffer, arrays = io.BytesIO(), dict[str, Any](state)
+        np.savez(buffer, **arrays)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_synced(self.path, buffer.getvalue())
+        except OSError as error:
+            raise InputError(f"checkpoint {self.path} cannot be written: {error}") from None
+        self._written = time.perf_counter()
+
+    def read(self) -> dict[str, NDArray[Any]] | None:
+        """Return what was written, None where nothing was. Raises InputError where it cannot be read or is damaged."""
+        try:
+            with self.path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
+                return {name: np.asarray(file[name]) for name in file.files}
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise InputError(f"checkpoint {self.path} cannot be read: {error}") from None
+        except (ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise InputError(f"checkpoint {self.path} is damaged ({error}): delete it to start anew") from None
+
+    def remove(self) -> None:
+        """Delete the file, if there is one."""
+        self.path.unlink(missing_ok=True)
+
+
+def identity_of(scan: Scan, settings: object) -> str:
+    """Hash what a fit depends on: the scan and the settings."""
+    digest = hashlib.blake2b(digest_size=16)
+    numbers = (scan.dark, scan.i0, scan.e_max, str(scan.counts.dtype))
+    digest.update(msgspec.json.encode((scan.geometry, numbers, settings)))
+    for array in (scan.counts, scan.flat):
+        digest.update(np.ascontiguousarray(array.numpy()).data)
+    return digest.hexdigest()
