@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from benchmarks.stress_cases import Case
     from benchmarks.stress_records import StressRecord
 
+CATALOGUE = "benchmarks.stress"
+"""The module whose `catalogue` the process that carries out the cases asks."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
@@ -89,7 +92,7 @@ def _work(left: "list[Case]", side: int, given: Arguments) -> None:
     from benchmarks.stress_worker import Worker
 
     commit, machine = host.commit(), host.host()  # of the code that is loaded, whatever is committed meanwhile
-    with Worker("benchmarks.stress", given.seconds) as worker, tqdm(left, unit="row", disable=not left) as bar:
+    with Worker(CATALOGUE, given.seconds) as worker, tqdm(left, unit="row", disable=not left) as bar:
         for case in bar:
             bar.set_postfix_str(f"{case.name}, {case.subject}")
             outcome = worker.run(case, side)

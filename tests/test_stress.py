@@ -1,0 +1,267 @@
+"""The stress suite: every case on the smallest grids, and that a case whose remedy is taken out is reported."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from stress_ends import ENDS, catalogue
+
+from baselines.known_spectrum import Beam
+from benchmarks import stress, stress_methods, stress_records, stress_simulator, stress_splats
+from benchmarks.methods import TABLE, find
+from benchmarks.stress_cases import Findings, carry_out
+from benchmarks.stress_scans import BONE, USUAL, WATER, example, geometry, in_air, rod
+from benchmarks.stress_worker import Worker
+from ctsim import plan
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+from ctsim.noise import Noise
+from ctsim.quadrature import gauss_rule
+from ctsim.spectrum import Tube
+from ctsim.types import Scanner
+from reconstruct import log
+from reconstruct.log import line_integrals
+from reconstruct.splat import level, method, ordered
+from reconstruct.splat.curve import MaterialCurve
+from reconstruct.splat.lattice import Lattice
+from reconstruct.splat.learner import seed_splats
+from reconstruct.splat.loss import l1_ssim
+from reconstruct.splat.objective import Objective
+from reconstruct.splat.published_settings import Settings
+from reconstruct.splat.response import make_response
+
+SMALLEST = 12
+# every scene meets a third of the methods here and every method a third of the scenes; the command runs all
+METHODS = [c for k, c in enumerate(stress_methods.cases()) if (k // len(TABLE) + k % len(TABLE)) % 3 == 0]
+CASES = [*stress_simulator.cases(), *stress_splats.cases(), *METHODS]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c.name}-{c.subject}")
+def test_a_case_is_as_expected(case):
+    outcome = carry_out(case, SMALLEST)
+    assert outcome.ok, outcome.found
+
+
+def test_every_method_and_kernel_has_its_cases():
+    by_subject = {}
+    for case in stress.catalogue():
+        by_subject.setdefault(case.subject, []).append(case.name)
+    assert set(by_subject) == {"simulator", "splat kernels", *TABLE}
+    assert all(len(names) == len(set(names)) for names in by_subject.values())
+    assert {case.subject for case in METHODS} == set(TABLE)
+    assert {case.name for case in METHODS} == {*stress_methods.SCENES, "threads"}
+
+
+# --- a case whose remedy is taken out ----------------------------------------------------------------
+
+
+def case_of(name, subject):
+    (found,) = [c for c in stress.catalogue() if (c.name, c.subject) == (name, subject)]
+    return found
+
+
+def test_without_a_floor_under_the_counts_the_dark_scan_is_reported(monkeypatch):
+    monkeypatch.setattr(log, "count_floor", lambda scan: 0.0)
+    for subject in ("fdk", "sirt"):
+        outcome = carry_out(case_of("all-zero-counts", subject), SMALLEST)
+        assert not outcome.ok and "NOT EXPECTED" in outcome.found
+
+
+def test_without_as_many_energies_as_it_takes_the_scan_is_reported(monkeypatch):
+    monkeypatch.setattr(plan, "energy_rule", lambda spectrum, detector, *_: gauss_rule(spectrum, detector, 2))
+    outcome = carry_out(case_of("k-edge", "simulator"), SMALLEST)
+    assert not outcome.ok and "|ΔP|" in outcome.found and "limit" in outcome.found
+
+
+def test_a_volume_that_depends_on_the_number_of_threads_is_reported(monkeypatch):
+    results = iter([np.zeros(3), np.ones(3)])
+    monkeypatch.setattr(stress_methods, "on_threads", lambda n, call: next(results))
+    monkeypatch.setattr(stress_methods, "thread_counts", lambda: [1, 2])
+    outcome = carry_out(case_of("threads", "fdk"), SMALLEST)
+    assert not outcome.ok and "differ" in outcome.found
+
+
+# --- how rows end ------------------------------------------------------------------------------------
+
+
+def test_a_hang_a_crash_and_a_warning_are_failed_rows_and_the_rest_goes_on():
+    ends = {run.__name__: end for run, end in ENDS.items()}
+    with Worker("stress_ends", seconds=60.0) as worker:
+        for case in catalogue():
+            worker.seconds = 1.0 if case.name == "hanging" else 60.0
+            outcome = worker.run(case, 12)
+            ok, words = ends[case.name]
+            assert outcome.ok is ok and words in outcome.found, outcome
+            assert ok or "NOT EXPECTED" in outcome.found
+
+
+def test_an_infinite_value_and_a_missing_refusal_are_found():
+    found = Findings()
+    found.finite("the volume", np.array([1.0, np.inf]))
+    found.refused("wrong", lambda: None)
+    found.refused("number", lambda: stress_methods.find("nosuch"))
+    assert [bool(w) for w in found.wrong] == [True] * 3 and "1 of 2" in found.wrong[0]
+
+
+class Sober:
+    """Carries out the cases of this module here, and counts."""
+
+    ran = 0
+
+    def __init__(self, *_):
+        pass
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def run(self, case, side):
+        Sober.ran += 1
+        return carry_out(case, side)
+
+
+@pytest.fixture
+def command(monkeypatch, tmp_path):
+    monkeypatch.setattr("benchmarks.stress_worker.Worker", Sober)
+    monkeypatch.setattr(stress, "catalogue", lambda: catalogue()[:3])
+    Sober.ran = 0
+    return lambda *words: stress.main([str(tmp_path / "out"), "--short", *words])
+
+
+def test_the_command_says_what_is_wrong_and_runs_only_what_is_missing(command, tmp_path, capsys):
+    assert command("--dry-run") == 0 and "3 of 3 rows" in capsys.readouterr().out
+    assert not (tmp_path / "out").exists()
+    assert command() == 1 and Sober.ran == 3
+    assert "NOT AS EXPECTED: raising, test: NOT EXPECTED: ValueError" in capsys.readouterr().out
+    text = (tmp_path / "out" / "stress.md").read_text(encoding="utf-8")
+    assert "1 of 3 rows are as expected" in text and "| wrong | test | w | e | NOT EXPECTED: a number nan" in text
+    with (tmp_path / "out" / "stress.jsonl").open("ab") as file:
+        file.write(b'{"identity": "torn')  # as a power cut leaves it
+    assert command() == 1 and Sober.ran == 5  # what failed is tried again
+    assert command("--case", "fine") == 0 and Sober.ran == 5
+    assert command("--case", "fine", "--force") == 0 and Sober.ran == 6
+    assert len(stress_records.read(tmp_path / "out" / "stress.jsonl")) == 6
+    with pytest.raises(InputError, match="did you mean fine"):
+        command("--case", "fina")
+    with pytest.raises(InputError, match="seconds must be positive"):
+        command("--seconds", "0")
+    (tmp_path / "out" / "stress.jsonl").write_bytes(b"{}\n")
+    with pytest.raises(InputError, match="line 1: expected a row"):
+        command()
+
+
+def test_changed_code_or_expectations_are_run_anew():
+    case = catalogue()[0]
+    known = stress_records.identity_of(case, 12)
+    others = [dataclasses.replace(case, code="new"), dataclasses.replace(case, expected="better")]
+    assert len({known, stress_records.identity_of(case, 13), *(stress_records.identity_of(c, 12) for c in others)}) == 4
+
+
+@pytest.mark.parametrize("kvp", [20.0, 33.3, 90.0, 300.0])
+def test_a_scan_finds_the_table_of_its_tube(kvp):
+    given = scan_of(tube=Tube(kvp=kvp)).scan
+    assert Beam.of(given, None, None).tube.kvp == kvp
+
+
+# --- hazards of splats that other tests do not show --------------------------------------------------
+
+
+def scan_of(*solids, side=SMALLEST, **scanner):
+    return example(Scanner(geometry=geometry(side), **scanner), in_air(solids or USUAL))
+
+
+def error(given):
+    return given.error(find("splat").reconstruct(given.scan, "cpu").values.numpy())
+
+
+def test_dead_pixels_are_left_out_by_weight_0(monkeypatch):
+    """A pixel that never sees anything has P = 0, as an open one: counted in, it carves the object away."""
+    given = scan_of(noise=Noise(dead_fraction=0.02))
+    masked = error(given)
+    monkeypatch.setattr(method, "padded", lambda g, p, valid: level.padded(g, p, np.ones_like(valid)))
+    # 0.14 and 0.45: what is carved away scores as an empty volume does
+    assert masked < 0.2 < 2 * masked < error(given)
+
+
+def test_starved_rays_count_for_little(monkeypatch):
+    """Iron at a thousand photons: rays behind it say nothing but noise, at unit weight as loudly as the others."""
+    given = scan_of(WATER, BONE, rod("Fe", 5.0, at=(9.0, 2.0)), i0=1e3)
+    weighted = error(given)
+
+    def unweighted(g, p, valid):
+        data = level.padded(g, p, valid)
+        data.weights[..., : g.n_detector[1]] = valid
+        return data
+
+    monkeypatch.setattr(method, "padded", unweighted)
+    assert 1.4 * weighted < error(given)  # 0.16 and 0.29
+
+
+def test_ssim_has_one_range_for_all_views():
+    """With a range of its own a view of air and noise would weigh as much as one of iron."""
+    given = scan_of(WATER, rod("Fe", 5.0))
+    objective = Objective.of(given.scan, Settings())
+    assert objective.data_range == objective.p[objective.valid].max() > 4
+    noise = np.random.Generator(np.random.Philox(key=1)).normal(0, 0.01, (24, 24))
+    (shared, _), (own, _) = (l1_ssim(np.zeros_like(noise), noise, r) for r in (objective.data_range, noise.max()))
+    assert shared < 0.01 < 20 * shared < own
+
+
+def test_seeds_lie_in_the_middle_of_voxels(monkeypatch):
+    """A shift by half a voxel, as R²-Gaussian's seeding has it, moves their mean off a centred object's axis."""
+    given = scan_of(WATER)
+    p, _ = line_integrals(given.scan, slice(None))
+    settings = Settings()
+    response = settings.make_response(90.0)
+
+    def off_axis():
+        seeds = seed_splats(p.numpy(), given.scan.geometry, settings, response)
+        mean = np.average(seeds.positions, axis=0, weights=seeds.densities[:, 0])
+        return float(np.linalg.norm(mean[:2])) / given.scan.geometry.d_voxel[1]
+
+    assert off_axis() < 0.1
+    centres = Geometry.voxel_centres
+    monkeypatch.setattr(
+        Geometry, "voxel_centres", lambda g: tuple(a + d / 2 for a, d in zip(centres(g), g.d_voxel, strict=True))
+    )
+    assert off_axis() > 0.4
+
+
+def test_the_step_is_that_of_a_majoriser(monkeypatch):
+    """The Hessian's own diagonal is none: a ray's splats all make up for what it lacks, each on its own."""
+    monkeypatch.setattr(ordered, "LEAST_SUBSETS", 1)  # one subset of all views: plain descent
+    monkeypatch.setattr(ordered, "SUBSET", 16)
+    given = scan_of(WATER, side=8).scan
+
+    def fit():
+        p, clamped = line_integrals(given, slice(None))
+        response = make_response("tube", e_max=given.e_max, basis="klein-nishina")
+        lattice = Lattice(geometry=given.geometry, support=np.ones(given.geometry.n_voxel, bool))
+        curve = MaterialCurve.of(response, 20.0)
+        u = np.full(len(lattice), curve.water, np.float32)
+        data = level.padded(given.geometry, p.numpy(), ~clamped.numpy())
+        return ordered.Fit(data=data, lattice=lattice, response=response, curve=curve, u=u, tv=0.0)
+
+    def misfits(found):
+        out = []
+        for _ in range(6):
+            found.run(1, lambda _: True)
+            out.append(found.misfit)
+        return np.array(out)
+
+    falling = misfits(fit())
+    assert np.all(np.diff(falling) < 0) and falling[-1] < 0.2 * falling[0]
+    found = fit()
+    ones = np.ones((1, 1), np.float32)
+    unit_images = [found._projector.forward(found._shapes[:, k : k + 1].copy(), ones)[:, 0] for k in range(8**3)]
+    diagonal = np.array([(found.data.weights * image**2).sum() for image in unit_images]) / found.lattice.unit
+    move = ordered.Fit._move
+
+    def jacobi(self, gradient, curvature, n_views):
+        held = np.maximum(self.u, np.float32(ordered.FAINT * self.curve.water))
+        move(self, gradient, (held * diagonal).astype(np.float32), n_views)
+
+    monkeypatch.setattr(ordered.Fit, "_move", jacobi)
+    assert misfits(found).max() > 2 * falling[0]
