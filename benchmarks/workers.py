@@ -7,6 +7,7 @@ job must be one that can be repeated.
 
 import contextlib
 import importlib
+import logging
 import multiprocessing
 import os
 import signal
@@ -15,6 +16,7 @@ import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from multiprocessing import connection
 from typing import Any, Protocol, Self
@@ -216,8 +218,11 @@ class Cluster:
             self._dask: Any = importlib.import_module("distributed")
         except ImportError:
             raise InputError("--scheduler needs the package distributed: pip install 'ctsim[cluster]'") from None
+        for name in ("distributed", "distributed.client"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters is said by our errors
+        self._address = address
         try:
-            self._client = self._dask.Client(address, timeout=CONNECT, set_as_default=False)
+            self._client = self._dask.Client(address, timeout=CONNECT)
         except (OSError, ValueError) as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             raise InputError(
@@ -231,7 +236,13 @@ class Cluster:
         self._client.close()  # what nobody waits for any more is not begun
 
     def answers(self, function: Function, jobs: Sequence[Any]) -> Answers:
-        """See `Pool`."""
+        """See `Pool`. Raises InputError when the scheduler is gone."""
+        try:
+            yield from self._answers(function, jobs)
+        except (CancelledError, self._dask.comm.CommClosedError) as error:
+            raise InputError(f"--scheduler {self._address}: it is gone; the same command goes on from here") from error
+
+    def _answers(self, function: Function, jobs: Sequence[Any]) -> Answers:
         waiting, running = deque(range(len(jobs))), {}
         while waiting or running:
             for address in self._client.nthreads().keys() - {address for _, address in running.values()}:

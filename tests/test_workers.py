@@ -1,5 +1,6 @@
 """Several processes and a Dask cluster give what one process gives, also when one of them is killed at work."""
 
+import json
 import os
 import signal
 import subprocess
@@ -141,7 +142,7 @@ def cluster():
     dask.config.set({"distributed.scheduler.allowed-failures": 1})
     with (
         LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL") as found,
-        Client(found) as client,
+        Client(found, set_as_default=False) as client,
     ):
         yield found.scheduler_address, client
 
@@ -242,6 +243,19 @@ def test_workers_that_cannot_be_had_are_one_sentence(serial, tmp_path, monkeypat
         error = capsys.readouterr().err
         assert said in error and error.count("\n") == 1
     assert not (tmp_path / "data").exists() and not (tmp_path / "results").exists()
+
+
+def test_a_scheduler_that_goes_is_one_sentence(tmp_path):
+    file = tmp_path / "scheduler.json"
+    command = ("-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard", "--scheduler-file", file)
+    with subprocess.Popen([sys.executable, *command], stderr=subprocess.DEVNULL) as scheduler:
+        until(file.exists)
+        with Cluster(json.loads(file.read_text())["address"]) as pool:
+            answers = pool.answers(job, ["one"])
+            assert next(answers) is None  # no worker has come yet
+            scheduler.kill()
+            with pytest.raises(InputError, match="it is gone"):
+                list(answers)
 
 
 def test_a_cluster_without_the_package_is_one_sentence(monkeypatch):
