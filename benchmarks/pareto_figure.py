@@ -61,4 +61,6 @@ def _scene(axes: Axes, every: Sequence[Point]) -> None:
     x, y = AXES[setting.part]
     axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y, title=f"{setting.part}, {setting.scene}")
     axes.grid(which="both", alpha=0.2)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")
     axes.legend(handles=handles, loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=8, frameon=False)

@@ -133,10 +133,13 @@ def runs(found: Sequence[Timed]) -> Counter[str]:
 
 
 def latest(found: Sequence[Timed]) -> list[Timed]:
-    """Keep what a table shows: of each choice the runs of its newest identity, on the machine of the last record."""
-    if not found:
-        return []
-    mine = [t for t in found if (t.setting.machine, t.setting.version) == (found[-1].setting.machine, VERSION)]
+    """Keep what a table shows: of each choice the runs of its newest identity, on the machine its scene was last on."""
+    machine = {(t.setting.part, t.setting.scene): t.setting.machine for t in found}
+    mine = [
+        t
+        for t in found
+        if t.setting.version == VERSION and t.setting.machine == machine[t.setting.part, t.setting.scene]
+    ]
     newest = {_place(t.setting): t.setting.identity for t in mine}
     return [t for t in mine if newest[_place(t.setting)] == t.setting.identity]
 
@@ -184,9 +187,13 @@ def at_knee(of: Sequence[Point]) -> Point | None:
 
 
 def recommended(of: Sequence[Point]) -> Point:
-    """Return the fastest point that is near the least error; of the simulator, whose error falls on and on, the knee.
+    """Return the setting to take: of methods the fastest near the least error of all.
 
-    A front without a knee has the first.
+    Of the simulator's choices it is the knee of the default's own curve, if there is one: its error falls on and on,
+    and what other curves differ in shows in another error.
     """
-    found = at_knee(of) if of[0].setting.part == "simulator" else None
-    return enough(of) if found is None else found
+    if of[0].setting.part == "methods":
+        return enough(of)
+    usual = {p.setting.curve for p in of if p.default}
+    mine = [p for p in of if not usual or p.setting.curve in usual]
+    return at_knee(mine) or enough(mine)

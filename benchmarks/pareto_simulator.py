@@ -39,9 +39,8 @@ USUAL = 1.5  # of the bundled suites
 FINER, FINEST = 16, 64
 """Of the reference: finer pixels along a side of a pixel, and rays in each."""
 CALM = 1e-4  # |ΔP| of the central ray alone, below which a pixel has no edge
-PROJECTIONS, SCATTER = "projections", "scatter, against the highest level"
 LEVELS: tuple[int, ...] = typing.get_args(typing.get_type_hints(Scatter)["level"])
-EXACT, BODY, VOXELS = "exact solids", "body in voxels, metal exact", "all in voxels"
+EXACT, BODY, VOXELS, SCATTER = "exact solids", "body in voxels, metal exact", "all in voxels", "scatter"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,8 +57,8 @@ class Choice:
 
     @property
     def group(self) -> str:
-        """Choices of one group have one reference."""
-        return SCATTER if self.curve == SCATTER else PROJECTIONS
+        """What is compared: whether there is a closed form is the scene's matter, so voxels do not rival solids."""
+        return SCATTER if self.curve == SCATTER else EXACT if self.grid is None else "voxels"
 
 
 def choices() -> list[Choice]:
@@ -67,8 +66,8 @@ def choices() -> list[Choice]:
     usual = Simulation()
     found = [
         Choice(
-            curve=f"{EXACT}, tolerance {tolerance:.0e}",
-            label=f"{subrays} sub-rays",
+            curve=f"tolerance {tolerance:.0e}",
+            label=f"{subrays} sub-ray{'s' * (subrays > 1)}",
             simulation=Simulation(tolerance=tolerance, subrays=subrays),
             default=(tolerance, subrays) == (usual.tolerance, usual.subrays),
         )
@@ -76,7 +75,7 @@ def choices() -> list[Choice]:
         for subrays in sorted({*SUBRAYS, usual.subrays})
     ]
     whole = Simulation(skip=False)
-    found.append(Choice(curve=f"{EXACT}, nothing skipped", label=f"{usual.subrays} sub-rays", simulation=whole))
+    found.append(Choice(curve="nothing skipped", label=f"{usual.subrays} sub-rays", simulation=whole))
     found += [
         Choice(curve=curve, label=f"{round(grid * SIDE)}³ labels", grid=grid, metal=metal, default=default)
         for curve, metal in ((BODY, False), (VOXELS, True))
@@ -138,7 +137,7 @@ class Bench:
         views = [images["noise_free"] for _, images in simulate_views(plan, phantom, scanner)]
         seconds = time.perf_counter() - start
         found = np.stack([views[k] for k in self.checked])
-        s = open_fraction(_scatter(max(LEVELS)), scanner.geometry) if choice.group == SCATTER else 0.0
+        s = open_fraction(_scatter(max(LEVELS)), scanner.geometry) if choice.curve == SCATTER else 0.0
         label = f"{choice.label}, {len(plan.rule.energies)} energies"
         return (Mark(label=label, seconds=seconds, values=self.errors(found, s), default=choice.default),)
 

@@ -34,12 +34,14 @@ ABOUT: dict[Part, str] = {
 
 def summary(found: Sequence[Timed]) -> str:
     """Render the fronts, the defaults and each curve's knee; what failed or was skipped stands below."""
-    out = [_provenance(found), ""]
-    about = set()
+    out: list[str] = []
+    about = ""
     for group in groups(points(found)):
-        part = group[0].setting.part
-        out += [] if part in about else [f"Error of {part}: {ABOUT[part]}.", ""]
-        about.add(part)
+        part, scene = group[0].setting.part, group[0].setting.scene
+        mine = [t for t in found if (t.setting.part, t.setting.scene) == (part, scene)]
+        if (head := f"{_provenance(mine)} Error of {part}: {ABOUT[part]}.") != about:
+            out += [head, ""]
+            about = head
         defaults = [*_defaults(group), ""] if len(LOWER[part]) > 1 else []
         out += [*_front(group), "", *defaults, *_curves(group), ""]
     bad = failures(found)
@@ -83,9 +85,8 @@ def _title(group: Sequence[Point]) -> str:
 
 
 def _front(group: Sequence[Point]) -> Iterator[str]:
-    """Yield the table of the group's front in its main error."""
-    part = group[0].setting.part
-    marked = {"knee": at_knee(group), "**recommended**": recommended(group)}
+    """Yield the table of the group's front in its main error, and what is recommended."""
+    part, corner = group[0].setting.part, at_knee(group)
     yield f"### {_title(group)}"
     yield ""
     yield f"The front, in {HEADS[part][ERROR[part]]}:"
@@ -93,16 +94,19 @@ def _front(group: Sequence[Point]) -> Iterator[str]:
     yield from _head("curve", "setting", "s", *HEADS[part].values(), "")
     for k in front([p.pair for p in group]):
         p = group[k]
-        note = ", ".join(name for name, marked_one in marked.items() if marked_one is p)
-        yield _row(p.setting.curve, _named(p), _s(p), *_values(p), note)
+        yield _row(p.setting.curve, _named(p), _s(p), *_values(p), "knee" if p is corner else "")
+    yield ""
+    yield f"Recommended: {_short(recommended(group))}."
 
 
 def _defaults(group: Sequence[Point]) -> Iterator[str]:
-    """Yield a line for every default: on the front, or what beats it."""
+    """Yield a line for every default: on the front, or what beats it, in an error alone and in all at once."""
+    keys = LOWER[group[0].setting.part]
     for k, p in enumerate(group):
         if p.default:
-            words = [_beaten(group, k, key) for key in LOWER[p.setting.part]]
-            yield f"- {p.setting.curve}, {_named(p)}: {'; '.join(words)}."
+            better = [q for q in group if q is not p and _beats(q, p, keys)]
+            joint = f"beaten by {_short(better[0])}" if better else "beaten by none"
+            yield f"- Default {_short(p)}: {_beaten(group, k, keys[0])}; in all errors at once {joint}."
 
 
 def _beaten(group: Sequence[Point], k: int, key: str) -> str:
@@ -111,7 +115,13 @@ def _beaten(group: Sequence[Point], k: int, key: str) -> str:
     if k in front(pairs):
         return f"on the front in {name}"
     best, share = beaten_by(pairs, k)
-    return f"off it in {name} ({_short(group[best])} is no worse in {share:.2f} of the time)"
+    return f"off the front in {name} ({_short(group[best])} is no worse in {share:.2f} of the time)"
+
+
+def _beats(q: Point, p: Point, keys: Sequence[str]) -> bool:
+    """Whether `q` is no slower than `p` and no worse in any error, and better in one of these."""
+    pairs = [(q.pair[0], p.pair[0]), *((q.values[key], p.values[key]) for key in keys)]
+    return all(a <= b for a, b in pairs) and any(a < b for a, b in pairs)
 
 
 def _curves(group: Sequence[Point]) -> Iterator[str]:

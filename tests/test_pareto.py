@@ -130,6 +130,9 @@ def test_a_table_shows_the_newest_code_on_the_last_machine():
     old, new, other = setting(code="1"), setting(code="2"), setting("b", machine="another")
     found = [timed(other, ("b", 1, 1)), timed(old, ("a", 1, 1)), timed(new, ("a", 2, 1)), timed(new, ("a", 4, 1))]
     assert [p.seconds for p in points(latest(found))] == [(2.0, 4.0)]
+    # another scene may have been measured elsewhere
+    elsewhere = setting("c", scene="t", machine="another")
+    assert len(latest([timed(elsewhere, ("c", 1, 1)), *found])) == 3
     assert runs(found) == Counter({old.identity: 1, new.identity: 2, other.identity: 1})
 
 
@@ -308,27 +311,28 @@ def test_simulator_end_to_end(tmp_path, monkeypatch, capsys, bench):
     monkeypatch.setattr(pareto_simulator, "Bench", lambda: bench)
     assert pareto.main([str(tmp_path), "--part", "simulator", "--repeats", "1"]) == 0
     text = capsys.readouterr().out
-    assert "### simulator, rods: projections (16² pixels, 4 views)" in text
+    assert "### simulator, rods: exact solids (16² pixels, 4 views)" in text
     # each default has its verdict in each error
-    verdicts = [line for line in text.splitlines() if line.startswith("- ") and "(default)" in line]
+    verdicts = [line for line in text.splitlines() if line.startswith("- Default ")]
     assert len(verdicts) == sum(c.default for c in few)
-    assert all(line.count("on the front in") + line.count("off it in") == 3 for line in verdicts)
+    assert all(line.count("the front in relative RMS") == line.count("in all errors at once") == 1 for line in verdicts)
 
 
 def test_verdicts_name_what_beats_a_default():
-    rows = [("a", 1.0, 0.5), ("b", 2.0, 0.5), ("c", 4.0, 0.1)]
-    of = [timed(setting(label, part="simulator"), (label, s, e)) for label, s, e in rows]
-    everything = {"rms": 0.0, "worst": 1.0, "off_edges": 1.0}
-    of = [
-        msgspec.structs.replace(
-            t,
-            marks=tuple(msgspec.structs.replace(m, values=everything | m.values, default=True) for m in t.marks),
-        )
-        for t in of
+    def row(label, seconds, rms, worst):
+        mark = Mark(label=label, seconds=seconds, default=True, values={"rms": rms, "worst": worst, "off_edges": 1.0})
+        return msgspec.structs.replace(timed(setting(label, part="simulator", curve="x")), marks=(mark,))
+
+    # b is as good as a but slower; c is better than all; d is beaten in rms alone
+    of = [row("a", 1.0, 0.5, 0.5), row("b", 2.0, 0.5, 0.5), row("c", 4.0, 0.1, 0.4), row("d", 5.0, 0.2, 0.3)]
+    lines = [line for line in pareto_table.summary(of).splitlines() if line.startswith("- Default")]
+    name = "the front in relative RMS of P"
+    assert lines == [
+        f"- Default x, a: on {name}; in all errors at once beaten by none.",
+        f"- Default x, b: off {name} (x, a is no worse in 0.50 of the time); in all errors at once beaten by x, a.",
+        f"- Default x, c: on {name}; in all errors at once beaten by none.",
+        f"- Default x, d: off {name} (x, c is no worse in 0.80 of the time); in all errors at once beaten by none.",
     ]
-    text = pareto_table.summary(of)
-    assert "- fdk, b (default): off it in relative RMS of P (fdk, a is no worse in 0.50 of the time)" in text
-    assert "- fdk, c (default): on the front in relative RMS of P; off it in worst |ΔP| (fdk, a" in text
     assert pareto_figure.draw(points(of)).axes
 
 
