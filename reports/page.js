@@ -70,11 +70,9 @@ function nearest(values, wanted) {
 
 function obey() {
   const asked = new URLSearchParams(location.hash.slice(1));
-  for (const scene of scenes) {
-    const slice = parseFloat(asked.get("slice"));
-    show(scene, Number.isNaN(slice) ? scene.images.start : nearest(scene.images.z, slice));
-  }
-  const radio = document.querySelector(`input[name=show][value="${CSS.escape(asked.get("show") ?? "both")}"]`);
+  const slice = parseFloat(asked.get("slice"));
+  if (!Number.isNaN(slice)) scenes.forEach((scene) => show(scene, nearest(scene.images.z, slice)));
+  const radio = all("input[name=show]").find((input) => input.value === asked.get("show"));
   if (radio) { radio.checked = true; look(radio.value); }
   const [name, column] = (asked.get("sort") ?? "").split(".");
   const table = document.getElementById(`table-${name}`)?.querySelector("table");
@@ -89,4 +87,5 @@ all("input[name=method]").forEach((box) => box.addEventListener("change", () => 
   all(".tile").filter((tile) => tile.dataset.method === box.value).forEach((tile) => { tile.hidden = !box.checked; });
 }));
 window.addEventListener("hashchange", obey);
+scenes.forEach((scene) => show(scene, scene.images.start));
 obey();

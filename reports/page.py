@@ -34,6 +34,7 @@ TITLES = {
     "anchored": "Anchored scores and harm",
     "cost": "Cost",
 }
+_BOX = '<input type="checkbox" autocomplete="off"'  # a reloaded page starts anew
 SIGNED_STOPS = 17  # of the error colours; the browser interpolates between them
 
 
@@ -78,7 +79,7 @@ def _asset(name: str) -> str:
 
 
 def _table(name: str, text: str) -> str:
-    return f'<div id="table-{html.escape(name)}">{markdown.to_html(text)}</div>'
+    return f'<div id="table-{html.escape(name.replace(" ", "-"))}">{markdown.to_html(text)}</div>'
 
 
 def _folded(name: str, text: str) -> str:
@@ -96,19 +97,20 @@ def _slices(scenes: list[str], cases: list[Case]) -> str:
     labels = dict.fromkeys(kept.record.label for case in cases for kept in case.kept)
     radios = (("both", "volumes and errors"), ("volume", "volumes"), ("error", "errors"))
     show = "".join(
-        f'<label><input type="radio" name="show" value="{value}"{" checked" * (value == "both")}>{text}</label>'
+        f'<label><input type="radio" autocomplete="off" name="show" value="{value}"'
+        f"{' checked' * (value == 'both')}>{text}</label>"
         for value, text in radios
     )
     boxes = "".join(
-        f'<label><input type="checkbox" name="method" value="{html.escape(label)}" checked>{html.escape(label)}</label>'
+        f'<label>{_BOX} name="method" value="{html.escape(label)}" checked>{html.escape(label)}</label>'
         for label in labels
     )
     return (
         '<p class="caption">Errors are volume minus effective-spectrum reference. Slices normal to z, row 0 at the '
         "bottom, cropped to the judged body, in 8 bits over the stated window. Metal is outlined, and grey in the "
-        "errors because it is not judged.</p>"
+        "errors because it is not judged. Of several seeds of a scene the first is shown.</p>"
         f'<fieldset class="look">{show}'
-        '<label><input type="checkbox" name="ring" checked>metal outline</label></fieldset>'
+        f'<label>{_BOX} name="ring" checked>metal outline</label></fieldset>'
         f'<details><summary>Methods</summary><fieldset class="look">{boxes}</fieldset></details>' + "".join(scenes)
     )
 
@@ -122,7 +124,8 @@ def _scene(case: Case, frame: slices.Frame, done: Callable[[], Any]) -> str:
     data = json.dumps(_images(case, frame, start, done), separators=(",", ":")).replace("<", "\\u003c")
     return (
         f'<section class="scene" id="scene-{name}"><h3>{name}</h3>{_step(frame)}<div class="control">'
-        f'<input type="range" min="0" max="{len(frame.z) - 1}" value="{start}" aria-label="slice of {name}">'
+        f'<input type="range" autocomplete="off" min="0" max="{len(frame.z) - 1}" value="{start}" '
+        f'aria-label="slice of {name}">'
         f"<output></output></div>{_legends(case)}"
         f'<div class="tiles">{"".join(tiles)}</div><script type="application/json">{data}</script></section>\n'
     )

@@ -130,10 +130,12 @@ def html_page(results: Path, data: Path | None, command: str) -> str:
     """Return the HTML page; with `data`, as many slices as fit into 20 MB."""
     from tqdm import tqdm
 
+    from benchmarks.records import outdated
     from reports import page, slices
     from reports.kept import first_cases
 
     found = read(results)
+    left_out = outdated(found)
     cases = [] if data is None else list(first_cases(data, found, results))
     missing = "There are no slices: the page was made without a dataset (run-benchmark report RESULTS DATA)."
     if data is not None:
@@ -141,7 +143,7 @@ def html_page(results: Path, data: Path | None, command: str) -> str:
     each = sum(map(slices.bytes_a_slice, cases))
     content = page.Content(
         title=f"ctsim: {results.resolve().name}",
-        provenance=f"{generated(command)} {measured(found)}",
+        provenance=f"{generated(command)} {measured(found)}" + (f" {left_out}." if left_out else ""),
         records=found,
         cases=cases,
         most=max(1, int(IMAGES * LIMIT / each)) if each else 1,
@@ -151,8 +153,8 @@ def html_page(results: Path, data: Path | None, command: str) -> str:
     images = sum(len(slices.frame_of(case, content.most).z) * (2 * len(case.kept) + 1) for case in cases)
     with tqdm(total=images, unit="image", disable=not images) as bar:
         text = page.page(content, bar.update)
-    if len(text) > LIMIT:
-        log.warning("the page has %.0f MB; fewer methods or scenes make it smaller", len(text) / 1e6)
+    if (size := len(text.encode())) > LIMIT:
+        log.warning("the page has %.0f MB; fewer methods or scenes make it smaller", size / 1e6)
     return text
 
 

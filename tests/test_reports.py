@@ -255,6 +255,7 @@ slider.value = 1;
 slider.dispatchEvent(new Event("input"));
 document.querySelector("input[name=method][value=limar]").click();
 document.title = location.hash;
+document.querySelector("nav a").click();
 """
 
 
