@@ -22,7 +22,7 @@ def l1_ssim(p: Image, target: Image, data_range: float, share: float = SSIM_SHAR
     methods.
     """
     kind, size = p.dtype, p.size
-    constants = tuple(kind.type(c) for c in ((0.01 * data_range) ** 2, (0.03 * data_range) ** 2, 1, 2))
+    constants = tuple(kind.type(c) for c in ((0.01 * data_range) ** 2, (0.03 * data_range) ** 2, 2))
     weights = kind.type(1 / size), kind.type(-share / size)
     parts, gradient = np.empty((p.shape[0], 3, p.shape[1]), kind), np.empty_like(p)
     sums = np.zeros((2, p.shape[0]))

@@ -30,30 +30,43 @@ def _add_product(weight, a, b, row):
 @njit(cache=True, error_model="numpy", fastmath=FAST)
 def _along(wide, taps, out):
     """Blur a row that has RADIUS zeros on both sides."""
+    t0, t1, t2, t3, t4, t5 = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
     for u in range(out.size):
-        out[u] = 0
-    for k in range(taps.size):
-        _add(taps[k], wide[k : k + out.size], out)
+        inner = t5 * wide[u + 5] + t4 * (wide[u + 4] + wide[u + 6]) + t3 * (wide[u + 3] + wide[u + 7])
+        outer = t1 * (wide[u + 1] + wide[u + 9]) + t0 * (wide[u] + wide[u + 10])
+        out[u] = inner + t2 * (wide[u + 2] + wide[u + 8]) + outer
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _similarity(means, moments, constants, parts):
-    """Return Σ SSIM of a row, and write its derivatives by the blurs of x, x² and x·y into `parts` [3, u]."""
+def _similarity(means, moments, constants, parts, ssim):
+    """Write SSIM of a row [u] and its derivatives by the blurs of x, x² and x·y into `parts` [3, u].
+
+    No loop writes more than two arrays: with three, LLVM gives up proving them apart and does not vectorise.
+    """
     mean_x, mean_y = means
     square_x, square_y, product = moments
-    c1, c2, one, two = constants  # numbers of the images' type: with a literal all would be float64
-    total = 0.0
+    c1, c2, two = constants  # numbers of the images' type: with a literal all would be float64
+    by_mean, by_variance, by_covariance = parts[0], parts[1], parts[2]
     for u in range(mean_x.size):
         x, y = mean_x[u], mean_y[u]
         b1, b2 = x * x + y * y + c1, (square_x[u] - x * x) + (square_y[u] - y * y) + c2
         a1, a2 = two * x * y + c1, two * (product[u] - x * y) + c2
-        scale = one / (b1 * b2)
-        ssim = a1 * a2 * scale
-        by_variance, by_covariance = -ssim / b2, two * a1 * scale
-        parts[0, u] = two * (y * a2 * scale - x * ssim / b1 - x * by_variance) - y * by_covariance
-        parts[1, u] = by_variance
-        parts[2, u] = by_covariance
-        total += ssim
+        by_covariance[u] = two * a1 / (b1 * b2)
+        ssim[u] = a1 * a2 / (b1 * b2)
+    for u in range(mean_x.size):
+        x, y = mean_x[u], mean_y[u]
+        b1, b2 = x * x + y * y + c1, (square_x[u] - x * x) + (square_y[u] - y * y) + c2
+        a2 = two * (product[u] - x * y) + c2
+        variance = -ssim[u] / b2
+        by_variance[u] = variance
+        by_mean[u] = two * (y * a2 / (b1 * b2) - x * (ssim[u] / b1 + variance)) - y * by_covariance[u]
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _sum(row):
+    total = 0.0
+    for u in range(row.size):
+        total += row[u]
     return total
 
 
@@ -62,7 +75,7 @@ def _first_rows(images, rows, taps, constants, parts, sums):
     x, y = images
     n_v, n_u = x.shape
     wide = np.zeros((5, n_u + 2 * RADIUS), x.dtype)
-    blurred = np.empty((5, n_u), x.dtype)
+    blurred, ssim = np.empty((5, n_u), x.dtype), np.empty(n_u, x.dtype)
     for v in range(rows[0], rows[1]):
         wide[:] = 0
         for k in range(max(0, RADIUS - v), min(2 * RADIUS + 1, n_v + RADIUS - v)):
@@ -76,7 +89,8 @@ def _first_rows(images, rows, taps, constants, parts, sums):
         for q in range(5):
             _along(wide[q], taps, blurred[q])
         means, moments = (blurred[0], blurred[1]), (blurred[2], blurred[3], blurred[4])
-        sums[v] = _similarity(means, moments, constants, parts[v])
+        _similarity(means, moments, constants, parts[v], ssim)
+        sums[v] = _sum(ssim)
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -114,7 +128,7 @@ def l1_ssim(x, y, taps, constants, weights, parts, out, sums):
     """Write weights[0]·sign(x − y) + weights[1]·d(Σ SSIM)/dx into `out` [v, u].
 
     `sums` float64 [2, v] gets Σ |x − y| and Σ SSIM of each row; `parts` [v, 3, u] is scratch; `taps` and the tuples
-    constants, (C1, C2, 1, 2), and weights are of the images' type.
+    constants, (C1, C2, 2), and weights are of the images' type.
     """
     n_v = x.shape[0]
     for c in prange(CHUNKS):
