@@ -244,7 +244,7 @@ def _dry_run(given: Arguments, wanted: dict[Part, list[str]]) -> int:
     widths = [max(len(line[k]) for line in lines) for k in range(5)]
     for line in lines:
         sys.stdout.write("  ".join(word.ljust(w) for word, w in zip(line, widths, strict=True)).rstrip() + "\n")
-    sys.stdout.write(f"total: {human_time(total)}, without compiling\n")
+    sys.stdout.write(f"total: {human_time(total)}, without compiling, planning and the reference\n")
     return 0
 
 

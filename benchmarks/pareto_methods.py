@@ -30,11 +30,27 @@ from reconstruct.watch import watch
 STOPS = frozenset((1, 2, 3, 5, 8, 12, 20, 30, 50, 80, 120, 200))
 BY_VALUE: dict[str, tuple[str, tuple[Any, ...]]] = {
     "ibhc": ("iterations", (1, 2, 3, 4, 6)),
-    "splat": ("passes", ((1, 0), (1, 1), (2, 1), (2, 2), (2, 4), (4, 4), (4, 8), (8, 8))),
+    "splat": ("passes", ((1, 0), (1, 1), (2, 1), (2, 2), (2, 4), (4, 4), (4, 8))),
 }
 """Methods that run once for each of these values of a parameter; the default is added."""
-FDKS = {"fdk": 1.0}
-"""Cost in FDKs, of an iteration where there are any."""
+FDKS = {
+    "fdk": 1.0,
+    "limar": 2.0,
+    "nmar": 4.4,
+    "bhc-poly": 6.8,
+    "water-precorrection": 1.7,
+    "ibhc": 2.7,
+    "sart": 3.0,
+    "os-sart": 2.3,
+    "sirt": 1.5,
+    "cgls": 1.3,
+    "fista-tv": 1.5,
+    "asd-pocs": 2.3,
+    "awpcsd": 3.7,
+    "splat": 18.0,
+}
+"""Cost in FDKs, for estimates, as measured on lung-Fe of `quick`: of an iteration or a pass where there are any."""
+UNKNOWN = 5.0
 LAST = 2  # times the default: how far iterations go
 
 
@@ -73,9 +89,10 @@ def efforts(name: str) -> list[Effort]:
 
 
 def in_fdks(effort: Effort) -> float:
-    """Return about how many times FDK's time a run takes, as measured on lung-Fe of `quick`."""
-    count = effort.method.params.get("iterations")
-    return FDKS.get(effort.method.name, 3.0) * (1 if count is None else count)
+    """Return about how many times FDK's time a run takes."""
+    params = effort.method.params
+    count = params.get("iterations") or sum(params.get("passes", (1,)))
+    return FDKS.get(effort.method.name, UNKNOWN) * count
 
 
 def fdk_seconds(geometry: Geometry) -> float:

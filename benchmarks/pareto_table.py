@@ -187,7 +187,8 @@ def _provenance(found: Sequence[Timed]) -> str:
     h, changed = last.host, "+changes" if last.commit.endswith("+changes") else ""
     counts = sorted({len(p.seconds) for p in points(found)})
     of = "–".join(map(str, dict.fromkeys((counts[0], counts[-1])))) if counts else "0"
+    threads = f"{h.threads} thread{'s' * (h.threads > 1)}"
     return (
-        f"{last.time}, commit {last.commit[:12]}{changed}, {h.cpu}, {h.cores} cores, {h.threads} threads, "
-        f"Python {h.python}, numba {h.versions.get('numba', '?')}. Seconds are medians of {of} interleaved runs."
+        f"{last.time}, commit {last.commit[:12]}{changed}, {h.cpu}, {h.cores} cores, {threads}, Python {h.python}, "
+        f"numba {h.versions.get('numba', '?')}. Seconds are medians of {of} interleaved runs."
     )
