@@ -69,7 +69,8 @@ class Learner:
 
     def __init__(self, objective: Objective, splats: Splats, response: Response, views: NDArray[np.int64]) -> None:
         self.objective, self.response, self.views = objective, response, views
-        self.settings, self._schedule = objective.settings, objective.settings.times()
+        self.settings = objective.settings
+        self._schedule = self.settings.densification(objective.projector.geometry.n_voxel)
         self._take(objective.activation.parameters(splats))
         self._moments = adam.no_moments(self._parameters)
         self._theta = {"theta": np.array(response.trainable, np.float32)}

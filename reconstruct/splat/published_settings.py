@@ -26,6 +26,7 @@ FLAT = (1.0, 1.0)  # θ of the paper's response that makes all nodes weigh alike
 CHANNELS = {"paper": "ab", "klein-nishina": "ab", "constant": "a", "photoelectric": "b"}
 START, ALONE = {"a": 0.075, "b": 0.0075}, 0.15  # of the FDK volume's values, of two densities and of one
 RATES = {"a": 0.01, "b": 0.1}  # learning rates of the densities
+VOXELS_A_SPLAT = 4  # at least, where splats are added
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,14 +84,15 @@ class Settings:
         """The path values that splats have a density for."""
         return CHANNELS[self.basis]
 
-    def times(self) -> Schedule:
-        """Return the schedule for the number of steps: it begins as published, and ends at the same share of them.
+    def densification(self, n_voxel: tuple[int, int, int]) -> Schedule:
+        """Return the schedule for the number of steps and the grid [z, y, x].
 
-        The beginning is not brought forward: until a few hundred steps of Adam have put the densities right, the loss
-        pulls at every splat.
+        It begins as published, for until a few hundred steps of Adam have put the densities right, the loss pulls at
+        every splat; it ends at the published share of the steps; and below 126³ voxels the cap falls with them.
         """
         last = round(self.schedule.last * self.steps / self.schedule_steps)
-        return dataclasses.replace(self.schedule, last=last)
+        most = min(self.schedule.most, max(self.n_splats, math.prod(n_voxel) // VOXELS_A_SPLAT))
+        return dataclasses.replace(self.schedule, last=last, most=most)
 
     def make_response(self, e_max: float) -> Response:
         """Build the response for a scan of greatest energy `e_max` (keV)."""
