@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from benchmarks.stress_cases import Case
     from benchmarks.stress_records import StressRecord
 
+SECONDS = {"simulator": (0.3, 0.6), "splat kernels": (0.1, 0.1)}  # a row, short and full; of a method:
+SECONDS_OF_METHOD = (0.15, 0.4)
 CATALOGUE = "benchmarks.stress"
 """The module whose `catalogue` the process that carries out the cases asks."""
 
@@ -69,9 +71,9 @@ def main(argv: list[str]) -> int:
 
 def catalogue() -> "list[Case]":
     """Return all cases."""
-    from benchmarks import stress_methods, stress_simulator, stress_splats
+    from benchmarks import stress_chain, stress_methods, stress_simulator, stress_splats
 
-    return stress_simulator.cases() + stress_splats.cases() + stress_methods.cases()
+    return stress_simulator.cases() + stress_splats.cases() + stress_chain.cases() + stress_methods.cases()
 
 
 def _chosen(cases: "list[Case]", names: Sequence[str]) -> "list[Case]":
@@ -123,8 +125,15 @@ def _list(left: "list[Case]", n_all: int, *, short: bool) -> None:
     for case in left:
         by_case.setdefault(case.name, []).append(case)
     for name, rows in by_case.items():
-        seconds = sum(c.seconds[0 if short else 1] for c in rows)
+        seconds = _cost(rows, short=short)
         subjects = ", ".join(c.subject for c in rows)
         sys.stdout.write(f"{name:20s} {len(rows):3d} rows {seconds:6.1f} s  {rows[-1].what}: {subjects}\n")
-    total = sum(c.seconds[0 if short else 1] for c in left)
-    sys.stdout.write(f"{len(left)} of {n_all} rows to run, about {total:.0f} s on two cores and as long to compile\n")
+    total = _cost(left, short=short)
+    sys.stdout.write(
+        f"{len(left)} of {n_all} rows to run, about {total:.0f} s on one idle core, and a minute to compile the first time\n"
+    )
+
+
+def _cost(rows: "list[Case]", *, short: bool) -> float:
+    """Return the seconds that rows took on one idle core, compilation apart."""
+    return sum(SECONDS.get(c.subject, SECONDS_OF_METHOD)[0 if short else 1] for c in rows)

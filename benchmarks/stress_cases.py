@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 
-FULL, SHORT = 32, 16  # voxels along a side
+FULL, SHORT = 24, 16  # voxels along a side
 SIMULATOR, SPLATS = "simulator", "splat kernels"  # subjects beside the methods
 
 
@@ -60,7 +60,7 @@ class Case:
     """One row: `run(side, findings)` carries it out on grids of so many voxels a side.
 
     `subject` is what is put under stress: SIMULATOR, SPLATS or the name of a method. `code` hashes the sources that
-    decide the result, `seconds` is what it took at SHORT and at FULL.
+    decide the result.
     """
 
     name: str
@@ -69,7 +69,6 @@ class Case:
     expected: str
     run: Callable[[int, Findings], None]
     code: str = ""
-    seconds: tuple[float, float] = (0.1, 0.3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

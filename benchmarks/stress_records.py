@@ -61,24 +61,29 @@ def record_of(case: Case, side: int, outcome: Outcome, by: tuple[Host, str, str]
 
 
 def append(path: Path, record: StressRecord) -> None:
-    """Append one line and force it to the disk."""
+    """Append one line and force it to the disk; the rest of a line whose writing was interrupted is cut off first."""
+    if path.exists() and (whole := _whole(data := path.read_bytes())) < len(data):
+        os.truncate(path, whole)
     with path.open("ab") as file:
         file.write(msgspec.json.encode(record) + b"\n")
         file.flush()
         os.fsync(file.fileno())
 
 
+def _whole(data: bytes) -> int:
+    """Return how many bytes are whole lines."""
+    return data.rfind(b"\n") + 1
+
+
 def read(path: Path) -> list[StressRecord]:
-    """Read the records; the rest of a line whose writing was interrupted is cut off, so that others may follow.
+    """Read the records, none where there is no file; the rest of a line that was interrupted is left out.
 
     Raises InputError where a whole line is no record.
     """
     if not path.exists():
         return []
     data = path.read_bytes()
-    whole = data.rfind(b"\n") + 1
-    if whole < len(data):
-        os.truncate(path, whole)
+    whole = _whole(data)
     decoder, found = msgspec.json.Decoder(StressRecord), []
     for number, line in enumerate(data[:whole].splitlines(), 1):
         try:

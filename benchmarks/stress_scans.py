@@ -154,23 +154,28 @@ class Example:
         return float(np.sqrt(np.mean((values[self.region] - there) ** 2) / np.mean(there**2)))
 
 
-def example(scanner: Scanner, phantom: Phantom) -> Example:
-    """Simulate a scan, sub-rays and noise included."""
-    stacks, volumes = simulated(phantom, scanner, Truth(twin=False), subrays=34)
-    reference, metal = volumes["reference_effective"], volumes["metal"] != 0
-    _, y, x = scanner.geometry.voxel_centres()
-    seen = np.hypot(y[:, None], x) <= ray_weights(scanner.geometry).radius
-    scan = Scan(
+def scan_from(stacks: Mapping[str, NDArray[Any]], volumes: Mapping[str, NDArray[Any]], scanner: Scanner) -> Scan:
+    """Return what `simulated` gave as a method gets it."""
+    return Scan(
         geometry=scanner.geometry,
         counts=torch.from_numpy(stacks["counts"]),
         flat=torch.from_numpy(stacks["flat"]),
         dark=scanner.noise.dark,
         i0=scanner.i0,
         e_max=spectrum(scanner.tube).e_max,
-        metal=torch.from_numpy(metal),
+        metal=torch.from_numpy(volumes["metal"] != 0),
     )
+
+
+def example(scanner: Scanner, phantom: Phantom) -> Example:
+    """Simulate a scan, sub-rays and noise included."""
+    stacks, volumes = simulated(phantom, scanner, Truth(twin=False), subrays=34)
+    reference, metal = volumes["reference_effective"], volumes["metal"] != 0
+    _, y, x = scanner.geometry.voxel_centres()
+    seen = np.hypot(y[:, None], x) <= ray_weights(scanner.geometry).radius
     inside = ~dilate(reference < 0.5 * np.median(reference[reference > 0]), 1, corners=True)
-    return Example(scan=scan, reference=reference, region=inside & ~dilate(metal, 2, corners=True) & seen)
+    region = inside & ~dilate(metal, 2, corners=True) & seen
+    return Example(scan=scan_from(stacks, volumes, scanner), reference=reference, region=region)
 
 
 def on_threads(threads: int, call: Callable[[], NDArray[Any]]) -> NDArray[Any]:

@@ -7,7 +7,7 @@ import pytest
 from stress_ends import ENDS, catalogue
 
 from baselines.known_spectrum import Beam
-from benchmarks import stress, stress_methods, stress_records, stress_simulator, stress_splats
+from benchmarks import stress, stress_chain, stress_methods, stress_records, stress_simulator, stress_splats
 from benchmarks.methods import TABLE, find
 from benchmarks.stress_cases import Findings, carry_out
 from benchmarks.stress_scans import BONE, USUAL, WATER, example, geometry, in_air, rod
@@ -33,7 +33,7 @@ from reconstruct.splat.response import make_response
 SMALLEST = 12
 # every scene meets a third of the methods here and every method a third of the scenes; the command runs all
 METHODS = [c for k, c in enumerate(stress_methods.cases()) if (k // len(TABLE) + k % len(TABLE)) % 3 == 0]
-CASES = [*stress_simulator.cases(), *stress_splats.cases(), *METHODS]
+CASES = [*stress_simulator.cases(), *stress_splats.cases(), *stress_chain.cases(), *METHODS]
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c.name}-{c.subject}")
