@@ -130,7 +130,7 @@ def _list(left: "list[Case]", n_all: int, *, short: bool) -> None:
         sys.stdout.write(f"{name:20s} {len(rows):3d} rows {seconds:6.1f} s  {rows[-1].what}: {subjects}\n")
     total = _cost(left, short=short)
     sys.stdout.write(
-        f"{len(left)} of {n_all} rows to run, about {total:.0f} s on one idle core, and a minute to compile the first time\n"
+        f"{len(left)} of {n_all} rows to run, about {total:.0f} s on one idle core; compiling takes a minute, once\n"
     )
 
 

@@ -92,7 +92,7 @@ def compare(found: Findings, given: Bench) -> dict[str, NDArray[Any]]:
     found.say(f"P to {exact.max():.3g}")
     if not seen.all():
         low, high = float(p[~seen].min()), float(p[~seen].max())
-        found.say(f"P beyond {P_MAX:g} within {low:.3g} … {high:.3g}", holds=P_MAX - LIMIT <= low and high <= CLAMP)
+        found.say(f"P beyond {P_MAX:g} within {low:.3g} … {high:.3g}", holds=low >= P_MAX - LIMIT and high <= CLAMP)
     if given.mass is not None:
         material, volume = given.mass
         there = float(volumes["reference_50kev"].sum(dtype=np.float64) * np.prod(given.scanner.geometry.d_voxel))
