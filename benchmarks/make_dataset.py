@@ -169,26 +169,33 @@ class Job:
 def _make(scenes: "tuple[Scene, ...]", out: Path, options: Options) -> int:
     from ctsim.manifest import arrange_index
     from ctsim.writer import is_complete
-    from phantoms.scene import build, scene_id
+    from phantoms.scene import scene_id
 
     # what is in the way shows before the first hour is spent, not after it
     todo = [s for s in scenes if options.force or not is_complete(out, s.name, scene_id(s))]
     for scene in scenes:
         if scene not in todo:
             _say(f"{scene.name}: already complete")
-    plans = {scene.name: _plan(scene)[0] for scene in todo}  # all phantoms could be more than memory holds
-    _check_space(out, sum(plan.disk_bytes for plan in plans.values()))
     with open_pool(options.workers, options.scheduler) as pool:
+        plans = {scene.name: _plan(scene)[0] for scene in todo}  # all phantoms could be more than memory holds
+        _check_space(out, sum(plan.disk_bytes for plan in plans.values()))
         if pool:
             where = out.resolve()
             _make_apart([Job(scene=s, plan=plans[s.name], out=where, force=options.force) for s in todo], pool)
-        for number, scene in enumerate(() if pool else todo, 1):
-            title = f"{number}/{len(todo)} {scene.name}"
-            with _memory(scene.name):
-                parts = build(scene), scene.resolve()
-                make_scene(scene, plans[scene.name], parts, out, force=options.force, title=title)
+        else:
+            _make_here(todo, plans, out, options.force)
     arrange_index(out, [scene.name for scene in scenes])
     return 0
+
+
+def _make_here(scenes: "list[Scene]", plans: "dict[str, Plan]", out: Path, force: bool) -> None:
+    """Make scenes one after another in this process."""
+    from phantoms.scene import build
+
+    for number, scene in enumerate(scenes, 1):
+        title = f"{number}/{len(scenes)} {scene.name}"
+        with _memory(scene.name):
+            make_scene(scene, plans[scene.name], (build(scene), scene.resolve()), out, force=force, title=title)
 
 
 def _make_apart(jobs: list[Job], pool: Pool) -> None:
@@ -208,9 +215,8 @@ def _make_apart(jobs: list[Job], pool: Pool) -> None:
                     raise InputError(f"{name}: {end.reason}, as happens when memory is short; expected fewer workers")
                 left.discard(number)
                 bar.set_description(f"{len(jobs) - len(left)}/{len(jobs)} {name}")
-            bar.n = sum(
-                n if k not in left else views_noted(jobs[k].out, jobs[k].scene.name) for k, n in enumerate(views)
-            )
+            noted = views_noted(jobs[0].out)
+            bar.n = sum(noted.get(jobs[k].scene.name, 0) if k in left else n for k, n in enumerate(views))
             bar.refresh()
 
 

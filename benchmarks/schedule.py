@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 
 from benchmarks import methods, records
+from benchmarks.devices import check_device
 from benchmarks.isolate import Outcome
 from benchmarks.records import OK, Record
 from benchmarks.run import Options, Runner, Task, describe_run, run_all
@@ -122,6 +123,7 @@ def _job(group: Group, results: Path, options: Options) -> Job:
 
 def do(job: Job) -> list[bytes]:
     """Be the worker: run a group, keep its volumes, and return its records as JSON."""
+    check_device(job.options.device)
     stored = pkgutil.resolve_name(job.options.store)(job.folder)
     method = methods.find(job.method, job.overrides)
     tasks = [Task(stored=stored, variant=variant, method=method, place=job.place) for variant in job.variants]

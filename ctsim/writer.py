@@ -90,13 +90,14 @@ def _tidy(data_dir: Path, name: str) -> None:
             durable.unlock(lock, handle)
 
 
-def views_noted(data_dir: Path, name: str) -> int:
-    """Return how many views of an unfinished scene are safe on the disk; 0 where nothing is noted."""
-    try:
-        note = (data_dir / f".{name}.partial" / mf.PROGRESS).read_bytes()
-        return msgspec.json.decode(note, type=_Progress).views
-    except (OSError, msgspec.DecodeError, UnicodeDecodeError):
-        return 0
+def views_noted(data_dir: Path) -> dict[str, int]:
+    """Return how many views are safe on the disk of each unfinished scene that has noted any, by name."""
+    found = {}
+    for folder in data_dir.glob(".*.partial"):
+        with contextlib.suppress(OSError, msgspec.DecodeError, UnicodeDecodeError):
+            note = msgspec.json.decode((folder / mf.PROGRESS).read_bytes(), type=_Progress)
+            found[folder.name.removeprefix(".").removesuffix(".partial")] = note.views
+    return found
 
 
 class SceneWriter:
