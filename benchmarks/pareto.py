@@ -283,5 +283,8 @@ def _report(out: Path) -> None:
         raise InputError(f"{out / NAME}: there are no records; run without --table first")
     summary = pareto_table.summary(shown)
     (out / "pareto.md").write_text(summary + pareto_table.every_point(shown), encoding="utf-8")
-    pareto_figure.draw(points(shown)).savefig(out / "pareto.png", dpi=pareto_figure.DPI)
-    sys.stdout.write(f"{summary}\nWritten: {out}/pareto.md, with every point, and pareto.png; records in {NAME}\n")
+    written = "pareto.md, with every point"
+    if drawn := points(shown):
+        pareto_figure.draw(drawn).savefig(out / "pareto.png", dpi=pareto_figure.DPI)
+        written += ", and pareto.png"
+    sys.stdout.write(f"{summary}\nWritten: {out}/{written}; records in {NAME}\n")

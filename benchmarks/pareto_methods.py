@@ -83,16 +83,17 @@ def efforts(name: str) -> list[Effort]:
             for v in every
         ]
     count = usual.params.get("iterations")
-    if count is None:
+    if not isinstance(count, int):
         return [Effort(method=usual, label="defaults")]
     return [Effort(method=find(name, {"iterations": LAST * count}), label=f"{LAST * count} iterations")]
 
 
 def in_fdks(effort: Effort) -> float:
     """Return about how many times FDK's time a run takes."""
-    params = effort.method.params
-    count = params.get("iterations") or sum(params.get("passes", (1,)))
-    return FDKS.get(effort.method.name, UNKNOWN) * count
+    name, params = effort.method.name, effort.method.params
+    amount = params.get(BY_VALUE[name][0] if name in BY_VALUE else "iterations")
+    count = sum(amount) if isinstance(amount, tuple | list) else amount if isinstance(amount, int) else 1
+    return FDKS.get(name, UNKNOWN) * count
 
 
 def fdk_seconds(geometry: Geometry) -> float:

@@ -226,7 +226,7 @@ def test_the_clock_leaves_out_scoring_and_counts_what_begins_and_ends_a_run(smal
 
 
 def test_methods_end_to_end(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("NUMBA_NUM_THREADS", "2")
+    monkeypatch.setattr(pareto, "_use", lambda threads: None)  # the threads of this process are not ours to set
     (tmp_path / "small.toml").write_text(SMALLEST, encoding="utf-8")
     out = tmp_path / "out"
     common = [str(out), "--suite", str(tmp_path / "small.toml"), "--part", "methods", "--repeats", "2"]
@@ -249,6 +249,21 @@ def test_methods_end_to_end(tmp_path, monkeypatch, capsys):
     assert (out / "pareto.jsonl").read_bytes() == first
     assert (out / "pareto.md").read_text().count("| cgls | 15 iterations (default) |") >= 1
     assert (out / "pareto.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_method_that_fails_is_a_row_with_its_reason_and_is_tried_again(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(pareto, "_use", lambda threads: None)
+    (tmp_path / "small.toml").write_text(SMALLEST, encoding="utf-8")
+    command = [str(tmp_path), "--suite", str(tmp_path / "small.toml"), "--part", "methods", "--repeats", "2"]
+    for _ in range(2):
+        assert pareto.main([*command, "--method", f"{__name__}:fails"]) == 1
+        text = capsys.readouterr().out
+        assert f"| {__name__}:fails | defaults | error | ValueError: no such luck |" in text
+    assert len(read(tmp_path / "pareto.jsonl")[0]) == 2
+
+
+def fails(scan, *, device):
+    raise ValueError("no such luck")
 
 
 # --- simulator ---------------------------------------------------------------------------------------
@@ -305,7 +320,7 @@ def test_scatter_is_judged_with_scatter(bench):
 
 
 def test_simulator_end_to_end(tmp_path, monkeypatch, capsys, bench):
-    monkeypatch.setenv("NUMBA_NUM_THREADS", "2")
+    monkeypatch.setattr(pareto, "_use", lambda threads: None)
     few = [c for c in pareto_simulator.choices() if c.default or c.label == "4 sub-rays"]
     monkeypatch.setattr(pareto_simulator, "choices", lambda: few)
     monkeypatch.setattr(pareto_simulator, "Bench", lambda: bench)
