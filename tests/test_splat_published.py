@@ -14,7 +14,7 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.types import Scan, Status
 from reconstruct.splat import adam, densify
-from reconstruct.splat.learner import LEAST_VALUE, seed_splats
+from reconstruct.splat.learner import LEAST_VALUE, Learner, seed_splats
 from reconstruct.splat.objective import Objective
 from reconstruct.splat.published import Progress, fit_published, read_out, reconstruct
 from reconstruct.splat.published_settings import PRESETS, Settings, changed
@@ -219,6 +219,16 @@ def test_a_fit_ends_when_views_it_does_not_see_gain_no_more():
     assert about["views"] == [4, 8, 11, 15]
     assert done < 2000 and about["step"] in passes and len(passes) == done // 16
     np.testing.assert_allclose(passes[about["step"]], volume.values, rtol=1e-4, atol=1e-8)
+
+
+def test_a_loss_that_is_not_finite_ends_the_fit_and_says_so(monkeypatch):
+    steps = []
+    monkeypatch.setattr(Learner, "step", lambda self, done: steps.append(done) or (math.nan if done == 25 else 0.5))
+    lost = fit_published(sphere(), PAPER)
+    assert steps == list(range(26)) and lost.status is Status.NONFINITE and "not finite" in lost.reason
+    # what met the views that were held out best was kept before
+    kept = fit_published(sphere(), dataclasses.replace(PAPER, held_out=2))
+    assert kept.status is Status.OK and kept.details["held_out"]["step"] == 18
 
 
 def test_a_fit_can_be_watched():

@@ -108,12 +108,14 @@ class _Run:
         self.best_misfit, self.best_step, self.idle = math.inf, 0, 0
 
     def go(self, on_progress: OnProgress | None, every: int) -> None:
-        """Take the steps that are left."""
+        """Take the steps that are left; a loss that is not finite ends them."""
         settings, stopwatch = self.settings, self.stopwatch
         while self.done < settings.steps and stopwatch.seconds < settings.seconds and self.idle < settings.patience:
             self.loss = self.learner.step(self.done)
             self.done += 1
             whole = self.done % len(self.learner.views) == 0
+            if not math.isfinite(self.loss):
+                break
             if self.held_out and (whole or self.done == settings.steps):
                 self._judge()
             if on_progress is not None and self.done % every == 0:
@@ -144,10 +146,8 @@ class _Run:
     def _judge(self) -> None:
         """Keep the state that meets the held-out views best, and count the passes without one that is better."""
         misfit = self.learner.objective.misfit(self.learner.splats(), self.learner.response, self.held_out)
-        self.idle += 1
-        if not misfit >= self.best_misfit * (1 - BETTER):
-            self.idle = 0
-        if not misfit >= self.best_misfit:
+        self.idle = 0 if misfit < self.best_misfit * (1 - BETTER) else self.idle + 1
+        if misfit < self.best_misfit:
             self.best, self.best_misfit, self.best_step = self.learner.state(), misfit, self.done
 
     def _state(self) -> dict[str, NDArray[Any]]:
@@ -191,7 +191,8 @@ class _Run:
         weights, how = read_out(splats, response, self.learner.objective)
         densities = voxelise(splats, self.learner.objective.projector.geometry, mean=False)
         values = np.einsum("c,czyx->zyx", weights, densities)
-        finite = bool(np.isfinite(values).all()) and (self.done == 0 or math.isfinite(self.loss))
+        sound = self.done == 0 or bool(self.best) or math.isfinite(self.loss)
+        finite = sound and bool(np.isfinite(values).all())
         details: dict[str, Any] = {
             "read-out": how,
             "splats": len(splats),
@@ -201,7 +202,8 @@ class _Run:
             "densities": {f"rho_{c}": density for c, density in zip(self.settings.channels, densities, strict=True)},
         }
         if self.held_out:
-            details["held_out"] = {"views": self.held_out, "misfit": self.best_misfit, "step": self.best_step}
+            misfit = self.best_misfit if self.best else None
+            details["held_out"] = {"views": self.held_out, "misfit": misfit, "step": self.best_step}
         return Volume(
             values=torch.from_numpy(values),
             status=Status.OK if finite else Status.NONFINITE,
