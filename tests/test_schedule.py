@@ -7,7 +7,7 @@ import pytest
 from test_run import double
 from test_tables import record
 
-from benchmarks import records, run, schedule, tables
+from benchmarks import cli_run, records, run, schedule, tables
 from benchmarks.methods import Method
 from benchmarks.schedule import Costs, ordered
 from benchmarks.workers import Lost
@@ -67,9 +67,8 @@ def test_the_cost_of_a_run_is_that_of_its_scan_else_the_methods_median():
 
 
 def test_a_dry_run_writes_nothing(smallest, tmp_path, capsys):
-    from benchmarks.cli_run import main
 
-    assert main([str(smallest), str(tmp_path / "results"), "--dry-run"]) == 0
+    assert cli_run.main([str(smallest), str(tmp_path / "results"), "--dry-run"]) == 0
     assert "2 of 2 runs" in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == []
 
@@ -149,8 +148,21 @@ def test_results_of_several_machines_are_collected_once(tmp_path):
 
 
 def test_collecting_renders_the_tables(tmp_path, capsys):
-    from benchmarks.cli_run import main
 
     records.append(tmp_path / "there" / records.NAME, record("fdk"))
-    assert main([str(tmp_path / "data"), str(tmp_path / "here"), "--collect", str(tmp_path / "there")]) == 0
+    assert cli_run.main([str(tmp_path / "data"), str(tmp_path / "here"), "--collect", str(tmp_path / "there")]) == 0
     assert "| counts only | fdk |" in capsys.readouterr().out and (tmp_path / "here/table.csv").exists()
+
+
+def test_tables_follow_the_runs(tmp_path, monkeypatch):
+    seen = []
+    write = tables.write
+
+    def watched(found, results):
+        seen.append(len(found))
+        write(found, results)
+
+    monkeypatch.setattr(tables, "write", watched)
+    monkeypatch.setattr(cli_run, "_scans", lambda given: [double(given.data)])
+    assert cli_run.main([str(tmp_path), str(tmp_path / "r"), "--method", "test_run:good"]) == 0
+    assert seen[0] == 1 and seen[-1] == 2  # after the first run, and at the end
