@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from benchmarks.stress_cases import Case
     from benchmarks.stress_records import StressRecord
 
-SECONDS = {"simulator": (0.3, 0.6), "splat kernels": (0.1, 0.1)}  # a row, short and full; of a method:
-SECONDS_OF_METHOD = (0.15, 0.4)
+# estimates of a row on one idle core, short and full, from runs beside other work
+SECONDS = {"simulator": (0.3, 0.6), "splat kernels": (0.1, 0.1)}
+SECONDS_OF_METHOD = (0.2, 0.5)
 CATALOGUE = "benchmarks.stress"
 """The module whose `catalogue` the process that carries out the cases asks."""
 
