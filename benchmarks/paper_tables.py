@@ -185,8 +185,8 @@ def caption(table: "Table", used: "list[Record]", protocol: str) -> str:
         parts.append("There is no record yet.")
     parts.append("The phantoms differ from the paper's: orders and gains compare, values do not.")
     if table.rank:
-        where = {"down": "of each column", "across": "of each row"}[table.rank]
-        parts.append(f"Bold is the best {where} and side, underlined the second, whatever a method needs as input.")
+        where = {"down": "column", "across": "row"}[table.rank]
+        parts.append(f"The best of a {where} is bold on either side, the second underlined, whatever its inputs.")
     return " ".join(parts)
 
 

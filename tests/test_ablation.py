@@ -6,6 +6,7 @@ from conftest import SMALLEST
 
 from benchmarks import ablation, cli, make_dataset, methods, records
 from benchmarks.make_dataset import load as load_suite
+from reconstruct.splat.published_settings import changed
 
 STUB = """
 from ctsim.errors import InputError
@@ -13,8 +14,8 @@ from reconstruct.fdk import reconstruct as fdk
 
 
 def reconstruct(scan, *, device, preset="fast", steps=None, response=None, basis=None, nodes=None, e_max=None):
-    if response == "known":
-        raise InputError("a known response needs a spectrum")
+    if response == "gmm":
+        raise InputError("this one has no mixtures")
     return fdk(scan, device=device)
 """
 TABLES = {'name = "smallest"': "[defaults]", "[phantom]": "[defaults.phantom]", "[scanner]": "[defaults.scanner]"}
@@ -60,6 +61,19 @@ def test_a_run_that_rows_share_is_listed_once_with_all_of_them():
     assert {v.params["e_max"] for v in found.values() if "e_max" in v.params} == {60.0, 120.0, 150.0}
 
 
+def test_the_rows_are_what_the_published_method_takes():
+    """Parameters are named and valued as its settings are, and each has a response of its own."""
+    found = {}
+    for variant in ablation.variants():
+        preset, changes = variant.params["preset"], {k: v for k, v in variant.params.items() if k != "preset"}
+        settings = changed(preset, changes)
+        if changes.get("nodes", 0) <= 60:  # the most that a response takes so far
+            response = settings.make_response(90.0)
+            key = (variant.scene, settings.basis, settings.steps, response.name, response.energies_kev.tobytes())
+            assert found.setdefault((*key, response.eta.tobytes()), variant) is variant
+    assert settings.schedule_steps == 10 * settings.steps
+
+
 def test_one_table_needs_its_own_rows_only():
     (baseline, *_) = ablation.variants((7,))
     assert baseline.params == {"preset": "r2", "steps": 3000} and baseline.scene == BROCCOLI
@@ -82,18 +96,18 @@ def test_rows_become_records_and_what_failed_is_tried_again(command, tmp_path):
     runs = ablation.variants((1, 7))
     assert {(r.run.scene, r.label) for r in found} == {(v.scene, v.label) for v in runs} and len(found) == len(runs)
     assert {r.run.variant for r in found} == {"metal"}
-    assert code == 1  # one response needs what it is not given
-    assert [r.label for r in found if r.status == "error"] == [label(response="known")]
+    assert code == 1
+    assert [r.label for r in found if r.status == "error"] == [label(response="gmm")]
     assert "## Table 1." in shown.out and "## Table 7." in shown.out and "## Table 3." not in shown.out
     text = (tmp_path / "results" / "ablation.md").read_text(encoding="utf-8")
-    (known,) = [line for line in text.splitlines() if line.startswith("| Known |")]
-    assert known.split("|")[3].strip() == "error" and "a known response needs a spectrum" in text
+    (mixture,) = [line for line in text.splitlines() if line.startswith("| GMM ")]
+    assert mixture.split("|")[3].strip() == "error" and "InputError: this one has no mixtures" in text
     ours = next(line for line in text.splitlines() if line.startswith("| Our model |"))
     score = next(r.scores["paper"].values["psnr3d"] for r in found if (r.run.scene, r.label) == (LUNG, label()))
     assert f"{score:.2f}" in ours
     assert command("--table", "1", "--table", "7")[0] == 1
     again, _ = records.read_all(tmp_path / "results")
-    assert [r.label for r in again[len(found) :]] == [label(response="known")]
+    assert [r.label for r in again[len(found) :]] == [label(response="gmm")]
     assert (tmp_path / "results" / "table.md").exists()
 
 
@@ -108,7 +122,7 @@ def test_a_dry_run_prints_rows_and_cost_and_writes_nothing(command, tmp_path):
     code, shown = command("--dry-run", "--table", "7", "--table", "5")
     lines = {line.partition("  ")[0]: line for line in shown.out.splitlines() if LUNG in line}
     assert code == 0 and " recorded " in lines[label()] and "5: Baseline with both; 7: Lung, Ours" in lines[label()]
-    assert "total: 2 of 8 runs" in shown.out and "scans to be made" not in shown.out
+    assert "total: 3 of 9 runs" in shown.out and "scans to be made" not in shown.out
 
 
 def test_the_cost_of_a_step_is_what_records_say():
