@@ -179,6 +179,10 @@ def caption(table: "Table", used: "list[Record]", protocol: str) -> str:
     if not timed:
         parts.append("The paper states neither the region, nor the energy of the reference, nor the peak of PSNR3D.")
     parts.append(f"Here: {tables.caption(used, 'cost' if timed else protocol)}")
+    planned = [table.planned(row, column) for row in table.rows for column in table.columns]
+    steps = sorted({p.params["steps"] for p in planned if "steps" in p.params})
+    if steps:
+        parts.append(f"A run has {' or '.join(map(str, steps))} steps here, a tenth of the published.")
     if used:
         parts += _circumstances(used, timed)
     else:

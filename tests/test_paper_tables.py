@@ -159,6 +159,7 @@ def test_a_missing_cell_names_the_command_that_makes_it():
     assert "--method fdk" not in table[3] and "--set splat.preset=r2`" in table[3]
     assert "there is no method acdnet, dicdnet" in table[3]
     assert "`run-benchmark ablation data/ results/ --table 5`" in table[5]
+    assert "A run has 2000 or 3000 steps here" in table[5] and "steps here" not in table[3]
     assert "`make-dataset real data/`" in table[8] and "--scene walnut-Fe" in table[8]
 
 
