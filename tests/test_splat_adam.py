@@ -23,18 +23,18 @@ KEY = rng.stream_key("test", "split", 0)
 
 
 def test_what_is_learned_stands_for_the_splats_and_within_the_bounds():
-    given = splats(50, "ellipsoids", low=0.05, high=4.0)
+    given = splats(50, "ellipsoids", low=0.05, high=8.0)
     back = ACTIVATION.splats(ACTIVATION.parameters(given))
-    assert ACTIVATION.unit == 12 and ACTIVATION.bounds == (0.006, 6)
+    assert ACTIVATION.unit == 12 and ACTIVATION.bounds == (0.012, 12)
     for name in ("positions", "scales", "rotations", "densities"):
         # float32 parameters of up to 10 are rounded to 5e-7, and so is the logarithm of what they stand for
         np.testing.assert_allclose(getattr(back, name), getattr(given, name), rtol=2e-6)
     extreme = dataclasses.replace(given, scales=np.full((50, 3), 100, np.float32))
     parameters = ACTIVATION.parameters(extreme)
-    assert np.all(ACTIVATION.splats(parameters).scales < 6)
+    assert np.all(ACTIVATION.splats(parameters).scales < 12)
     parameters["scales"], parameters["densities"] = parameters["scales"] * 0 - 1e30, parameters["densities"] * 0 - 1e30
     least = ACTIVATION.splats(parameters)
-    assert np.all(least.scales == np.float32(0.006)) and np.all(least.densities == 0)
+    assert np.all(least.scales == np.float32(0.012)) and np.all(least.densities == 0)
     with pytest.raises(InputError, match="must be positive"):
         ACTIVATION.parameters(dataclasses.replace(given, densities=-given.densities))
     with pytest.raises(InputError, match="some"):
@@ -163,12 +163,12 @@ def test_a_brick_is_a_part_of_the_grid():
 
 
 def test_small_splats_are_doubled_and_large_ones_split():
-    given, unit = splats(6, "ellipsoids", low=0.5, high=1.0), 12.0
+    given = splats(6, "ellipsoids", low=0.5, high=1.0)
     scales = given.scales.copy()
-    scales[[1, 4], 2] = 2.0
+    scales[[1, 4], 2] = 2.5  # a tenth of the volume is 2.4 mm
     given = dataclasses.replace(given, scales=scales)
     pull = np.array([1, 1, 0, 0, 1, 0]) * 6e-5
-    after, origin = densify.densify(given, pull, unit, densify.Schedule(), KEY)
+    after, origin = densify.densify(given, pull, SMALL, densify.Schedule(), KEY)
     # 0 is doubled, 1 and 4 give way to two each
     assert origin.tolist() == [0, 2, 3, 5, -1, -1, -1, -1, -1]
     stay = origin[:4]
@@ -176,8 +176,8 @@ def test_small_splats_are_doubled_and_large_ones_split():
     halved = np.array([0.5, 1, 1, 1, 0.5, 0.5, 0.5, 0.5, 0.5], np.float32)[:, None]
     assert np.array_equal(after.densities, given.densities[[*stay, 0, 1, 4, 1, 4]] * halved)
     np.testing.assert_allclose(after.scales[5:], given.scales[[1, 4, 1, 4]] / 1.6, rtol=1e-6)
-    again, _ = densify.densify(given, pull, unit, densify.Schedule(), KEY)
-    other, _ = densify.densify(given, pull, unit, densify.Schedule(), rng.stream_key("test", "split", 1))
+    again, _ = densify.densify(given, pull, SMALL, densify.Schedule(), KEY)
+    other, _ = densify.densify(given, pull, SMALL, densify.Schedule(), rng.stream_key("test", "split", 1))
     assert np.array_equal(after.positions, again.positions)
     assert not np.array_equal(after.positions[5:], other.positions[5:])
     moments = adam.Moments(first={"x": np.arange(6, dtype=np.float32)[:, None]}, second={}, steps=3)
@@ -186,9 +186,9 @@ def test_small_splats_are_doubled_and_large_ones_split():
 
 
 def test_halves_of_a_split_are_drawn_from_it():
-    one = splats(1, "ellipsoids", low=2.0)
+    one = splats(1, "ellipsoids", low=2.5, within=0.0)  # the volume ends at 4 σ and beyond
     many = Splats(**{field.name: np.repeat(getattr(one, field.name), 4000, 0) for field in dataclasses.fields(one)})
-    after, _ = densify.densify(many, np.ones(4000), 12.0, densify.Schedule(), KEY)
+    after, _ = densify.densify(many, np.ones(4000), SMALL, densify.Schedule(), KEY)
     expected = covariances(one.shapes())[0][0]
     spread = np.cov((after.positions - one.positions).T.astype(float))
     # 8000 draws: variances within √(2/8000) = 1.6 %, four times that
@@ -200,12 +200,16 @@ def test_faint_and_broken_splats_go_and_the_cap_holds():
     densities = given.densities.copy()
     densities[0], densities[1, 0], densities[2, 1] = 1e-7, 0, np.nan
     given = dataclasses.replace(given, densities=densities)
-    after, origin = densify.densify(given, np.zeros(8), 12.0, schedule, KEY)
+    after, origin = densify.densify(given, np.zeros(8), SMALL, schedule, KEY)
     assert origin.tolist() == [1, 3, 4, 5, 6, 7]
     pull = np.array([0, 0, 0, 1, 5, 2, 4, 3.0])
-    after, origin = densify.densify(given, pull, 12.0, schedule, KEY)
+    after, origin = densify.densify(given, pull, SMALL, schedule, KEY)
     assert len(after) == 8 and np.array_equal(after.positions[6:], given.positions[[4, 6]])
-    none, origin = densify.densify(splats(0, "ellipsoids"), np.zeros(0), 12.0, schedule, KEY)
+    positions = given.positions.copy()
+    positions[3, 0], positions[4, 2], positions[5, 1] = 12.1, -12.1, 11.9
+    left, origin = densify.densify(dataclasses.replace(given, positions=positions), np.zeros(8), SMALL, schedule, KEY)
+    assert origin.tolist() == [1, 5, 6, 7] and len(left) == 4
+    none, origin = densify.densify(splats(0, "ellipsoids"), np.zeros(0), SMALL, schedule, KEY)
     assert len(none) == 0 and origin.size == 0
     assert [s for s in range(0, 16000, 50) if schedule.is_due(s)] == list(range(600, 15000, 100))
     assert densify.screen_pull(np.array([2e-7]), 512) == pytest.approx(5.12e-5)

@@ -26,7 +26,7 @@ RATES = {"positions": 2e-4, "scales": 5e-3, "rotations": 1e-3, "densities": 0.01
 """Learning rates at the start, per unit of length for positions."""
 DECAY = 0.1  # of a rate over the whole run
 FIRST, SECOND, EPS = 0.9, 0.999, 1e-15
-SCALES = (0.0005, 0.5)  # units, R2-Gaussian's bounds
+SCALES = (0.0005, 0.5)  # shares of the volume's widest side, R2-Gaussian's bounds
 ONE = np.float32(1)
 
 
@@ -103,8 +103,8 @@ def unit_length(geometry: Geometry) -> float:
 
 def activation(geometry: Geometry) -> Activation:
     """Return R2-Gaussian's activations in the volume of `geometry`."""
-    unit = unit_length(geometry)
-    return Activation(unit=unit, bounds=(SCALES[0] * unit, SCALES[1] * unit))
+    side = max(geometry.s_voxel)
+    return Activation(unit=unit_length(geometry), bounds=(SCALES[0] * side, SCALES[1] * side))
 
 
 def no_moments(parameters: Parameters) -> Moments:

@@ -7,14 +7,15 @@ from numpy.typing import NDArray
 
 from ctsim import rng
 from ctsim.errors import InputError
-from reconstruct.splat.adam import Array, Moments
+from ctsim.geometry import Geometry
+from reconstruct.splat.adam import Array, Moments, unit_length
 from reconstruct.splat.kernels.rotations_cpu import write_rotations
 from reconstruct.splat.model import Splats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Schedule:
-    """When and where to densify; lengths are units (see `adam`), densities per unit."""
+    """When and where to densify; `large` is a share of the volume's widest side, `faint` per unit (see `adam`)."""
 
     first: int = 500
     last: int = 15000
@@ -35,13 +36,14 @@ def screen_pull(centres: NDArray[np.floating], n_u: int) -> NDArray[np.floating]
 
 
 def densify(
-    splats: Splats, pull: NDArray[np.floating], unit: float, schedule: Schedule, key: np.uint64
+    splats: Splats, pull: NDArray[np.floating], geometry: Geometry, schedule: Schedule, key: np.uint64
 ) -> tuple[Splats, NDArray[np.int64]]:
     """Return the splats afterwards, and of which splat before each is the same one (−1: it is new).
 
     Where `pull` [splat], the mean of `screen_pull`, reaches the threshold, a splat of no scale above `large` becomes
     two of half the density at the same place, and a larger one two of half the density, scales by 1.6 down, at places
-    drawn from itself. Then those fainter than `faint` in all channels, and any that are not finite, are removed.
+    drawn from itself. Then those fainter than `faint` in all channels, those whose centre has left the volume of
+    `geometry`, and any that are not finite, are removed.
     Where the cap allows fewer, those that are pulled most are chosen. `key` names the stream of random numbers.
     """
     if splats.rotations is None:
@@ -49,7 +51,7 @@ def densify(
     room = max(0, schedule.most - len(splats))
     chosen = np.flatnonzero(pull >= schedule.pull)
     chosen = np.sort(chosen[np.argsort(-pull[chosen], kind="stable")[:room]])
-    is_large = splats.scales[chosen].max(1, initial=0.0) > schedule.large * unit
+    is_large = splats.scales[chosen].max(1, initial=0.0) > schedule.large * max(geometry.s_voxel)
     cloned, split = chosen[~is_large], chosen[is_large]
     densities = splats.densities.copy()
     densities[chosen] *= np.float32(0.5)
@@ -62,13 +64,17 @@ def densify(
         scales[tail] /= np.float32(1.6)
     origin = np.concatenate([stay, np.full(len(order) - len(stay), -1)])
     grown = Splats(positions=positions, scales=scales, densities=densities[order], rotations=splats.rotations[order])
-    return _pruned(grown, origin, schedule.faint / unit)
+    return _pruned(grown, origin, geometry, schedule.faint / unit_length(geometry))
 
 
-def _pruned(splats: Splats, origin: NDArray[np.int64], faint: float) -> tuple[Splats, NDArray[np.int64]]:
+def _pruned(
+    splats: Splats, origin: NDArray[np.int64], geometry: Geometry, faint: float
+) -> tuple[Splats, NDArray[np.int64]]:
     assert splats.rotations is not None
     columns = [splats.positions, splats.scales, splats.densities, splats.rotations]
     kept = (splats.densities >= faint).any(1) & np.isfinite(np.concatenate(columns, 1)).all(1)
+    middle, side = np.array(geometry.off_origin)[::-1], np.array(geometry.s_voxel)[::-1]
+    kept &= (np.abs(splats.positions - middle) <= side / 2).all(1)
     positions, scales, densities, rotations = (array[kept] for array in columns)
     return Splats(positions=positions, scales=scales, densities=densities, rotations=rotations), origin[kept]
 

@@ -119,7 +119,8 @@ class Learner:
     def _densify(self, done: int) -> None:
         activation, pull = self.objective.activation, self._pulls / np.maximum(self._seen, 1)
         key = rng.stream_key(stream(self.settings), "split", done)
-        splats, origin = densify.densify(self.splats(), pull, activation.unit, self._schedule, key)
+        geometry = self.objective.projector.geometry
+        splats, origin = densify.densify(self.splats(), pull, geometry, self._schedule, key)
         splats, order = sorted_by_z(splats)
         # a density that underflowed is no softplus; one channel may be 0 where the other is not
         densities = np.maximum(splats.densities, np.float32(LEAST_DENSITY / activation.unit))
