@@ -338,8 +338,9 @@ def test_verdicts_name_what_beats_a_default():
         mark = Mark(label=label, seconds=seconds, default=True, values={"rms": rms, "worst": worst, "off_edges": 1.0})
         return msgspec.structs.replace(timed(setting(label, part="simulator", curve="x")), marks=(mark,))
 
-    # b is as good as a but slower; c is better than all; d is beaten in rms alone
+    # e is a again; b is as good as a but slower; c is better than all; d is beaten in rms alone
     of = [row("a", 1.0, 0.5, 0.5), row("b", 2.0, 0.5, 0.5), row("c", 4.0, 0.1, 0.4), row("d", 5.0, 0.2, 0.3)]
+    of.append(row("e", 1.0, 0.5, 0.5))
     lines = [line for line in pareto_table.summary(of).splitlines() if line.startswith("- Default")]
     name = "the front in relative RMS of P"
     assert lines == [
@@ -347,6 +348,7 @@ def test_verdicts_name_what_beats_a_default():
         f"- Default x, b: off {name} (x, a is no worse in 0.50 of the time); in all errors at once beaten by x, a.",
         f"- Default x, c: on {name}; in all errors at once beaten by none.",
         f"- Default x, d: off {name} (x, c is no worse in 0.80 of the time); in all errors at once beaten by none.",
+        f"- Default x, e: on {name}; in all errors at once beaten by none.",
     ]
     assert pareto_figure.draw(points(of)).axes
 
