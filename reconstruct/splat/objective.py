@@ -1,7 +1,7 @@
 """The loss of one view that the published splat methods go down, and its gradient.
 
-Where the publications leave it open: clamped pixels are 0 in both images that a loss compares; TV pulls at densities
-only, not at places and shapes.
+Where the publications leave it open: clamped pixels are 0 in both images that a loss compares; SSIM's range is the
+scan's greatest P; TV pulls at densities only, not at places and shapes.
 """
 
 import dataclasses
