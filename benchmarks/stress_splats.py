@@ -159,7 +159,7 @@ def not_finite(_: int, found: Findings) -> None:
             arrays[name][0, 0] = value
             odd = Splats(**arrays)
             _beside_fair(found, f"{value} in {name}", odd, seen=name == "densities")
-            kept, origin = densify(joined(odd, FAIR), np.zeros(2), 10.0, Schedule(), np.uint64(1))
+            kept, origin = densify(joined(odd, FAIR), np.zeros(2), GEOMETRY, Schedule(), np.uint64(1))
             found.say(f"{value} in {name}: dropped", holds=len(kept) == 1 and origin.tolist() == [1])
 
 
