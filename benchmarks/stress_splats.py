@@ -115,7 +115,7 @@ def needles(_: int, found: Findings) -> None:
 
 
 def sub_pixel(_: int, found: Findings) -> None:
-    """Project splats of a tenth, a thousandth and a millionth of a pixel; they keep their mass."""
+    """Project splats of a tenth, a thousandth and a millionth of a millimetre."""
     for scale in (0.1, 1e-3, 1e-6):
         given = splat([0.4, -0.3, 0.2], [scale] * 3)
         _near_float64(found, given)
