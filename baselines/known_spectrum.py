@@ -6,9 +6,9 @@ volumes [z, y, x] in 1/mm, lengths in mm.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Self, TypeVar
+from typing import Self
 
 import msgspec
 import numpy as np
@@ -21,10 +21,11 @@ from baselines.metal import auto_mask, water_value
 from baselines.prior import BONE, LUNG
 from ctsim.detector import Detector
 from ctsim.errors import InputError
-from ctsim.materials import E_MIN, attenuation, material
+from ctsim.materials import attenuation, material
 from ctsim.quadrature import effective_weights, energy_rule, full_rule
 from ctsim.spectrum import Spectrum, Tube, spectrum
 from ctsim.types import Scan, Status, Volume
+from reconstruct.beam import Given, known_detector, known_tube
 from reconstruct.fdk import fdk_stream
 from reconstruct.log import count_floor, line_integrals
 from reconstruct.projector import forward_columns
@@ -33,8 +34,6 @@ from reconstruct.redundancy import ray_weights
 P_TOP, NODES = 30.0, 2048  # of the table of water; beyond it goes on straight
 L0_VIEWS, SEEN = 8, 0.05  # views, and the least P, that the median path is taken from
 Array = NDArray[np.float32]
-Given = Mapping[str, Any] | None
-Settings = TypeVar("Settings", Tube, Detector)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,10 +74,7 @@ class Beam:
         Raises InputError for keys and values that Tube and Detector refuse, and for a bow-tie, behind which every
         pixel has a spectrum of its own.
         """
-        known = _settings("tube", {} if tube is None else tube, Tube, {"kvp": _kvp(scan.e_max)})
-        if known.bowtie is not None:
-            raise InputError("tube: one table serves all pixels only without a bow-tie, got tube.bowtie")
-        sees = _settings("detector", {} if detector is None else detector, Detector, {})
+        known, sees = known_tube(tube, scan.e_max), known_detector(detector)
         beam = cls(tube=known, detector=sees, spectrum=spectrum(known), l0=0.0)
         return cls(tube=known, detector=sees, spectrum=beam.spectrum, l0=_median_path(scan, beam.table()))
 
@@ -105,28 +101,6 @@ class Beam:
             "water_path_mm": self.l0,
             "water_per_mm": self.effective("water"),
         }
-
-
-def _settings(
-    name: str, given: "Mapping[str, Any] | Settings", kind: type[Settings], defaults: dict[str, Any]
-) -> Settings:
-    if isinstance(given, kind):
-        return given
-    if not isinstance(given, Mapping):
-        raise InputError(f"{name}: expected a table such as {defaults or {'kind': 'gos'}}, got {given!r}")
-    try:
-        return msgspec.convert({**defaults, **given}, kind)
-    except (msgspec.ValidationError, InputError) as error:
-        raise InputError(f"{name}: {error}") from None
-
-
-def _kvp(e_max: float) -> float:
-    """Return the kVp whose highest bin, of at most 0.25 keV to 100 kVp, is centred on `e_max`."""
-    kvp = e_max
-    for _ in range(3):
-        n = math.ceil((kvp - E_MIN) / max(0.25, kvp / 400))
-        kvp = e_max + (kvp - E_MIN) / n / 2
-    return round(kvp, 6)  # 19.9999999 would be outside the table that begins at 20
 
 
 def _median_path(scan: Scan, table: Table) -> float:

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from baselines.inpaint import FILLS, Filled, fill
 from baselines.metal import INSERTS, Metal, Trace, find_metal, reinsert
-from baselines.settings import keywords
 from ctsim.errors import InputError
 from ctsim.types import Scan, Status, Volume
 from reconstruct.fdk import add_fdk
 from reconstruct.fdk import reconstruct as fdk
+from reconstruct.settings import keywords
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,11 +16,11 @@ from baselines.inpaint import Filled, fill
 from baselines.limar import Bridging, finished, mended, uncorrected
 from baselines.metal import Trace, find_metal, reinsert
 from baselines.prior import check_prior, choose_prior
-from baselines.settings import keywords
 from ctsim.errors import InputError
 from ctsim.types import Scan, Status, Volume
 from reconstruct.fdk import reconstruct as fdk
 from reconstruct.projector import forward_columns
+from reconstruct.settings import keywords
 
 NORMALISATIONS = ("offset", "additive", "ratio")
 

@@ -23,8 +23,8 @@ from baselines.iterative import (
     visiting_order,
     weighted_dot,
 )
-from baselines.settings import keywords
 from ctsim.types import Scan, Volume
+from reconstruct.settings import keywords
 
 CACHE_BYTES = 1 << 30  # voxel sums of the subsets are kept up to this size, else made anew on each visit
 

@@ -20,9 +20,9 @@ from baselines.iterative import (
 )
 from baselines.metal import water_value
 from baselines.sart import Passes
-from baselines.settings import keywords
 from ctsim.errors import InputError
 from ctsim.types import Scan, Volume
+from reconstruct.settings import keywords
 from reconstruct.tv import Denoiser, axis_ratios, descend, total_variation
 
 # Sidky and Pan's values

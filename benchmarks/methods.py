@@ -121,6 +121,8 @@ def find(name: str, overrides: dict[str, Any] | None = None) -> Method:
     params |= given
     if inputs == METAL_MASK and params["mask"] == "auto":
         inputs = COUNTS_ONLY  # it finds the metal itself
+    if inputs == COUNTS_ONLY and params.get("response") == "known":
+        inputs = SPECTRUM
     return Method(
         name=name,
         target=target,

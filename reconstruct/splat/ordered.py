@@ -9,7 +9,6 @@ a smaller error on a thorax with iron than three without.
 """
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -55,8 +54,11 @@ class Fit:
         self._projector = Projector(geometry=self.data.geometry)
         self._shapes = self.lattice.splats(np.zeros((len(self.lattice), 1), np.float32)).shapes()
 
-    def run(self, passes: int, proceed: Callable[["Fit"], bool]) -> bool:
-        """Go through all views `passes` times; stop and return False when `proceed`, asked after a subset, says so."""
+    def run(self, passes: int, proceed: Callable[["Fit", bool], bool]) -> bool:
+        """Go through all views `passes` times; stop and return False when `proceed(fit, whole)` says so.
+
+        It is asked after each subset, `whole` where that was the last of a pass.
+        """
         n_views = self.data.geometry.n_views
         n = min(max(n_views // SUBSET, LEAST_SUBSETS), n_views)
         for _ in range(passes):
@@ -67,9 +69,10 @@ class Fit:
                 if (k + 1) % SMOOTH_EVERY == 0 or k + 1 == n:
                     share = (k % SMOOTH_EVERY + 1) / n
                     self.u = self.lattice.denoise(self.u, self.tv * self.curve.water * share, SMOOTHING)
-                if not proceed(self):
+                if k + 1 == n:
+                    self.misfit = misfit
+                if not proceed(self, k + 1 == n):
                     return False
-            self.misfit = misfit
         return True
 
     def volume(self) -> Image:
@@ -115,20 +118,3 @@ def bit_reversed(n: int) -> list[int]:
     bits = max(n - 1, 0).bit_length()
     order = (int(f"{k:0{bits}b}"[::-1], 2) if bits else 0 for k in range(1 << bits))
     return [k for k in order if k < n]
-
-
-@dataclass(slots=True, kw_only=True)
-class Clock:
-    """Tells a fit when its seconds are over."""
-
-    seconds: float
-    began: float = field(default_factory=time.perf_counter)
-
-    @property
-    def elapsed(self) -> float:
-        """Seconds since the start."""
-        return time.perf_counter() - self.began
-
-    def proceed(self, _: Fit) -> bool:
-        """Whether time is left."""
-        return self.elapsed < self.seconds

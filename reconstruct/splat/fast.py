@@ -1,0 +1,206 @@
+"""The preset "fast": polychromatic splats from counts, geometry and the greatest energy alone.
+
+Coarse to fine: the object is carved from its shadows, fitted on a coarse grid from a start of plain water, and refined
+to a grid finer than the volume's, as fine as the detector sees. No mask, no spectrum (unless one is given) and no FDK
+enter.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ctsim.detector import Detector
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+from ctsim.quadrature import full_rule
+from ctsim.spectrum import Tube, spectrum
+from ctsim.types import Scan, Status, Volume
+from reconstruct.beam import Given, known_detector, known_tube
+from reconstruct.log import line_integrals
+from reconstruct.splat.curve import MaterialCurve
+from reconstruct.splat.lattice import Lattice
+from reconstruct.splat.level import Data, carve, coarser, padded, refined
+from reconstruct.splat.ordered import Fit
+from reconstruct.splat.project import Projector
+from reconstruct.splat.response import Response, basis_functions, evaluate, make_response, tangent
+from reconstruct.splat.volume import voxelise
+from reconstruct.watch import Stopwatch
+
+OPEN = 5.0  # standard deviations of an open pixel below which a ray met nothing
+LEAST_OPEN = 0.01
+EMPTY = 0.05  # times water: a voxel of the coarser volume below that holds no splat
+VIEWS, SHORTEST = 12, 0.5  # views that the read-out's water is measured in, and its least path in voxels
+DENSEST = 15.0  # times water, that is no metal: enamel 9, titanium 43
+SMALLEST = 24  # voxels along an axis below which there is no coarser level
+RESPONSES = ("tube", "known")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What the preset "fast" may be told.
+
+    `passes` over the views are those of each coarser level and of the finest; `tv` is the threshold of denoising in
+    units of water a pass. The finest grid is `fineness` times that of the volume, at most as fine as the detector's
+    pixels at the isocentre. `response` "tube" is a tube behind `filtration` mm of aluminium, seen by a scintillator;
+    "known" takes `tube` and `detector`, tables of a scene file, whole or in part. `readout` is an energy in keV, or
+    "hardened": by the object's own water. After `seconds` it returns what there is. Raises InputError for values that
+    make no sense.
+    """
+
+    passes: tuple[int, int] = (3, 1)
+    tv: float = 0.03
+    fineness: float = 1.5
+    response: Literal["tube", "known"] = "tube"
+    filtration: float = 0.5
+    tube: Given | Tube = None
+    detector: Given | Detector = None
+    readout: float | Literal["hardened"] = "hardened"
+    seconds: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not (len(self.passes) == 2 and min(self.passes) >= 0 and max(self.passes) > 0):
+            raise InputError(f"passes must be two counts, not both 0, got {self.passes}")
+        for name, least in (("tv", 0), ("seconds", 0), ("fineness", 1)):
+            if not getattr(self, name) >= least:
+                raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        if self.response not in RESPONSES:
+            raise InputError(f"response of preset 'fast' must be one of {', '.join(RESPONSES)}, got {self.response!r}")
+        if self.response == "tube" and not (self.tube is None and self.detector is None):
+            raise InputError("tube and detector are for response 'known', got them with response 'tube'")
+        at_energy = isinstance(self.readout, int | float) and math.isfinite(self.readout) and self.readout > 0
+        if self.readout != "hardened" and not at_energy:
+            raise InputError(f"readout must be 'hardened' or a positive energy in keV, got {self.readout!r}")
+
+    def make_response(self, e_max: float) -> Response:
+        """Build the response for a scan of greatest energy `e_max` (keV)."""
+        if self.response == "tube":
+            return make_response("tube", e_max=e_max, basis="klein-nishina", theta=(self.filtration,))
+        seen = full_rule(spectrum(known_tube(self.tube, e_max)), known_detector(self.detector))
+        return make_response("known", e_max=e_max, basis="klein-nishina", spectrum=(seen.energies, seen.w1))
+
+
+def reconstruct(scan: Scan, settings: Settings) -> Volume:
+    """Reconstruct `scan`: attenuation in 1/mm; details hold the volumes "rho_a" and "rho_b" under "densities"."""
+    stopwatch = Stopwatch()
+    p, clamped = line_integrals(scan, slice(None))
+    data = padded(finer(scan.geometry, settings.fineness), p.numpy(), ~clamped.numpy())
+    response = settings.make_response(scan.e_max)
+
+    def proceed(fit: Fit, whole: bool) -> bool:
+        stopwatch.show(fit.view_updates, lambda: _read(fit, settings, scan.geometry)[0], whole=whole)
+        return stopwatch.seconds < settings.seconds
+
+    fit = _coarse_to_fine(data, response, settings, proceed)
+    details: dict[str, Any] = {
+        "response": {"name": response.name, "theta": list(response.trainable)},
+        "clamped_pixels": int(clamped.sum()),
+        "splats": 0 if fit is None else len(fit.lattice),
+    }
+    if fit is None:
+        details["limitation"] = "no ray met anything: the volume is empty"
+        return Volume(values=torch.zeros(scan.geometry.n_voxel), details=details)
+    values, how = _read(fit, settings, scan.geometry)
+    finite = bool(np.isfinite(values).all())
+    rho_a, rho_b = voxelise(fit.lattice.splats(fit.curve(fit.u)[0]), scan.geometry)
+    details |= {
+        "read-out": how,
+        "misfit": fit.misfit if math.isfinite(fit.misfit) else None,
+        "view_updates": fit.view_updates,
+        "densities": {"rho_a": rho_a, "rho_b": rho_b},
+    }
+    return Volume(
+        values=torch.from_numpy(values),
+        status=Status.OK if finite else Status.NONFINITE,
+        reason="" if finite else "the reconstruction holds values that are not finite",
+        details=details,
+    )
+
+
+def finer(geometry: Geometry, fineness: float) -> Geometry:
+    """Return the geometry with up to `fineness` times as many voxels along each axis, none smaller than a pixel.
+
+    A volume's sharp edges lie beyond the frequencies of its own grid. Fitted on that grid they ring; on one half as
+    fine again the error in the tissue fell by 2 dB on every scene tried.
+    """
+    pixel = min(geometry.d_detector) * geometry.dso / geometry.dsd
+    n = [max(k, round(k * min(fineness, d / pixel))) for k, d in zip(geometry.n_voxel, geometry.d_voxel, strict=True)]
+    d_voxel = tuple(d * k / m for d, k, m in zip(geometry.d_voxel, geometry.n_voxel, n, strict=True))
+    return msgspec.structs.replace(geometry, n_voxel=tuple(n), d_voxel=d_voxel)
+
+
+def _read(fit: Fit, settings: Settings, geometry: Geometry) -> tuple[NDArray[np.float32], str]:
+    """Return the volume as settings want it read, [z, y, x], and in words how."""
+    if settings.readout == "hardened":
+        length = typical_length(fit)
+        weights, how = tangent(fit.response, fit.curve.of_water, length), f"hardened by {length:.1f} mm of water"
+    else:
+        a, b = basis_functions(np.array([settings.readout]), fit.response.basis, fit.response.e_max)
+        weights, how = (float(a[0]), float(b[0])), f"at {settings.readout:g} keV"
+    values = fit.curve(fit.u)[0] @ np.array(weights, np.float32)[:, None]
+    return voxelise(fit.lattice.splats(values), geometry)[0], how
+
+
+def _coarse_to_fine(
+    data: Data, response: Response, settings: Settings, proceed: Callable[[Fit, bool], bool]
+) -> Fit | None:
+    """Fit level by level; None where the scan shows nothing."""
+    met = max(OPEN / math.sqrt(_open_photons(data)), LEAST_OPEN)
+    curve = MaterialCurve.of(response, _rough_length(data, response, met))
+    levels = [data]
+    while settings.passes[0] and min(levels[0].geometry.n_voxel) >= 2 * SMALLEST:
+        levels.insert(0, coarser(levels[0]))
+    fit, done = None, 0
+    for level in levels:
+        if fit is None:
+            support = carve(level, met)
+            start = np.where(support, curve.water, 0).astype(np.float32)
+        else:
+            start = refined(fit.volume(), level.geometry)
+            support = start > EMPTY * curve.water
+        if not support.any():
+            return None
+        lattice = Lattice(geometry=level.geometry, support=support)
+        u = lattice.gather(start)
+        fit = Fit(data=level, lattice=lattice, response=response, curve=curve, u=u, tv=settings.tv, view_updates=done)
+        if not fit.run(settings.passes[level is data] if len(levels) > 1 else sum(settings.passes), proceed):
+            break
+        done = fit.view_updates
+    return fit
+
+
+def _open_photons(data: Data) -> float:
+    """Estimate the photons of an open pixel from how far p falls below 0, which only noise does: 1/var."""
+    n_u = data.geometry.n_detector[1]
+    p = data.p[..., :n_u][data.weights[..., :n_u] > 0]
+    below = p[p < 0].astype(np.float64)
+    return float(1 / max(np.mean(below**2), 1e-12)) if below.size else 1e12
+
+
+def _rough_length(data: Data, response: Response, met: float) -> float:
+    """Return the water path (mm) behind which p is the median of the rays that met something."""
+    n_u = data.geometry.n_detector[1]
+    p = data.p[..., :n_u][data.weights[..., :n_u] > 0]
+    seen = p[p > met]
+    if not seen.size:
+        return 0.0
+    lengths = np.linspace(0, 500, 2001)
+    la, lb = ((lengths * density).astype(np.float32) for density in MaterialCurve.of(response, 0.0).of_water)
+    found, _, _ = evaluate(response, la, lb)
+    return float(np.interp(np.median(seen), found, lengths))
+
+
+def typical_length(fit: Fit) -> float:
+    """Return the median water-equivalent path (mm) through what is no metal, of the rays that meet it."""
+    geometry, water = fit.data.geometry, fit.curve.water
+    views = np.unique(np.linspace(0, geometry.n_views - 1, min(VIEWS, geometry.n_views)).round().astype(int))
+    shares = np.where(fit.u < DENSEST * water, fit.u / water, 0).astype(np.float32)
+    splats = fit.lattice.splats(shares[:, None])
+    paths = Projector(geometry=geometry).forward(splats.shapes(), splats.densities, views)
+    met = paths[paths > SHORTEST * max(geometry.d_voxel)]
+    return float(np.median(met)) if met.size else 0.0
