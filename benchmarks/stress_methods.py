@@ -54,6 +54,7 @@ DESCENT = ("asd-pocs", "awpcsd")  # their steps are of one length whatever the g
 SAME_BY_DESCENT = 0.03
 BOUNDS = {"ibhc": 10.0}  # adds to P what its own volume says of hardening, streaks included
 ORDERED = ("sart", "os-sart", "asd-pocs", "awpcsd", "splat")  # a view that comes twice moves them twice
+SAMPLED = ("bhc-poly",)  # fits in 64 views, other ones where there are twice as many
 PHYSICAL = ("splat", "ibhc")  # take materials from tables in 1/mm
 
 
@@ -154,7 +155,7 @@ SCENES: dict[str, Scene] = {
     "one-view": Scene(what="one view", make=lambda n: scan_of(n, of={"n_views": 1}), near=False),
     "two-views": Scene(what="two views", make=lambda n: scan_of(n, of={"n_views": 2}), near=False),
     "arc-90": Scene(what="an arc of 90°", make=lambda n: scan_of(n, of={"arc_deg": 90.0}), near=False),
-    "duplicate-views": Scene(what="every view twice", make=twice, like=scan_of, unlike=ORDERED),
+    "duplicate-views": Scene(what="every view twice", make=twice, like=scan_of, unlike=(*ORDERED, *SAMPLED)),
     "uneven-angles": Scene(
         what="angles that crowd on one side", make=lambda n: scan_of(n, of={"angles_deg": uneven(2 * n)})
     ),

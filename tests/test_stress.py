@@ -104,8 +104,8 @@ def test_an_infinite_value_and_a_missing_refusal_are_found():
     assert [bool(w) for w in found.wrong] == [True] * 3 and "1 of 2" in found.wrong[0]
 
 
-class Sober:
-    """Carries out the cases of this module here, and counts."""
+class Here:
+    """Carries out cases in this process, and counts them."""
 
     ran = 0
 
@@ -119,30 +119,30 @@ class Sober:
         pass
 
     def run(self, case, side):
-        Sober.ran += 1
+        Here.ran += 1
         return carry_out(case, side)
 
 
 @pytest.fixture
 def command(monkeypatch, tmp_path):
-    monkeypatch.setattr("benchmarks.stress_worker.Worker", Sober)
+    monkeypatch.setattr("benchmarks.stress_worker.Worker", Here)
     monkeypatch.setattr(stress, "catalogue", lambda: catalogue()[:3])
-    Sober.ran = 0
+    Here.ran = 0
     return lambda *words: stress.main([str(tmp_path / "out"), "--short", *words])
 
 
 def test_the_command_says_what_is_wrong_and_runs_only_what_is_missing(command, tmp_path, capsys):
     assert command("--dry-run") == 0 and "3 of 3 rows" in capsys.readouterr().out
     assert not (tmp_path / "out").exists()
-    assert command() == 1 and Sober.ran == 3
+    assert command() == 1 and Here.ran == 3
     assert "NOT AS EXPECTED: raising, test: NOT EXPECTED: ValueError" in capsys.readouterr().out
     text = (tmp_path / "out" / "stress.md").read_text(encoding="utf-8")
     assert "1 of 3 rows are as expected" in text and "| wrong | test | w | e | NOT EXPECTED: a number nan" in text
     with (tmp_path / "out" / "stress.jsonl").open("ab") as file:
         file.write(b'{"identity": "torn')  # as a power cut leaves it
-    assert command() == 1 and Sober.ran == 5  # what failed is tried again
-    assert command("--case", "fine") == 0 and Sober.ran == 5
-    assert command("--case", "fine", "--force") == 0 and Sober.ran == 6
+    assert command() == 1 and Here.ran == 5  # what failed is tried again
+    assert command("--case", "fine") == 0 and Here.ran == 5
+    assert command("--case", "fine", "--force") == 0 and Here.ran == 6
     assert len(stress_records.read(tmp_path / "out" / "stress.jsonl")) == 6
     with pytest.raises(InputError, match="did you mean fine"):
         command("--case", "fina")
