@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from benchmarks.paper_layout import load
 from benchmarks.paper_tables import ABLATION
 from ctsim.errors import InputError
 from ctsim.human import human_time
@@ -80,14 +81,12 @@ def variants(numbers: tuple[int, ...] = ()) -> list[Variant]:
 
     Raises InputError for a table that is none.
     """
-    from benchmarks import paper_layout
-
     known = ablations()
     for number in numbers:
         if number not in known:
             raise InputError(f"--table {number}: the ablations are tables {', '.join(map(str, known))}")
     found: dict[tuple[str, str], Variant] = {}
-    for table in paper_layout.load().table:
+    for table in load().table:
         for row in table.rows if table.number in (numbers or known) else ():
             for column in table.columns:
                 p = table.planned(row, column)
@@ -102,9 +101,7 @@ def variants(numbers: tuple[int, ...] = ()) -> list[Variant]:
 
 def ablations() -> tuple[int, ...]:
     """Return the numbers of the paper's tables that are ablations."""
-    from benchmarks import paper_layout
-
-    return tuple(table.number for table in paper_layout.load().table if table.suite == ABLATION)
+    return tuple(table.number for table in load().table if table.suite == ABLATION)
 
 
 def _run(given: Arguments, listed: list[Variant], options: "Options") -> int:

@@ -5,21 +5,21 @@ the command that makes it stands below the table.
 """
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from benchmarks.methods import TABLE
+from benchmarks.paper_layout import Cell, Form, Paper, Planned, Sheet, Table, duration, load, printed, render
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:
-    from benchmarks.paper_layout import Cell, Paper, Planned, Sheet, Table
     from benchmarks.records import Record
 
 Protocol = Literal["paper", "tissue", "aligned", "aligned_50kev"]
-Form = Literal["md", "tex"]
 ABLATION = "ablation"
 """The suite that `run-benchmark ablation` makes and runs."""
 
@@ -45,10 +45,12 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def read(folders: Iterable[Path]) -> "list[Record]":
-    """Read the records of all folders, oldest first. Raises InputError where a folder is not there."""
+def read(folders: tuple[Path, ...]) -> "list[Record]":
+    """Read the records of all folders, oldest first. Raises InputError where a folder or all are missing."""
     from benchmarks import records
 
+    if not folders:
+        raise InputError("no folder is given, expected one or more with records of run-benchmark")
     found: list[Record] = []
     for folder in folders:
         if not folder.is_dir():
@@ -65,18 +67,18 @@ def text_of(found: "list[Record]", form: Form, protocol: Protocol, numbers: tupl
 
     Raises InputError for a table that the paper lacks, and where seeds of one scene have grids of different sizes.
     """
-    from benchmarks import paper_layout, records
+    from benchmarks import records
 
-    paper = paper_layout.load()
+    paper = load()
     measured = Measured.of(found)
-    parts = [paper_layout.render(fill(t, measured, protocol), form) for t in chosen(paper, numbers)]
+    parts = [render(fill(t, measured, protocol), form) for t in chosen(paper, numbers)]
     old = records.outdated(found)
     mark = "" if form == "md" else "% "
     head = f"{mark}Columns “paper”: as printed in {paper.source}. Columns “here”: records of run-benchmark.\n"
     return "\n".join([head, *parts, f"{mark}{old}.\n"] if old else [head, *parts])
 
 
-def chosen(paper: "Paper", numbers: tuple[int, ...]) -> "list[Table]":
+def chosen(paper: Paper, numbers: tuple[int, ...]) -> list[Table]:
     """Return the tables of these numbers, all where none is given."""
     known = [table.number for table in paper.table]
     for number in numbers:
@@ -131,10 +133,8 @@ def _check_grids(latest: "list[Record]") -> None:
             )
 
 
-def fill(table: "Table", measured: Measured, protocol: str) -> "Sheet":
+def fill(table: Table, measured: Measured, protocol: str) -> Sheet:
     """Fill a table from records."""
-    from benchmarks.paper_layout import Sheet, printed
-
     planned = [[table.planned(row, column) for column in table.columns] for row in table.rows]
     here = [[_cell(table, k, p, measured, protocol) for k, p in enumerate(row)] for row in planned]
     paper = [[printed(text) for text in row.figures or ("",) * len(table.columns)] for row in table.rows]
@@ -150,9 +150,8 @@ def fill(table: "Table", measured: Measured, protocol: str) -> "Sheet":
     return sheet.ranked()
 
 
-def _cell(table: "Table", k: int, planned: "Planned", measured: Measured, protocol: str) -> "Cell":
+def _cell(table: Table, k: int, planned: Planned, measured: Measured, protocol: str) -> Cell:
     """Return our cell of column `k`: mean ± standard deviation over seeds; of a failed run its status."""
-    from benchmarks.paper_layout import Cell, duration
     from benchmarks.records import OK
 
     metric = table.columns[k].metric
@@ -170,7 +169,7 @@ def _cell(table: "Table", k: int, planned: "Planned", measured: Measured, protoc
     return Cell(number=float(row["mean"]), text=" ± ".join(texts))
 
 
-def caption(table: "Table", used: "list[Record]", protocol: str) -> str:
+def caption(table: Table, used: "list[Record]", protocol: str) -> str:
     """State protocol, region, reference, range, seeds, inputs and metal insertion of our columns, and what compares."""
     from benchmarks import tables
 
@@ -214,7 +213,7 @@ def _circumstances(used: "list[Record]", timed: bool) -> list[str]:
     return [*parts, f"Inputs: {inputs}.", f"Metal insertion: {metal}."]
 
 
-def _by(used: "list[Record]", what: Any) -> str:
+def _by(used: "list[Record]", what: "Callable[[Record], str]") -> str:
     """Group the methods of records by what they have in common: "metal mask, oracle (limar, nmar)"."""
     groups: dict[str, dict[str, None]] = {}
     for record in used:
@@ -241,10 +240,8 @@ def _remarks(used: "list[Record]", measured: Measured) -> list[str]:
     return failed + old
 
 
-def commands(table: "Table", missing: "list[Planned]") -> list[str]:
+def commands(table: Table, missing: list[Planned]) -> list[str]:
     """Name the commands that make the cells without a record."""
-    from benchmarks.methods import TABLE
-
     strange = dict.fromkeys(p.method for p in missing if p.method not in TABLE)
     notes = [f"–: there is no method {', '.join(strange)} in `benchmarks/methods.py`"] if strange else []
     missing = [p for p in missing if p.method in TABLE]

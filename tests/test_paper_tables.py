@@ -211,7 +211,11 @@ def test_seeds_of_different_grids_are_not_averaged(tmp_path, monkeypatch, capsys
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
-    [(["nowhere"], "nowhere: there is no such folder"), ([".", "--table", "10"], "tables 1 to 9")],
+    [
+        (["nowhere"], "nowhere: there is no such folder"),
+        ([".", "--table", "10"], "tables 1 to 9"),
+        ([], "no folder is given"),
+    ],
 )
 def test_what_is_not_there_is_one_sentence(arguments, says, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["run-benchmark", "paper-tables", *arguments])
