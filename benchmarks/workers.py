@@ -245,19 +245,15 @@ class Cluster:
     def _answers(self, function: Function, jobs: Sequence[Any]) -> Answers:
         waiting, running = deque(range(len(jobs))), {}
         while waiting or running:
-            for address in self._client.nthreads().keys() - {address for _, address in running.values()}:
-                if waiting:
-                    number = waiting.popleft()
-                    future = self._client.submit(
-                        _alone, function, jobs[number], pure=False, workers=[address], allow_other_workers=True
-                    )
-                    running[future] = (number, address)
+            # no more jobs than workers: Dask gives each to an idle one, and moves it when that is lost
+            for _ in range(min(len(waiting), len(self._client.nthreads()) - len(running))):
+                number = waiting.popleft()
+                running[self._client.submit(_alone, function, jobs[number], pure=False)] = number
             done = self._done(list(running))
             if not done:
                 yield None
             for future in done:
-                number, _ = running.pop(future)
-                yield number, self._answer(future)
+                yield running.pop(future), self._answer(future)
 
     def _done(self, futures: list[Any]) -> set[Any]:
         """Wait a little for one of the futures; return those that have ended."""

@@ -206,6 +206,16 @@ def test_a_job_that_kills_its_process_each_time_is_given_up_and_the_others_done(
     assert kind == "cluster" or "signal SIGKILL" in found[0].reason
 
 
+def test_a_cluster_that_loses_all_its_workers_goes_on_with_those_that_come(cluster):
+    address, client = cluster
+    with Cluster(address) as pool:
+        answers = pool.answers(time.sleep, [3.0, 3.0, 0.0])
+        assert next(answers) is None  # two are at work
+        for pid in client.run(os.getpid).values():
+            os.kill(pid, signal.SIGKILL)
+        assert sorted(a for a in answers if a) == [(0, None), (1, None), (2, None)]
+
+
 def test_what_a_job_refuses_is_raised_here_and_the_cores_are_shared():
     with Local(2) as pool:
         assert [a for a in pool.answers(job, ["one"]) if a] == [(0, f"one with {threads_of(2)['NUMBA_NUM_THREADS']}")]
