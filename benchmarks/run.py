@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 STORE = "ctsim.store:open_scan"
+WARM = 1.0  # seconds that a warm-up lasts beyond compiling, where a method knows of time
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -283,8 +284,11 @@ def checked(outcome: Outcome, shape: tuple[int, int, int]) -> Outcome:
 def warm_up(method: Method, scan: "Scan", device: str) -> float:
     """Run the method on a tiny scan of the same kind, so that compiling is not timed; return its seconds.
 
-    The method's own complaint about the tiny scan is not its result and is only logged.
+    A method that can be told how many seconds it may take gets one. Its own complaint about the tiny scan is not its
+    result and is only logged.
     """
+    if "seconds" in method.params:
+        method = dataclasses.replace(method, overrides={**method.overrides, "seconds": WARM})
     with measured() as usage:
         try:
             method.reconstruct(tiny(scan), device)

@@ -38,7 +38,7 @@ TOLERANCE = 1e-4  # of P, to which a known spectrum is reduced
 START = (0.2, 1.0)  # the paper's r and Ē_th
 SCINTILLATOR = Detector(kind="gos", thickness=0.2)
 ELECTRON_REST = 510.998950  # keV
-_MOST_NODES = 60
+_MOST_NODES = 64
 _SMOOTH = 0.05  # width in Ē of the hinge
 _PEAKS = 5
 _RELATIVE_WIDTH = 0.5  # ε of "sinh"; ρb/ε is all that the data know, so that no other value fits better
