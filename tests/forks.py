@@ -5,6 +5,7 @@ change of a file (half of what was to be written is then written), or against a 
 """
 
 import ctypes
+import faulthandler
 import json
 import os
 import resource
@@ -19,6 +20,7 @@ from typing import Any, Self
 
 CLONE_NEWNS, CLONE_NEWUSER = 0x00020000, 0x10000000
 CAPABILITIES_3 = 0x20080522
+HANGS = 120.0  # seconds after which a run tells where it is and ends
 LARGEST = 8192  # less than a volume of the tests
 COUNTED = ("write", "pwrite", "fsync", "fdatasync", "replace", "rename", "unlink", "mkdir", "ftruncate")
 
@@ -112,6 +114,7 @@ def attempt(command: list[str], here: bool = False, seconds: float | None = None
 def be(command: list[str], counted: int, change: int | None = None, disk: Any = None, powerless: bool = False) -> None:
     """Be the command."""
     code = 99
+    faulthandler.dump_traceback_later(HANGS, exit=True)
     try:
         if disk:
             from benchmarks import make_dataset
