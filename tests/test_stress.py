@@ -32,16 +32,12 @@ from reconstruct.splat.published_settings import Settings
 SMALLEST = 12
 # every scene meets a third of the methods here and every method a third of the scenes; the command runs all
 METHODS = [c for k, c in enumerate(stress_methods.cases()) if (k // len(TABLE) + k % len(TABLE)) % 3 == 0]
-# a known fault, a row of the table that says NO: see docs/stability.md
-DIVERGES = {("truncated", "splat")}
 CASES = [*stress_simulator.cases(), *stress_splats.cases(), *stress_chain.cases(), *METHODS]
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c.name}-{c.subject}")
 def test_a_case_is_as_expected(case):
     outcome = carry_out(case, SMALLEST)
-    if not outcome.ok and (case.name, case.subject) in DIVERGES:
-        pytest.xfail(outcome.found)
     assert outcome.ok, outcome.found
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from ctsim.materials import attenuation
+from reconstruct.splat.kernels import curve_cpu
 from reconstruct.splat.response import Response, tangent
 
 MATERIALS = ("water", "cortical_bone", "Al", "Ti", "Fe")
@@ -58,12 +59,19 @@ class MaterialCurve:
         """ρa and ρb of water, 1/mm."""
         return float(self.densities[1, 0]), float(self.densities[1, 1])
 
-    def __call__(self, u: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return (ρa, ρb) and their derivatives with respect to u, both [splat, 2]."""
-        k = np.clip(np.searchsorted(self.knots, u, side="right") - 1, 0, len(self.slopes) - 1)
-        slopes = self.slopes[k]
-        values = self.densities[k] + slopes * (u - self.knots[k])[:, None]
-        return values.astype(np.float32), slopes.astype(np.float32)
+    def densities_of(self, u: NDArray[np.float32], unit: float = 1.0) -> NDArray[np.float32]:
+        """Return (ρa, ρb) over `unit`, float32 [splat, 2]."""
+        out = np.empty((u.size, 2), np.float32)
+        curve_cpu.evaluate(u, self.knots, self.densities, self.slopes, unit, out)
+        return out
+
+    def transpose(
+        self, u: NDArray[np.float32], sums: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return how two pairs of sums by (ρa, ρb), float32 [splat, 4], change with each unknown: two [splat]."""
+        first, second = np.empty_like(u), np.empty_like(u)
+        curve_cpu.transpose(u, self.knots, self.slopes, sums, first, second)
+        return first, second
 
 
 def _densities(response: Response, material: str) -> NDArray[np.float64]:

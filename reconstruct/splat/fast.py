@@ -96,18 +96,19 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         stopwatch.show(fit.view_updates, lambda: _read(fit, settings, scan.geometry)[0], whole=whole)
         return stopwatch.seconds < settings.seconds
 
-    fit = _coarse_to_fine(data, response, settings, proceed)
+    fit = None if bool(clamped.all()) else _coarse_to_fine(data, response, settings, proceed)
     details: dict[str, Any] = {
         "response": {"name": response.name, "theta": list(response.trainable)},
         "clamped_pixels": int(clamped.sum()),
         "splats": 0 if fit is None else len(fit.lattice),
     }
     if fit is None:
-        details["limitation"] = "no ray met anything: the volume is empty"
+        blind = bool(clamped.all())
+        details["limitation"] = f"{'no reading is of use' if blind else 'no ray met anything'}: the volume is empty"
         return Volume(values=torch.zeros(scan.geometry.n_voxel), details=details)
     values, how = _read(fit, settings, scan.geometry)
     finite = bool(np.isfinite(values).all())
-    rho_a, rho_b = voxelise(fit.lattice.splats(fit.curve(fit.u)[0]), scan.geometry)
+    rho_a, rho_b = voxelise(fit.lattice.splats(fit.curve.densities_of(fit.u)), scan.geometry)
     details |= {
         "read-out": how,
         "misfit": fit.misfit if math.isfinite(fit.misfit) else None,
@@ -142,7 +143,7 @@ def _read(fit: Fit, settings: Settings, geometry: Geometry) -> tuple[NDArray[np.
     else:
         a, b = basis_functions(np.array([settings.readout]), fit.response.basis, fit.response.e_max)
         weights, how = (float(a[0]), float(b[0])), f"at {settings.readout:g} keV"
-    values = fit.curve(fit.u)[0] @ np.array(weights, np.float32)[:, None]
+    values = fit.curve.densities_of(fit.u) @ np.array(weights, np.float32)[:, None]
     return voxelise(fit.lattice.splats(values), geometry)[0], how
 
 

@@ -53,6 +53,12 @@ class Lattice:
             densities=(densities / np.float32(self.unit)).astype(np.float32),
         )
 
+    @property
+    def padded(self) -> tuple[int, int]:
+        """Size (y, x) of a slice with room for the tails of a ramp filter, which fall as the square of the distance."""
+        n_y, n_x = (int(fft.next_fast_len(n + n // 4, real=True) or n) for n in self.support.shape[1:])
+        return n_y, n_x
+
     def scatter(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Put values [splat] into their voxels: [z, y, x], zero elsewhere."""
         volume = np.zeros(self.support.size, np.float32)
@@ -69,9 +75,8 @@ class Lattice:
         return self.gather(self._denoiser.run(columns, tau, iterations).transpose(2, 0, 1))
 
     def filter_slices(self, values: NDArray[np.float32], gain: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Multiply the spectrum of every slice, padded to twice its size, by `gain` [2·y, x + 1]."""
-        _, n_y, n_x = self.support.shape
-        size = (2 * n_y, 2 * n_x)
+        """Multiply the spectrum of every slice, `padded`, by `gain`, as `rfft2` orders it."""
+        (_, n_y, n_x), size = self.support.shape, self.padded
         spectrum = np.asarray(fft.rfft2(self.scatter(values), s=size, axes=(1, 2), workers=-1)) * gain
         filtered = np.asarray(fft.irfft2(spectrum, s=size, axes=(1, 2), workers=-1), np.float32)
         return self.gather(filtered[:, :n_y, :n_x])

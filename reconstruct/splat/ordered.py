@@ -27,6 +27,7 @@ SUBSET, LEAST_SUBSETS = 10, 8
 STEEPEST = 0.8
 """Greatest gain of the ramp, as a share of the views in a subset."""
 SMOOTH_EVERY, SMOOTHING = 4, 8  # subsets from one denoising to the next, and its iterations
+LONGEST = 3.0  # times the median root of a step: hardly seen splats, their steps spread by F, make a fit diverge
 FAINT = 0.3  # times water: splats below are preconditioned as if they held this
 
 Image = NDArray[np.float32]
@@ -51,7 +52,8 @@ class Fit:
     _shapes: Image = field(init=False)
 
     def __post_init__(self) -> None:
-        self._projector = Projector(geometry=self.data.geometry)
+        # splats of half a voxel span so small an angle that EWA leaves out about a thousandth of the peak at most
+        self._projector = Projector(geometry=self.data.geometry, tolerance=math.inf)
         self._shapes = self.lattice.splats(np.zeros((len(self.lattice), 1), np.float32)).shapes()
 
     def run(self, passes: int, proceed: Callable[["Fit", bool], bool]) -> bool:
@@ -81,8 +83,7 @@ class Fit:
 
     def _step(self, views: NDArray[np.int64]) -> float:
         """Update `u` from some views; return their mean |P − p|."""
-        densities, slopes = self.curve(self.u)
-        values = densities / np.float32(self.lattice.unit)
+        values = self.curve.densities_of(self.u, self.lattice.unit)
         paths = self._projector.forward(self._shapes, values, views)
         la, lb = (np.ascontiguousarray(paths[:, c]) for c in (0, 1))
         p, by_a, by_b = evaluate(self.response, la, lb)
@@ -92,8 +93,7 @@ class Fit:
         pulls = weights * lacking
         images = np.stack([pulls * by_a, pulls * by_b, along * by_a, along * by_b], 1, dtype=np.float32)
         sums = self._projector.adjoint(self._shapes, images, views)
-        gradient, curvature = (np.einsum("sc,sc->s", slopes, sums[:, k : k + 2]) for k in (0, 2))
-        self._move(gradient, curvature, len(views))
+        self._move(*self.curve.transpose(self.u, sums), len(views))
         self.view_updates += len(views)
         return float(np.abs(lacking).mean())
 
@@ -101,15 +101,18 @@ class Fit:
         water = self.curve.water
         held = np.maximum(self.u, np.float32(FAINT * water))
         root = np.sqrt(held / np.maximum(curvature, np.float32(1e-20)))
-        half = root * gradient
         tissue = self.u < METAL * water  # a metal's own steps are so large that spread they swamp the tissue
+        if tissue.any():
+            np.minimum(root, np.float32(LONGEST * np.median(root[tissue])), out=root, where=tissue)
+        half = root * gradient
         spread = self.lattice.filter_slices(np.where(tissue, half, 0), self._ramp(n_views))
         step = root * np.where(tissue, spread, half)
         self.u = np.clip(self.u + step, 0, np.float32(self.curve.knots[-1]))
 
     def _ramp(self, n_views: int) -> Image:
         _, n_y, n_x = self.lattice.support.shape
-        cycles = np.hypot((np.fft.fftfreq(2 * n_y) * n_y)[:, None], np.fft.rfftfreq(2 * n_x) * n_x)
+        p_y, p_x = self.lattice.padded
+        cycles = np.hypot((np.fft.fftfreq(p_y) * n_y)[:, None], np.fft.rfftfreq(p_x) * n_x)
         return np.clip(cycles * math.pi / n_views, 1, max(STEEPEST * n_views, 1)).astype(np.float32)
 
 

@@ -29,6 +29,8 @@ CHUNKS = 16  # of splats at least, one a task
 BANDS, BAND = 16, 32  # at most so many bands of rows, each of at least so many: a task adds splats in their order
 ROWS = 16  # rows by multiplication before the exponentials are taken anew
 STEEP = 110.0  # −2 log of the faintest value that multiplication may start from
+CHANGE = 50.0  # −2 log of what multiplication may make of a fainter one: e^(25 − 55) of the peak is nothing
+UPRIGHT, NARROWEST = 0.1, 12.5  # C_uv/C_vv and C_vv up to which a change, (cutoff + 0.8 √C_vv)², stays below it
 LARGEST = 1e30  # of a line integral: what is longer is not a splat
 # a camera vector: source, detector centre − source, u step, v step, then numbers, and what follows from all these
 SOURCE, ACROSS, STEP_U, STEP_V, CUTOFF, TOLERANCE, BOX = 0, 3, 6, 9, 12, 13, 14
@@ -87,8 +89,8 @@ def _in_axes(shapes, i, a):
 def _jacobian(camera, dual, ray, tau):
     """Return the place on the detector, in pixels up to its origin, and its derivative by the position."""
     at, depth = _dot(dual, ray), _of(camera, DEPTH)
-    j = ((dual[0] - at * depth[0]) / tau, (dual[1] - at * depth[1]) / tau, (dual[2] - at * depth[2]) / tau)
-    return at, j
+    over = 1 / tau
+    return at, ((dual[0] - at * depth[0]) * over, (dual[1] - at * depth[1]) * over, (dual[2] - at * depth[2]) * over)
 
 
 @njit(cache=True, error_model="numpy")
@@ -98,7 +100,8 @@ def footprint(shapes, i, camera, fp):
     tau = _dot(c, _of(camera, DEPTH))
     if not tau > 1e-6:
         return False
-    ray = (c[0] / tau, c[1] / tau, c[2] / tau)
+    over = 1 / tau
+    ray = (c[0] * over, c[1] * over, c[2] * over)
     at_u, j_u = _jacobian(camera, _of(camera, DUAL_U), ray, tau)
     at_v, j_v = _jacobian(camera, _of(camera, DUAL_V), ray, tau)
     fp[U0], fp[V0] = at_u - camera[ORIGIN_U], at_v - camera[ORIGIN_V]
@@ -112,11 +115,12 @@ def footprint(shapes, i, camera, fp):
     s_uu, s_uv, s_vv = _dot(b_u, b_u), _dot(b_u, b_v), _dot(b_v, b_v)
     boxed = _dot(crossed, crossed) + box * (s_uu + s_vv + box)
     s_uu, s_vv = s_uu + box, s_vv + box
-    fp[C_UU], fp[C_UV], fp[C_VV] = s_vv / boxed, -s_uv / boxed, s_uu / boxed
+    by_det = 1 / boxed
+    fp[C_UU], fp[C_UV], fp[C_VV] = s_vv * by_det, -s_uv * by_det, s_uu * by_det
     fp[S_UU], fp[S_UV], fp[S_VV] = s_uu, s_uv, s_vv
     fp[REACH_U], fp[REACH_V] = camera[CUTOFF] * math.sqrt(s_uu), camera[CUTOFF] * math.sqrt(s_vv)
     rr = _dot(ray, ray)
-    fp[W0] = camera[PEAK] * s0 * s1 * s2 / (tau * tau) * math.sqrt(rr / boxed)
+    fp[W0] = camera[PEAK] * s0 * s1 * s2 * (over * over) * math.sqrt(rr * by_det)
     fp[EXACT] = 0.0
     if camera[TOLERANCE] < np.inf:
         _write_depths(shapes, i, camera, ray, fp)
@@ -195,9 +199,18 @@ def _q(fp, du, dv):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _is_steep(fp, column, first, last):
-    """Whether a value in this block is too faint to be reached by multiplication; Q is greatest at a corner."""
+    """Whether a value in this block is too faint to be reached by multiplication; Q is greatest at a corner.
+
+    Faint lanes do no harm where they stay faint: Q = du²/S_uu + C_vv (dv − ridge)², and only the latter changes.
+    """
+    if abs(fp[C_UV]) <= UPRIGHT * fp[C_VV] and fp[C_VV] < NARROWEST:
+        return False
     a, b, low, high = column - fp[U0], column - fp[U0] + (WIDTH - 1), first - fp[V0], last - 1 - fp[V0]
-    return max(_q(fp, a, low), _q(fp, b, low), _q(fp, a, high), _q(fp, b, high)) > STEEP
+    if max(_q(fp, a, low), _q(fp, b, low), _q(fp, a, high), _q(fp, b, high)) <= STEEP:
+        return False
+    lean = fp[C_UV] / fp[C_VV]
+    furthest = max(abs(low + lean * a), abs(low + lean * b), abs(high + lean * a), abs(high + lean * b))
+    return fp[C_VV] * furthest * furthest > CHANGE
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -230,15 +243,16 @@ def _start(fp, column, dv, n_u):
 
 
 @njit(cache=True, error_model="numpy")
-def add_splat(fp, values, cutoff, image, n_u, rows):
-    """Add values[c]·w to the image of every channel, one or two, in the half-open range of rows."""
-    n_c = values.shape[0]
+def add_splat(fp, values, i, cutoff, image, n_u, rows):
+    """Add values[i, c]·w to the image of every channel, one or two, in the half-open range of rows."""
+    n_c = values.shape[1]
     n_v = image.shape[0] // n_c
-    if not abs(values[0]) * fp[W0] + abs(values[n_c - 1]) * fp[W0] < LARGEST:
+    first, last = values[i, 0] * fp[W0], values[i, n_c - 1] * fp[W0]
+    if not abs(first) + abs(last) < LARGEST:
         return
     left, right = _columns(fp, n_u)
-    fall = spread(np.float32(math.exp(-fp[C_VV])))
-    a, b = spread(np.float32(values[0] * fp[W0])), spread(np.float32(values[n_c - 1] * fp[W0]))
+    fall = exp(spread(np.float32(-fp[C_VV])))
+    a, b = spread(np.float32(first)), spread(np.float32(last))
     for column in range(left, right, WIDTH):
         low, high = _rows(fp, column, cutoff, n_v)
         low, high = max(low, rows[0]), min(high, rows[1])
@@ -254,12 +268,12 @@ def add_splat(fp, values, cutoff, image, n_u, rows):
 
 
 @njit(cache=True, error_model="numpy")
-def read_splat(fp, images, cutoff, n_u, sums):
-    """Add Σ w·image of every channel, at most four, to `sums`."""
-    n_c = sums.shape[0]
+def read_splat(fp, images, cutoff, n_u, sums, i):
+    """Add Σ w·image of every channel, at most four, to sums[i]."""
+    n_c = sums.shape[1]
     n_v = images.shape[0] // n_c
     left, right = _columns(fp, n_u)
-    fall = spread(np.float32(math.exp(-fp[C_VV])))
+    fall = exp(spread(np.float32(-fp[C_VV])))
     zero = spread(np.float32(0))
     s0, s1, s2, s3 = zero, zero, zero, zero
     for column in range(left, right, WIDTH):
@@ -277,13 +291,13 @@ def read_splat(fp, images, cutoff, n_u, sums):
                     s3 = fma(g, load(images, 3 * n_v + v, column), s3)
                 g = mul(g, r)
                 r = mul(r, fall)
-    sums[0] += np.float32(fp[W0]) * total(s0)
+    sums[i, 0] += np.float32(fp[W0]) * total(s0)
     if n_c > 1:
-        sums[1] += np.float32(fp[W0]) * total(s1)
+        sums[i, 1] += np.float32(fp[W0]) * total(s1)
     if n_c > 2:
-        sums[2] += np.float32(fp[W0]) * total(s2)
+        sums[i, 2] += np.float32(fp[W0]) * total(s2)
     if n_c > 3:
-        sums[3] += np.float32(fp[W0]) * total(s3)
+        sums[i, 3] += np.float32(fp[W0]) * total(s3)
 
 
 @njit(cache=True, error_model="numpy")
@@ -300,7 +314,7 @@ def _footprints(shapes, camera, n_v, bounds, table, reach):
 def _add_band(table, reach, values, cutoff, band, image):
     for i in range(values.shape[0]):
         if reach[i, 0] < band[1] and reach[i, 1] > band[0]:
-            add_splat(table[i], values[i], cutoff, image, image.shape[1] - WIDTH, band)
+            add_splat(table[i], values, i, cutoff, image, image.shape[1] - WIDTH, band)
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
@@ -323,7 +337,7 @@ def _forward_all(shapes, values, camera, image):
     fp = np.empty(FOOTPRINT)
     for i in range(values.shape[0]):
         if footprint(shapes, i, camera, fp):
-            add_splat(fp, values[i], camera[CUTOFF], image, n_u, (0, n_v))
+            add_splat(fp, values, i, camera[CUTOFF], image, n_u, (0, n_v))
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
@@ -337,9 +351,10 @@ def forward_views(shapes, values, cameras, images):
 def _backward_chunk(shapes, bounds, cameras, images, n_u, sums):
     fp = np.empty(FOOTPRINT)
     for view in range(cameras.shape[0]):
+        camera, stack = cameras[view], images[view]
         for i in range(bounds[0], bounds[1]):
-            if footprint(shapes, i, cameras[view], fp):
-                read_splat(fp, images[view], cameras[view, CUTOFF], n_u, sums[i])
+            if footprint(shapes, i, camera, fp):
+                read_splat(fp, stack, camera[CUTOFF], n_u, sums, i)
 
 
 @njit(cache=True, error_model="numpy", parallel=True)

@@ -1,0 +1,37 @@
+"""A material curve and its transpose, one pass over the unknowns each.
+
+The curve from an unknown to two densities is piecewise linear: `knots` [knot], `densities` [knot, 2] and `slopes`
+[knot − 1, 2], float64.
+"""
+
+import numpy as np
+from numba import njit, prange
+
+
+@njit(inline="always")
+def _piece(knots, value):
+    k = 0
+    while k < knots.size - 2 and value >= knots[k + 1]:
+        k += 1
+    return k
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def evaluate(u, knots, densities, slopes, unit, out):
+    """Write both densities of each unknown over `unit`, `out` float32 [unknown, 2]."""
+    over = 1 / unit
+    for i in prange(u.size):
+        k = _piece(knots, u[i])
+        past = u[i] - knots[k]
+        for c in range(2):
+            out[i, c] = (densities[k, c] + slopes[k, c] * past) * over
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def transpose(u, knots, slopes, sums, gradient, curvature):
+    """Write how the sums [unknown, 4], two pairs by density, change with each unknown: float32 [unknown] each."""
+    for i in prange(u.size):
+        k = _piece(knots, u[i])
+        a, b = np.float32(slopes[k, 0]), np.float32(slopes[k, 1])
+        gradient[i] = a * sums[i, 0] + b * sums[i, 1]
+        curvature[i] = a * sums[i, 2] + b * sums[i, 3]
