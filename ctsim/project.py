@@ -23,8 +23,8 @@ from ctsim.solids import pack
 from ctsim.types import Phantom
 
 # Over a pixel in which the thickness changes linearly by R the intensity mean differs from the central
-# ray by R²/24 in P, so R = 0.1 costs 4e-4, below the photon noise of 1e6 photons. Where a solid begins within the
-# pixel the mean can differ by R/2.
+# ray by R²/24 in P, so R = 0.1 costs 4e-4, below the photon noise of 1e6 photons; at a kink it is R/4. Where a solid
+# begins within the pixel the mean can differ by R/2.
 EDGE_THRESHOLD, STEP_THRESHOLD = 0.1, 0.004
 
 
