@@ -27,9 +27,10 @@ class Arguments:
     """Run reconstruction methods over a dataset, score them, and write tables and pictures.
 
     What RESULTS already holds is not run again, unless the data, the method's parameters or its code
-    have changed or the run failed. `run-benchmark inspect` shows what a score's conventions are worth,
-    `run-benchmark peers` compares with other libraries, `run-benchmark reproduce` checks what is claimed of FDK,
-    LIMAR and NMAR.
+    have changed or the run failed. Other commands, each with its own --help: `run-benchmark report` (results as one
+    page), `inspect` (what a score's conventions are worth), `pareto` (time against error), `stress` (numerical
+    stability), `skipping` (what is left out and saved), `peers` (other libraries), `reproduce` (what is claimed of FDK,
+    LIMAR and NMAR), `ablation` and `paper-tables` (the published splat method).
     """
 
     data: tyro.conf.Positional[Path]
