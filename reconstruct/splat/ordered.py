@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from reconstruct.splat.columns import LatticeProjector
 from reconstruct.splat.curve import METAL, MaterialCurve
 from reconstruct.splat.lattice import Lattice
 from reconstruct.splat.level import Data
-from reconstruct.splat.project import Projector
 from reconstruct.splat.response import Response, evaluate
 from reconstruct.splat.volume import voxelise
 
@@ -48,13 +48,10 @@ class Fit:
     tv: float
     misfit: float = math.inf
     view_updates: int = 0
-    _projector: Projector = field(init=False)
-    _shapes: Image = field(init=False)
+    _projector: LatticeProjector = field(init=False)
 
     def __post_init__(self) -> None:
-        # splats of half a voxel span so small an angle that EWA leaves out about a thousandth of the peak at most
-        self._projector = Projector(geometry=self.data.geometry, tolerance=math.inf)
-        self._shapes = self.lattice.splats(np.zeros((len(self.lattice), 1), np.float32)).shapes()
+        self._projector = LatticeProjector(self.data.geometry, self.lattice)
 
     def run(self, passes: int, proceed: Callable[["Fit", bool], bool]) -> bool:
         """Go through all views `passes` times; stop and return False when `proceed(fit, whole)` says so.
@@ -84,7 +81,7 @@ class Fit:
     def _step(self, views: NDArray[np.int64]) -> float:
         """Update `u` from some views; return their mean |P − p|."""
         values = self.curve.densities_of(self.u, self.lattice.unit)
-        paths = self._projector.forward(self._shapes, values, views)
+        paths = self._projector.forward(values, views)
         la, lb = (np.ascontiguousarray(paths[:, c]) for c in (0, 1))
         p, by_a, by_b = evaluate(self.response, la, lb)
         lacking, weights = self.data.p[views] - p, self.data.weights[views]
@@ -92,7 +89,7 @@ class Fit:
         lacking *= weights > 0
         pulls = weights * lacking
         images = np.stack([pulls * by_a, pulls * by_b, along * by_a, along * by_b], 1, dtype=np.float32)
-        sums = self._projector.adjoint(self._shapes, images, views)
+        sums = self._projector.adjoint(images, views)
         self._move(*self.curve.transpose(self.u, sums), len(views))
         self.view_updates += len(views)
         return float(np.abs(lacking).mean())
