@@ -139,7 +139,8 @@ def cluster():
     import dask.config
     from distributed import Client, LocalCluster
 
-    dask.config.set({"distributed.scheduler.allowed-failures": 1})
+    # as many as there are workers: a job may be moved from one that is killed to the other before that is, too
+    dask.config.set({"distributed.scheduler.allowed-failures": 2})
     with (
         LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL") as found,
         Client(found, set_as_default=False) as client,

@@ -53,7 +53,7 @@ class Settings:
     make no sense.
     """
 
-    passes: tuple[int, int] = (3, 1)
+    passes: tuple[int, int] = (3, 2)
     tv: float = 0.03
     fineness: float = 1.5
     response: Literal["tube", "known"] = "tube"
