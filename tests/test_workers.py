@@ -194,7 +194,7 @@ def job(given: str) -> str:
         os.kill(os.getpid(), signal.SIGKILL)
     if given == "refuse":
         raise InputError("not this one")
-    return f"{given} with {os.environ['NUMBA_NUM_THREADS']}"
+    return f"{given} with {os.environ.get('NUMBA_NUM_THREADS')}"
 
 
 @pytest.mark.parametrize("kind", ["local", "cluster"])
