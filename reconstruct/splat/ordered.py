@@ -48,10 +48,10 @@ class Fit:
     tv: float
     misfit: float = math.inf
     view_updates: int = 0
-    _projector: LatticeProjector = field(init=False)
+    projector: LatticeProjector = field(init=False)
 
     def __post_init__(self) -> None:
-        self._projector = LatticeProjector(self.data.geometry, self.lattice)
+        self.projector = LatticeProjector(self.data.geometry, self.lattice)
 
     def run(self, passes: int, proceed: Callable[["Fit", bool], bool]) -> bool:
         """Go through all views `passes` times; stop and return False when `proceed(fit, whole)` says so.
@@ -81,7 +81,7 @@ class Fit:
     def _step(self, views: NDArray[np.int64]) -> float:
         """Update `u` from some views; return their mean |P − p|."""
         values = self.curve.densities_of(self.u, self.lattice.unit)
-        paths = self._projector.forward(values, views)
+        paths = self.projector.forward(values, views)
         la, lb = (np.ascontiguousarray(paths[:, c]) for c in (0, 1))
         p, by_a, by_b = evaluate(self.response, la, lb)
         lacking, weights = self.data.p[views] - p, self.data.weights[views]
@@ -89,7 +89,7 @@ class Fit:
         lacking *= weights > 0
         pulls = weights * lacking
         images = np.stack([pulls * by_a, pulls * by_b, along * by_a, along * by_b], 1, dtype=np.float32)
-        sums = self._projector.adjoint(images, views)
+        sums = self.projector.adjoint(images, views)
         self._move(*self.curve.transpose(self.u, sums), len(views))
         self.view_updates += len(views)
         return float(np.abs(lacking).mean())

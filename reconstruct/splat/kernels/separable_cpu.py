@@ -87,14 +87,24 @@ def _gain(place, u):
 
 
 @njit(cache=True, error_model="numpy")
-def _rows_of(camera, place, z, bounds, n_v):
-    """Return the half-open range of rows that a column's splats reach, within the detector."""
+def _window(at, scale, camera, z, bounds, size, place):
+    """Place a column; return the half-open ranges of u and v within the detector that it reaches, and its reach in v.
+
+    All are 0 where it throws no shadow on the detector of `size` (v, u).
+    """
+    n_v, n_u = size
+    if not _place(camera, at[0], at[1], scale, place):
+        return 0, 0, 0, 0, 0.0
+    left, right = _columns(camera, place, n_u)
     reach = _reach_v(camera, place, z[bounds[0]], z[bounds[1] - 1])
     a, _, _ = _shadow(camera, place, z[bounds[0]])
     b, _, _ = _shadow(camera, place, z[bounds[1] - 1])
     low = min(max(min(a, b) - reach, -1e9), 1e9)
     high = min(max(max(a, b) + reach, -1e9), 1e9)
-    return max(0, int(math.ceil(low))), min(n_v, int(math.floor(high)) + 1), reach
+    first, last = max(0, int(math.ceil(low))), min(n_v, int(math.floor(high)) + 1)
+    if left >= right or first >= last:
+        return 0, 0, 0, 0, 0.0
+    return left, right, first, last, reach
 
 
 @njit(cache=True, error_model="numpy")
@@ -102,15 +112,13 @@ def _forward_view(xy, starts, z, values, scale, camera, image):
     n_u, n_v = image.shape[0] // 2, image.shape[1] - 2 * PAD
     place, profile = np.empty(PLACE), np.empty((2, image.shape[1]), np.float32)
     for column in range(xy.shape[0]):
-        if not _place(camera, xy[column, 0], xy[column, 1], scale, place):
-            continue
-        left, right = _columns(camera, place, n_u)
-        low, high, reach = _rows_of(camera, place, z, (starts[column], starts[column + 1]), n_v)
-        if left >= right or low >= high:
+        bounds = (starts[column], starts[column + 1])
+        left, right, low, high, reach = _window(xy[column], scale, camera, z, bounds, (n_v, n_u), place)
+        if left >= right:
             continue
         for v in range(profile.shape[1]):
             profile[0, v] = profile[1, v] = 0
-        for i in range(starts[column], starts[column + 1]):
+        for i in range(bounds[0], bounds[1]):
             row, falling, peak = _shadow(camera, place, z[i])
             if not -reach <= row <= n_v - 1 + reach:
                 continue
@@ -142,11 +150,9 @@ def _backward_columns(columns, xy, starts, z, scale, camera, image, sums):
     place, profile = np.empty(PLACE), np.zeros((4, image.shape[1]), np.float32)
     gains, zero = np.empty(n_u, np.float32), spread(np.float32(0))
     for column in range(columns[0], columns[1]):
-        if not _place(camera, xy[column, 0], xy[column, 1], scale, place):
-            continue
-        left, right = _columns(camera, place, n_u)
-        low, high, reach = _rows_of(camera, place, z, (starts[column], starts[column + 1]), n_v)
-        if left >= right or low >= high:
+        bounds = (starts[column], starts[column + 1])
+        left, right, low, high, reach = _window(xy[column], scale, camera, z, bounds, (n_v, n_u), place)
+        if left >= right:
             continue
         for v in range(profile.shape[1]):
             profile[0, v] = profile[1, v] = profile[2, v] = profile[3, v] = 0
@@ -164,7 +170,7 @@ def _backward_columns(columns, xy, starts, z, scale, camera, image, sums):
             store(profile, 1, v, s1)
             store(profile, 2, v, s2)
             store(profile, 3, v, s3)
-        for i in range(starts[column], starts[column + 1]):
+        for i in range(bounds[0], bounds[1]):
             row, falling, peak = _shadow(camera, place, z[i])
             if not -reach <= row <= n_v - 1 + reach:
                 continue
