@@ -16,7 +16,7 @@ from ctsim.store import list_scans, open_scan
 from ctsim.types import Status
 from reconstruct.fdk import reconstruct as fdk
 from reconstruct.splat.curve import MATERIALS, MaterialCurve
-from reconstruct.splat.level import carve, coarser, padded, refined
+from reconstruct.splat.level import carve, coarser, refined, weighted
 from reconstruct.splat.method import reconstruct
 from reconstruct.splat.ordered import bit_reversed
 from reconstruct.splat.response import evaluate, make_response
@@ -56,7 +56,7 @@ def small(tmp_path_factory):
 
 
 def data_of(geometry, p):
-    return padded(geometry, np.asarray(p, np.float32), np.ones(p.shape, bool))
+    return weighted(geometry, np.asarray(p, np.float32), np.ones(p.shape, bool))
 
 
 def test_coarse_pixels_and_voxels_lie_where_the_fine_ones_do():
@@ -81,7 +81,7 @@ def test_coarser_averages_intensities_and_leaves_out_what_has_no_weight():
     valid = np.ones(p.shape, bool)
     valid[0, 0, 0] = False
     valid[2, :2, :2] = False
-    found = coarser(padded(GEOMETRY, p, valid))
+    found = coarser(weighted(GEOMETRY, p, valid))
     assert found.p[0, 0, 0] == pytest.approx(-np.log(np.exp(-p[0, :2, :2]).ravel()[1:].mean()), rel=1e-6)
     assert found.weights[1, 0, 0] == 0
     assert found.weights[0, 0, 0] == pytest.approx(np.exp(-found.p[0, 0, 0]), rel=1e-6)
@@ -114,7 +114,7 @@ def test_carving_keeps_every_voxel_of_the_object_and_few_more():
 
 def test_pixels_without_weight_carve_nothing():
     valid = np.zeros(GEOMETRY.shape, bool)
-    kept = carve(padded(GEOMETRY, np.zeros(GEOMETRY.shape, np.float32), valid), 0.01)
+    kept = carve(weighted(GEOMETRY, np.zeros(GEOMETRY.shape, np.float32), valid), 0.01)
     assert kept.all()
 
 

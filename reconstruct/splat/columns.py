@@ -17,9 +17,10 @@ Image = NDArray[np.float32]
 
 
 class LatticeProjector:
-    """Projects the splats of `lattice` along the rays of `geometry`, in the order of the lattice.
+    """Projects the splats of `lattice`, in its order, along the rays of `geometry`; values and images have two channels.
 
-    Images are [view, channel, v, u + 8], as those of `Projector`.
+    Images lie as the kernels want them, [view, channel, u, v + 32] or as `Projector` has them: `arranged` puts pictures
+    [view, v, u] into that form, and `pictures` takes them out of it.
     """
 
     def __init__(self, geometry: Geometry, lattice: Lattice) -> None:
@@ -29,39 +30,45 @@ class LatticeProjector:
         self._shapes = lattice.splats(np.zeros((len(lattice), 1), np.float32)).shapes()
         self.by_columns = _upright(self._projector.cameras) and _reach(geometry, lattice) < kernels.WIDEST
         if self.by_columns:
-            x, y, z = lattice.positions.T
-            self._order = np.lexsort((z, x, y))
-            places = lattice.positions[self._order, :2]
+            places = lattice.positions[:, :2]
             first = np.flatnonzero(np.any(places[1:] != places[:-1], axis=1)) + 1
-            self._starts = np.concatenate([[0], first, [len(lattice)]]).astype(np.int64)
-            self._xy = places[self._starts[:-1]].astype(np.float64)
-            self._z = z[self._order].astype(np.float64)
+            starts = np.concatenate([[0], first, [len(lattice)]]).astype(np.int64)
+            z = np.pad(lattice.positions[None, :, 2], [(0, 0), (0, WIDTH)])
+            self._columns = (places[starts[:-1]].astype(np.float64), starts, z, int(np.diff(starts).max(initial=0)))
 
     def forward(self, values: Image, views: NDArray[np.int64]) -> Image:
-        """Sum values [splat, 2] times line integrals (mm) over the splats."""
+        """Sum values [splat, 2] times line integrals (mm) over the splats; scratch columns may hold anything finite."""
         if not self.by_columns:
             return self._projector.forward(self._shapes, values, views)
         n_v, n_u = self._n_detector
         images = np.zeros((len(views), 2 * n_u, n_v + 2 * kernels.PAD), np.float32)
-        cameras = self._projector.cameras[views]
-        kernels.forward(self._xy, self._starts, self._z, values[self._order], self._scale, cameras, images)
-        out = np.zeros((len(views), 2, n_v, n_u + WIDTH), np.float32)
-        inner = images.reshape(len(views), 2, n_u, -1)[..., kernels.PAD : kernels.PAD + n_v]
-        out[..., :n_u] = inner.transpose(0, 1, 3, 2)
-        return out
+        kernels.forward(self._columns, values, self._scale, self._projector.cameras[views], images)
+        return images.reshape(len(views), 2, n_u, -1)
 
     def adjoint(self, images: Image, views: NDArray[np.int64]) -> Image:
-        """Sum images of four channels times line integrals (mm) over the pixels: [splat, 4]."""
+        """Sum images, zero in their scratch columns, times line integrals (mm) over the pixels: [splat, 2]."""
         if not self.by_columns:
             return self._projector.adjoint(self._shapes, images, views)
+        stack = images.reshape(len(views), -1, images.shape[-1])
+        sums = np.zeros((self._shapes.shape[1], 2), np.float32)
+        kernels.backward(self._columns, self._scale, self._projector.cameras[views], stack, sums)
+        return sums
+
+    def arranged(self, pictures: Image) -> Image:
+        """Put pictures [..., v, u] into the form of an image's channel, scratch columns zero."""
         n_v, n_u = self._n_detector
-        turned = np.zeros((len(views), 4, n_u, n_v + 2 * kernels.PAD), np.float32)
-        turned[..., kernels.PAD : kernels.PAD + n_v] = images[..., :n_u].transpose(0, 1, 3, 2)
-        sums, out = np.zeros((2, len(self._order), 4), np.float32)
-        stack, cameras = turned.reshape(len(views), 4 * n_u, -1), self._projector.cameras[views]
-        kernels.backward(self._xy, self._starts, self._z, self._scale, cameras, stack, sums)
-        out[self._order] = sums
+        if not self.by_columns:
+            return np.pad(pictures, [(0, 0)] * (pictures.ndim - 1) + [(0, WIDTH)])
+        out = np.zeros((*pictures.shape[:-2], n_u, n_v + 2 * kernels.PAD), np.float32)
+        self.pictures(out)[...] = pictures
         return out
+
+    def pictures(self, images: Image) -> Image:
+        """View the detector's part of images as [..., v, u]."""
+        n_v, n_u = self._n_detector
+        if not self.by_columns:
+            return images[..., :n_u]
+        return images[..., kernels.PAD : kernels.PAD + n_v].swapaxes(-1, -2)
 
 
 def _upright(cameras: NDArray[np.float64]) -> bool:

@@ -65,13 +65,11 @@ class MaterialCurve:
         curve_cpu.evaluate(u, self.knots, self.densities, self.slopes, unit, out)
         return out
 
-    def transpose(
-        self, u: NDArray[np.float32], sums: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return how two pairs of sums by (ρa, ρb), float32 [splat, 4], change with each unknown: two [splat]."""
-        first, second = np.empty_like(u), np.empty_like(u)
-        curve_cpu.transpose(u, self.knots, self.slopes, sums, first, second)
-        return first, second
+    def transpose(self, u: NDArray[np.float32], sums: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return how sums by (ρa, ρb), float32 [splat, 2], change with each unknown: [splat]."""
+        out = np.empty_like(u)
+        curve_cpu.transpose(u, self.knots, self.slopes, sums, out)
+        return out
 
 
 def _densities(response: Response, material: str) -> NDArray[np.float64]:

@@ -25,7 +25,7 @@ from reconstruct.beam import Given, known_detector, known_tube
 from reconstruct.log import line_integrals
 from reconstruct.splat.curve import MaterialCurve
 from reconstruct.splat.lattice import Lattice
-from reconstruct.splat.level import Data, carve, coarser, padded, refined
+from reconstruct.splat.level import Data, carve, coarser, refined, weighted
 from reconstruct.splat.ordered import Fit
 from reconstruct.splat.response import Response, basis_functions, evaluate, make_response, tangent
 from reconstruct.splat.volume import voxelise
@@ -34,7 +34,7 @@ from reconstruct.watch import Stopwatch
 OPEN = 5.0  # standard deviations of an open pixel below which a ray met nothing
 LEAST_OPEN = 0.01
 EMPTY = 0.05  # times water: a voxel of the coarser volume below that holds no splat
-VIEWS, SHORTEST = 12, 0.5  # views that the read-out's water is measured in, and its least path in voxels
+VIEWS, SHORTEST = 12, 0.5  # views whose pixels stand for all, and the least path in voxels that counts as one
 DENSEST = 15.0  # times water, that is no metal: enamel 9, titanium 43
 SMALLEST = 24  # voxels along an axis below which there is no coarser level
 RESPONSES = ("tube", "known")
@@ -52,7 +52,7 @@ class Settings:
     make no sense.
     """
 
-    passes: tuple[int, int] = (3, 2)
+    passes: tuple[int, int] = (3, 3)
     tv: float = 0.03
     fineness: float = 1.5
     response: Literal["tube", "known"] = "tube"
@@ -88,7 +88,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     """Reconstruct `scan`: attenuation in 1/mm; details hold the volumes "rho_a" and "rho_b" under "densities"."""
     stopwatch = Stopwatch()
     p, clamped = line_integrals(scan, slice(None))
-    data = padded(finer(scan.geometry, settings.fineness), p.numpy(), ~clamped.numpy())
+    data = weighted(finer(scan.geometry, settings.fineness), p.numpy(), ~clamped.numpy())
     response = settings.make_response(scan.e_max)
 
     def proceed(fit: Fit, whole: bool) -> bool:
@@ -176,16 +176,24 @@ def _coarse_to_fine(
 
 def _open_photons(data: Data) -> float:
     """Estimate the photons of an open pixel from how far p falls below 0, which only noise does: 1/var."""
-    n_u = data.geometry.n_detector[1]
-    p = data.p[..., :n_u][data.weights[..., :n_u] > 0]
+    p = _readings(data)
     below = p[p < 0].astype(np.float64)
     return float(1 / max(np.mean(below**2), 1e-12)) if below.size else 1e12
 
 
+def _readings(data: Data) -> NDArray[np.float32]:
+    """Return the line integrals of a few views' pixels that count."""
+    views = _few_views(data.geometry)
+    return data.p[views][data.weights[views] > 0]
+
+
+def _few_views(geometry: Geometry) -> NDArray[np.int64]:
+    return np.unique(np.linspace(0, geometry.n_views - 1, min(VIEWS, geometry.n_views)).round().astype(np.int64))
+
+
 def _rough_length(data: Data, response: Response, met: float) -> float:
     """Return the water path (mm) behind which p is the median of the rays that met something."""
-    n_u = data.geometry.n_detector[1]
-    p = data.p[..., :n_u][data.weights[..., :n_u] > 0]
+    p = _readings(data)
     seen = p[p > met]
     if not seen.size:
         return 0.0
@@ -198,9 +206,9 @@ def _rough_length(data: Data, response: Response, met: float) -> float:
 def typical_length(fit: Fit) -> float:
     """Return the median water-equivalent path (mm) through what is no metal, of the rays that meet it."""
     geometry, water = fit.data.geometry, fit.curve.water
-    views = np.unique(np.linspace(0, geometry.n_views - 1, min(VIEWS, geometry.n_views)).round().astype(int))
     shares = np.where(fit.u < DENSEST * water, fit.u / water, 0).astype(np.float32)
     # the projector takes two channels: the second is not looked at
-    paths = fit.projector.forward(np.stack([shares, shares], 1) / np.float32(fit.lattice.unit), views)[:, 0]
+    both = np.stack([shares, shares], 1) / np.float32(fit.lattice.unit)
+    paths = fit.projector.pictures(fit.projector.forward(both, _few_views(geometry)))[:, 0]
     met = paths[paths > SHORTEST * max(geometry.d_voxel)]
     return float(np.median(met)) if met.size else 0.0

@@ -19,7 +19,8 @@ SIGMA = 0.45
 class Lattice:
     """One round splat in the middle of each voxel of `support` [z, y, x] (bool); values are per splat.
 
-    `unit` is what a lattice of ones sums to at a point, on average; a splat's density is its attenuation over it.
+    Splats are ordered by y, x and z, so that upright columns of them lie together. `unit` is what a lattice of ones
+    sums to at a point, on average; a splat's density is its attenuation over it.
     """
 
     geometry: Geometry
@@ -27,20 +28,23 @@ class Lattice:
     positions: NDArray[np.float32] = field(init=False)
     scale: float = field(init=False)
     unit: float = field(init=False)
+    _box: tuple[slice, ...] = field(init=False)
+    _size: tuple[int, ...] = field(init=False)
     _index: NDArray[np.int64] = field(init=False)
     _denoiser: Denoiser = field(init=False)
 
     def __post_init__(self) -> None:
         z, y, x = (axis.astype(np.float32) for axis in self.geometry.voxel_centres())
-        k, j, i = np.nonzero(self.support)
-        self._index = np.flatnonzero(self.support)
+        columns = self.support.transpose(1, 2, 0)
+        j, i, k = np.nonzero(columns)
         self.positions = np.stack([x[i], y[j], z[k]], 1)
         d = np.array(self.geometry.d_voxel)
         self.scale = SIGMA * float(np.prod(d)) ** (1 / 3)
         self.unit = float((math.sqrt(2 * math.pi) * self.scale) ** 3 / np.prod(d))
-        self._denoiser = Denoiser(
-            np.ascontiguousarray(self.support.transpose(1, 2, 0)), axis_ratios(self.geometry), positivity=True
-        )
+        self._box = tuple(slice(int(n.min()), int(n.max()) + 1) if n.size else slice(0, 0) for n in (j, i, k))
+        inside = np.ascontiguousarray(columns[self._box])
+        self._size, self._index = inside.shape, np.flatnonzero(inside)
+        self._denoiser = Denoiser(inside, axis_ratios(self.geometry), positivity=True)
 
     def __len__(self) -> int:
         return len(self._index)
@@ -55,28 +59,28 @@ class Lattice:
 
     @property
     def padded(self) -> tuple[int, int]:
-        """Size (y, x) of a slice with room for the tails of a ramp filter, which fall as the square of the distance."""
-        n_y, n_x = (int(fft.next_fast_len(n + n // 4, real=True) or n) for n in self.support.shape[1:])
+        """Size (y, x) of the support with room for the tails of a ramp filter, which fall as the distance squared."""
+        n_y, n_x = (int(fft.next_fast_len(n + n // 4, real=True) or n) for n in self._size[:2])
         return n_y, n_x
-
-    def scatter(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Put values [splat] into their voxels: [z, y, x], zero elsewhere."""
-        volume = np.zeros(self.support.size, np.float32)
-        volume[self._index] = values
-        return volume.reshape(self.support.shape)
 
     def gather(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
         """Take the values of a volume [z, y, x] at the splats: [splat]."""
-        return np.ascontiguousarray(volume).reshape(-1)[self._index]
+        return volume.transpose(1, 2, 0)[self._box].reshape(-1)[self._index]
 
     def denoise(self, values: NDArray[np.float32], tau: float, iterations: int) -> NDArray[np.float32]:
         """Return argmin ½‖x − values‖² + tau·TV(x), x not negative."""
-        columns = np.ascontiguousarray(self.scatter(values).transpose(1, 2, 0))
-        return self.gather(self._denoiser.run(columns, tau, iterations).transpose(2, 0, 1))
+        return self._denoiser.run(self._filled(values), tau, iterations).reshape(-1)[self._index]
 
     def filter_slices(self, values: NDArray[np.float32], gain: NDArray[np.float32]) -> NDArray[np.float32]:
         """Multiply the spectrum of every slice, `padded`, by `gain`, as `rfft2` orders it."""
-        (_, n_y, n_x), size = self.support.shape, self.padded
-        spectrum = np.asarray(fft.rfft2(self.scatter(values), s=size, axes=(1, 2), workers=-1)) * gain
-        filtered = np.asarray(fft.irfft2(spectrum, s=size, axes=(1, 2), workers=-1), np.float32)
-        return self.gather(filtered[:, :n_y, :n_x])
+        (n_y, n_x, _), size = self._size, self.padded
+        spectrum = np.asarray(fft.rfft2(self._filled(values), s=size, axes=(0, 1), workers=-1))
+        spectrum *= gain[..., None]
+        filtered = np.asarray(fft.irfft2(spectrum, s=size, axes=(0, 1), workers=-1, overwrite_x=True), np.float32)
+        return filtered[:n_y, :n_x].reshape(-1)[self._index]
+
+    def _filled(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Put values [splat] into the smallest box [y, x, z] that holds the support, zero elsewhere."""
+        volume = np.zeros(self._size, np.float32)
+        volume.reshape(-1)[self._index] = values
+        return volume

@@ -9,30 +9,20 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ctsim.geometry import Geometry
-from reconstruct.splat.kernels.lanes import WIDTH
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Data:
-    """Line integrals `p` and their weights, float32 [view, v, u + 8]: the last columns are scratch of weight 0."""
+    """Line integrals `p` and their weights, float32 [view, v, u]."""
 
     geometry: Geometry
     p: NDArray[np.float32]
     weights: NDArray[np.float32]
 
 
-def padded(geometry: Geometry, p: NDArray[np.float32], valid: NDArray[np.bool_]) -> Data:
+def weighted(geometry: Geometry, p: NDArray[np.float32], valid: NDArray[np.bool_]) -> Data:
     """Weight line integrals [view, v, u] by the photons that came through, exp(−p), and 0 where not `valid`."""
-    n_u = geometry.n_detector[1]
-    data = Data(geometry=geometry, p=_wide(geometry), weights=_wide(geometry))
-    data.p[..., :n_u] = p
-    data.weights[..., :n_u] = np.where(valid, np.exp(-np.maximum(p, 0)), 0)
-    return data
-
-
-def _wide(geometry: Geometry) -> NDArray[np.float32]:
-    n_v, n_u = geometry.n_detector
-    return np.zeros((geometry.n_views, n_v, n_u + WIDTH), np.float32)
+    return Data(geometry=geometry, p=p, weights=np.where(valid, np.exp(-np.maximum(p, 0)), 0).astype(np.float32))
 
 
 def coarser(data: Data) -> Data:
@@ -68,7 +58,7 @@ def coarser(data: Data) -> Data:
     n = np.maximum(valid.sum((2, 4)), 1)
     mean = np.where(valid, np.exp(-p), 0).sum((2, 4)) / n
     seen = np.asarray(valid.any((2, 4)), np.bool_)
-    return padded(geometry, -np.log(np.where(seen, mean, 1)).astype(np.float32), seen)
+    return weighted(geometry, -np.log(np.where(seen, mean, 1)).astype(np.float32), seen)
 
 
 def refined(values: NDArray[np.float32], fine: Geometry) -> NDArray[np.float32]:
@@ -84,8 +74,7 @@ def carve(data: Data, open_below: float) -> NDArray[np.bool_]:
     A voxel is empty where a view has its shadow and p of the pixels around that lies below `open_below`. Pixels
     without weight say nothing.
     """
-    n_u = data.geometry.n_detector[1]
-    p = np.where(data.weights[..., :n_u] > 0, data.p[..., :n_u], np.inf)
+    p = np.where(data.weights > 0, data.p, np.inf)
     near = np.asarray(ndimage.maximum_filter(p, (1, 3, 3))) > open_below
     z, y, x = data.geometry.voxel_centres()
     state = np.zeros(data.geometry.n_voxel, np.int8)

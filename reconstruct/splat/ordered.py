@@ -26,6 +26,8 @@ SUBSET, LEAST_SUBSETS = 10, 8
 """Views in a subset, fewer where there would be too few subsets."""
 STEEPEST = 0.8
 """Greatest gain of the ramp, as a share of the views in a subset."""
+MEASURE_EVERY = 4
+"""Subsets from one measurement of the curvature to the next."""
 SMOOTH_EVERY, SMOOTHING = 4, 8  # subsets from one denoising to the next, and its iterations
 LONGEST = 3.0  # times the median root of a step: hardly seen splats, their steps spread by F, make a fit diverge
 FAINT = 0.3  # times water: splats below are preconditioned as if they held this
@@ -49,22 +51,29 @@ class Fit:
     misfit: float = math.inf
     view_updates: int = 0
     projector: LatticeProjector = field(init=False)
+    _p: Image = field(init=False)
+    _weights: Image = field(init=False)
+    _curvature: Image = field(init=False)  # by both densities, summed over the views that it was measured in
+    _measured: int = 0
 
     def __post_init__(self) -> None:
         self.projector = LatticeProjector(self.data.geometry, self.lattice)
+        self._p, self._weights = (self.projector.arranged(a) for a in (self.data.p, self.data.weights))
+        self._curvature = np.zeros((len(self.lattice), 2), np.float32)
 
     def run(self, passes: int, proceed: Callable[["Fit", bool], bool]) -> bool:
         """Go through all views `passes` times; stop and return False when `proceed(fit, whole)` says so.
 
-        It is asked after each subset, `whole` where that was the last of a pass.
+        It is asked after each subset, `whole` where that was the last of a pass. In the last pass steps grow shorter,
+        to a half: subsets that disagree, by noise or by what no model explains, would keep the fit from settling.
         """
         n_views = self.data.geometry.n_views
         n = min(max(n_views // SUBSET, LEAST_SUBSETS), n_views)
-        for _ in range(passes):
+        for turn in range(1, passes + 1):
             misfit = 0.0
             for k, subset in enumerate(bit_reversed(n)):
                 views = np.arange(subset, n_views, n)
-                misfit += self._step(views) / n
+                misfit += self._step(views, k % MEASURE_EVERY == 0, 1 / (1 + k / n) if turn == passes else 1.0) / n
                 if (k + 1) % SMOOTH_EVERY == 0 or k + 1 == n:
                     share = (k % SMOOTH_EVERY + 1) / n
                     self.u = self.lattice.denoise(self.u, self.tv * self.curve.water * share, SMOOTHING)
@@ -78,21 +87,27 @@ class Fit:
         """Return u on the voxel grid, a mean over each voxel: [z, y, x] in 1/mm."""
         return voxelise(self.lattice.splats(self.u[:, None]), self.data.geometry)[0]
 
-    def _step(self, views: NDArray[np.int64]) -> float:
-        """Update `u` from some views; return their mean |P − p|."""
+    def _step(self, views: NDArray[np.int64], measure: bool, length: float) -> float:
+        """Update `u` by `length` of a step from some views; return their mean |P − p|.
+
+        The curvature is that of all views in which it was measured, since it changes little from subset to subset.
+        """
         values = self.curve.densities_of(self.u, self.lattice.unit)
         paths = self.projector.forward(values, views)
         la, lb = (np.ascontiguousarray(paths[:, c]) for c in (0, 1))
         p, by_a, by_b = evaluate(self.response, la, lb)
-        lacking, weights = self.data.p[views] - p, self.data.weights[views]
-        along = weights * (by_a * la + by_b * lb)  # J·u: the majoriser's other half
-        lacking *= weights > 0
-        pulls = weights * lacking
-        images = np.stack([pulls * by_a, pulls * by_b, along * by_a, along * by_b], 1, dtype=np.float32)
-        sums = self.projector.adjoint(images, views)
-        self._move(*self.curve.transpose(self.u, sums), len(views))
+        weights = self._weights[views]
+        slopes = np.stack([weights * by_a, weights * by_b], 1)
+        if measure:
+            along = by_a * la + by_b * lb  # J·u: the majoriser's other half
+            self._curvature += self.projector.adjoint(slopes * along[:, None], views)
+            self._measured += len(views)
+        lacking = np.where(weights > 0, self._p[views] - p, np.float32(0))
+        gradient = self.curve.transpose(self.u, self.projector.adjoint(slopes * lacking[:, None], views))
+        curvature = self.curve.transpose(self.u, self._curvature) * np.float32(len(views) / self._measured)
+        self._move(gradient * np.float32(length), curvature, len(views))
         self.view_updates += len(views)
-        return float(np.abs(lacking).mean())
+        return float(np.abs(lacking).sum(dtype=np.float64)) / (len(views) * math.prod(self.data.geometry.n_detector))
 
     def _move(self, gradient: Image, curvature: Image, n_views: int) -> None:
         water = self.curve.water

@@ -28,10 +28,8 @@ def evaluate(u, knots, densities, slopes, unit, out):
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def transpose(u, knots, slopes, sums, gradient, curvature):
-    """Write how the sums [unknown, 4], two pairs by density, change with each unknown: float32 [unknown] each."""
+def transpose(u, knots, slopes, sums, out):
+    """Write how sums by both densities [unknown, 2] change with each unknown, `out` float32 [unknown]."""
     for i in prange(u.size):
         k = _piece(knots, u[i])
-        a, b = np.float32(slopes[k, 0]), np.float32(slopes[k, 1])
-        gradient[i] = a * sums[i, 0] + b * sums[i, 1]
-        curvature[i] = a * sums[i, 2] + b * sums[i, 3]
+        out[i] = np.float32(slopes[k, 0]) * sums[i, 0] + np.float32(slopes[k, 1]) * sums[i, 1]

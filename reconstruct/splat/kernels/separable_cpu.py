@@ -6,7 +6,8 @@ detector columns once. A splat's shadow is taken as exp(−½ du²/S_uu − ½ d
 (`splat_cpu`): the separable footprint of Long, Fessler and Balter (IEEE Trans. Med. Imaging 29, 2010,
 doi:10.1109/TMI.2010.2050898) with Gaussians. What it leaves out is S_uv, of the order of u·v/dsd² of the others.
 
-Splats are ordered by column, z ascending: `xy` [column, 2], `starts` [column + 1] into `z` [splat], mm. Images are
+Splats are ordered by column, z ascending: `columns` holds xy float64 [column, 2], the starts [column + 1] of columns in
+z float32 [1, splat + 8], both mm, and the most splats that a column has. Images are
 float32 [channel · u, v + 32], transposed and with 16 columns of scratch on either side.
 """
 
@@ -15,7 +16,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from reconstruct.splat.kernels.lanes import WIDTH, exp, fma, load, mul, ramp, spread, store, total
+from reconstruct.splat.kernels.lanes import WIDTH, add, div, exp, fma, load, mul, ramp, spread, sqrt, store, total
 from reconstruct.splat.kernels.splat_cpu import (
     BOX,
     CUTOFF,
@@ -65,12 +66,25 @@ def _reach_v(camera, place, z_first, z_last):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _shadow(camera, place, z):
-    """Return a splat's row, −1/(2 S_vv) and peak."""
-    cz = z - camera[SOURCE + 2]
-    at = place[PER_Z] * cz
-    over = 1 / (place[S_VV] + place[S_VV_2] * at * at)
-    return at - camera[ORIGIN_V], -0.5 * over, place[W0] * math.sqrt((place[RAY] + place[RAY_2] * cz * cz) * over)
+def _row(camera, place, z):
+    return place[PER_Z] * (z - camera[SOURCE + 2]) - camera[ORIGIN_V]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _shadows(camera, place, z, bounds, table):
+    """Write the rows, −1/(2 S_vv) and peaks of a column's splats: table [3, splat of the column]."""
+    source, origin = spread(np.float32(-camera[SOURCE + 2])), spread(np.float32(-camera[ORIGIN_V]))
+    per_z, peak = spread(np.float32(place[PER_Z])), spread(np.float32(place[W0]))
+    across, along = spread(np.float32(place[S_VV])), spread(np.float32(place[S_VV_2]))
+    ray, ray_2 = spread(np.float32(place[RAY])), spread(np.float32(place[RAY_2]))
+    one, half = spread(np.float32(1)), spread(np.float32(-0.5))
+    for i in range(bounds[0], bounds[1], WIDTH):
+        cz = add(load(z, 0, i), source)
+        at = mul(per_z, cz)
+        over = div(one, fma(mul(at, at), along, across))
+        store(table, 0, i - bounds[0], add(at, origin))
+        store(table, 1, i - bounds[0], mul(half, over))
+        store(table, 2, i - bounds[0], mul(peak, sqrt(mul(fma(mul(cz, cz), ray_2, ray), over))))
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -96,9 +110,9 @@ def _window(at, scale, camera, z, bounds, size, place):
     if not _place(camera, at[0], at[1], scale, place):
         return 0, 0, 0, 0, 0.0
     left, right = _columns(camera, place, n_u)
-    reach = _reach_v(camera, place, z[bounds[0]], z[bounds[1] - 1])
-    a, _, _ = _shadow(camera, place, z[bounds[0]])
-    b, _, _ = _shadow(camera, place, z[bounds[1] - 1])
+    ends = z[0, bounds[0]], z[0, bounds[1] - 1]
+    reach = _reach_v(camera, place, ends[0], ends[1])
+    a, b = _row(camera, place, ends[0]), _row(camera, place, ends[1])
     low = min(max(min(a, b) - reach, -1e9), 1e9)
     high = min(max(max(a, b) + reach, -1e9), 1e9)
     first, last = max(0, int(math.ceil(low))), min(n_v, int(math.floor(high)) + 1)
@@ -108,9 +122,11 @@ def _window(at, scale, camera, z, bounds, size, place):
 
 
 @njit(cache=True, error_model="numpy")
-def _forward_view(xy, starts, z, values, scale, camera, image):
+def _forward_view(columns, values, scale, camera, image):
+    xy, starts, z, tallest = columns
     n_u, n_v = image.shape[0] // 2, image.shape[1] - 2 * PAD
     place, profile = np.empty(PLACE), np.empty((2, image.shape[1]), np.float32)
+    table, gains = np.empty((3, tallest + WIDTH), np.float32), np.empty(n_u, np.float32)
     for column in range(xy.shape[0]):
         bounds = (starts[column], starts[column + 1])
         left, right, low, high, reach = _window(xy[column], scale, camera, z, bounds, (n_v, n_u), place)
@@ -118,84 +134,84 @@ def _forward_view(xy, starts, z, values, scale, camera, image):
             continue
         for v in range(profile.shape[1]):
             profile[0, v] = profile[1, v] = 0
+        _shadows(camera, place, z, bounds, table)
         for i in range(bounds[0], bounds[1]):
-            row, falling, peak = _shadow(camera, place, z[i])
+            k = i - bounds[0]
+            row, falling, peak = table[0, k], table[1, k], table[2, k]
             if not -reach <= row <= n_v - 1 + reach:
                 continue
             first, last = int(math.ceil(row - reach)), int(math.floor(row + reach))
-            a, b = spread(np.float32(values[i, 0] * peak)), spread(np.float32(values[i, 1] * peak))
+            a, b = spread(values[i, 0] * peak), spread(values[i, 1] * peak)
             for start in range(first, last + 1, WIDTH):
-                t = ramp(np.float32(start - row))
-                g = exp(mul(mul(t, t), spread(np.float32(falling))))
+                t = ramp(np.float32(start) - row)
+                g = exp(mul(mul(t, t), spread(falling)))
                 at = start + PAD
                 store(profile, 0, at, fma(g, a, load(profile, 0, at)))
                 store(profile, 1, at, fma(g, b, load(profile, 1, at)))
         for u in range(left, right):
-            g = spread(_gain(place, u))
-            for v in range(low + PAD, high + PAD, WIDTH):
-                store(image, u, v, fma(g, load(profile, 0, v), load(image, u, v)))
-                store(image, n_u + u, v, fma(g, load(profile, 1, v), load(image, n_u + u, v)))
+            gains[u] = _gain(place, u)
+        for v in range(low + PAD, high + PAD, WIDTH):
+            a, b = load(profile, 0, v), load(profile, 1, v)
+            for u in range(left, right):
+                g = spread(gains[u])
+                store(image, u, v, fma(g, a, load(image, u, v)))
+                store(image, n_u + u, v, fma(g, b, load(image, n_u + u, v)))
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
-def forward(xy, starts, z, values, scale, cameras, images):
+def forward(columns, values, scale, cameras, images):
     """Project values [splat, 2] onto views, one a thread: images [view, 2 · u, v + 32] must be zero."""
     for view in prange(cameras.shape[0]):
-        _forward_view(xy, starts, z, values, scale, cameras[view], images[view])
+        _forward_view(columns, values, scale, cameras[view], images[view])
 
 
 @njit(cache=True, error_model="numpy")
-def _backward_columns(columns, xy, starts, z, scale, camera, image, sums):
-    n_u, n_v = image.shape[0] // 4, image.shape[1] - 2 * PAD
-    place, profile = np.empty(PLACE), np.zeros((4, image.shape[1]), np.float32)
+def _backward_columns(chosen, columns, scale, camera, image, sums):
+    xy, starts, z, tallest = columns
+    n_u, n_v = image.shape[0] // 2, image.shape[1] - 2 * PAD
+    place, profile = np.empty(PLACE), np.zeros((2, image.shape[1]), np.float32)
+    table = np.empty((3, tallest + WIDTH), np.float32)
     gains, zero = np.empty(n_u, np.float32), spread(np.float32(0))
-    for column in range(columns[0], columns[1]):
+    for column in range(chosen[0], chosen[1]):
         bounds = (starts[column], starts[column + 1])
         left, right, low, high, reach = _window(xy[column], scale, camera, z, bounds, (n_v, n_u), place)
         if left >= right:
             continue
         for v in range(profile.shape[1]):
-            profile[0, v] = profile[1, v] = profile[2, v] = profile[3, v] = 0
+            profile[0, v] = profile[1, v] = 0
         for u in range(left, right):
             gains[u] = _gain(place, u)
         for v in range(low + PAD, high + PAD, WIDTH):
-            s0, s1, s2, s3 = zero, zero, zero, zero
+            a, b = zero, zero
             for u in range(left, right):
                 g = spread(gains[u])
-                s0 = fma(g, load(image, u, v), s0)
-                s1 = fma(g, load(image, n_u + u, v), s1)
-                s2 = fma(g, load(image, 2 * n_u + u, v), s2)
-                s3 = fma(g, load(image, 3 * n_u + u, v), s3)
-            store(profile, 0, v, s0)
-            store(profile, 1, v, s1)
-            store(profile, 2, v, s2)
-            store(profile, 3, v, s3)
+                a = fma(g, load(image, u, v), a)
+                b = fma(g, load(image, n_u + u, v), b)
+            store(profile, 0, v, a)
+            store(profile, 1, v, b)
+        _shadows(camera, place, z, bounds, table)
         for i in range(bounds[0], bounds[1]):
-            row, falling, peak = _shadow(camera, place, z[i])
+            k = i - bounds[0]
+            row, falling, peak = table[0, k], table[1, k], table[2, k]
             if not -reach <= row <= n_v - 1 + reach:
                 continue
             first, last = int(math.ceil(row - reach)), int(math.floor(row + reach))
-            s0, s1, s2, s3 = zero, zero, zero, zero
+            a, b = zero, zero
             for start in range(first, last + 1, WIDTH):
-                t = ramp(np.float32(start - row))
-                g = exp(mul(mul(t, t), spread(np.float32(falling))))
+                t = ramp(np.float32(start) - row)
+                g = exp(mul(mul(t, t), spread(falling)))
                 at = start + PAD
-                s0 = fma(g, load(profile, 0, at), s0)
-                s1 = fma(g, load(profile, 1, at), s1)
-                s2 = fma(g, load(profile, 2, at), s2)
-                s3 = fma(g, load(profile, 3, at), s3)
-            w = np.float32(peak)
-            sums[i, 0] += w * total(s0)
-            sums[i, 1] += w * total(s1)
-            sums[i, 2] += w * total(s2)
-            sums[i, 3] += w * total(s3)
+                a = fma(g, load(profile, 0, at), a)
+                b = fma(g, load(profile, 1, at), b)
+            sums[i, 0] += peak * total(a)
+            sums[i, 1] += peak * total(b)
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
-def backward(xy, starts, z, scale, cameras, images, sums):
-    """Apply the transpose: sums [splat, 4] += Σ w·images over all pixels of images [view, 4 · u, v + 32]."""
-    n = xy.shape[0]
+def backward(columns, scale, cameras, images, sums):
+    """Apply the transpose: sums [splat, 2] += Σ w·images over all pixels of images [view, 2 · u, v + 32]."""
+    n = columns[0].shape[0]
     for task in prange((n + COLUMNS - 1) // COLUMNS):
-        columns = (task * COLUMNS, min((task + 1) * COLUMNS, n))
+        chosen = (task * COLUMNS, min((task + 1) * COLUMNS, n))
         for view in range(cameras.shape[0]):
-            _backward_columns(columns, xy, starts, z, scale, cameras[view], images[view], sums)
+            _backward_columns(chosen, columns, scale, cameras[view], images[view], sums)
