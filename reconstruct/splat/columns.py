@@ -17,7 +17,7 @@ Image = NDArray[np.float32]
 
 
 class LatticeProjector:
-    """Projects the splats of `lattice`, in its order, along the rays of `geometry`; values and images have two channels.
+    """Projects the splats of `lattice`, in its order, along the rays of `geometry`, in two channels.
 
     Images lie as the kernels want them, [view, channel, u, v + 32] or as `Projector` has them: `arranged` puts pictures
     [view, v, u] into that form, and `pictures` takes them out of it.

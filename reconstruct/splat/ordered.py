@@ -27,7 +27,7 @@ SUBSET, LEAST_SUBSETS = 10, 8
 STEEPEST = 0.8
 """Greatest gain of the ramp, as a share of the views in a subset."""
 MEASURE_EVERY = 4
-"""Subsets from one measurement of the curvature to the next."""
+"""Subsets of the first pass from one measurement of the curvature to the next."""
 SMOOTH_EVERY, SMOOTHING = 4, 8  # subsets from one denoising to the next, and its iterations
 LONGEST = 3.0  # times the median root of a step: hardly seen splats, their steps spread by F, make a fit diverge
 FAINT = 0.3  # times water: splats below are preconditioned as if they held this
@@ -73,7 +73,8 @@ class Fit:
             misfit = 0.0
             for k, subset in enumerate(bit_reversed(n)):
                 views = np.arange(subset, n_views, n)
-                misfit += self._step(views, k % MEASURE_EVERY == 0, 1 / (1 + k / n) if turn == passes else 1.0) / n
+                length = 1 / (1 + k / n) if turn == passes else 1.0
+                misfit += self._step(views, turn == 1 and k % MEASURE_EVERY == 0, length) / n
                 if (k + 1) % SMOOTH_EVERY == 0 or k + 1 == n:
                     share = (k % SMOOTH_EVERY + 1) / n
                     self.u = self.lattice.denoise(self.u, self.tv * self.curve.water * share, SMOOTHING)
@@ -90,7 +91,7 @@ class Fit:
     def _step(self, views: NDArray[np.int64], measure: bool, length: float) -> float:
         """Update `u` by `length` of a step from some views; return their mean |P − p|.
 
-        The curvature is that of all views in which it was measured, since it changes little from subset to subset.
+        The curvature is that of all views in which it was measured: it changes little from subset to subset.
         """
         values = self.curve.densities_of(self.u, self.lattice.unit)
         paths = self.projector.forward(values, views)
