@@ -103,7 +103,7 @@ class Fit:
             along = by_a * la + by_b * lb  # J·u: the majoriser's other half
             self._curvature += self.projector.adjoint(slopes * along[:, None], views)
             self._measured += len(views)
-        lacking = np.where(weights > 0, self._p[views] - p, np.float32(0))
+        lacking = (self._p[views] - p) * (weights > 0)
         gradient = self.curve.transpose(self.u, self.projector.adjoint(slopes * lacking[:, None], views))
         curvature = self.curve.transpose(self.u, self._curvature) * np.float32(len(views) / self._measured)
         self._move(gradient * np.float32(length), curvature, len(views))
