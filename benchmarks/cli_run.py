@@ -137,16 +137,25 @@ def _compute(given: Arguments) -> int:
 
 
 def _work(groups: "list[Group]", results: Path, options: "Options", pool: "Pool | None") -> "list[Record]":
-    """Do the runs behind a progress bar, the tables following them; return the records of those that failed."""
+    """Do the runs behind a progress bar, the tables following them; return the records of those that failed.
+
+    Beside the last run that ended it says how far the fit is that runs in this process, where a method tells.
+    """
     from tqdm import tqdm
 
     from benchmarks import records, schedule, tables
+    from reconstruct.watch import Progress, listen
 
-    failed, written, took = [], 0.0, 0.0
+    failed, written, took, ended = [], 0.0, 0.0, ""
     n_runs = sum(len(group) for group in groups)
-    with tqdm(total=n_runs, unit="run", disable=not n_runs) as bar:
+
+    def say(now: Progress) -> None:
+        bar.set_postfix_str(f"{ended}now {now.share:.0%}, loss {now.loss:.3g}, {now.remaining:.0f} s to go")
+
+    with tqdm(total=n_runs, unit="run", disable=not n_runs) as bar, listen(say):
         for task, record in schedule.work(groups, results, options, pool):
-            bar.set_postfix_str(f"{task.stored.name} {record.label}: {record.status}")
+            ended = f"{task.stored.name} {record.label}: {record.status}, "
+            bar.set_postfix_str(ended.removesuffix(", "))
             bar.update()
             if record.status not in ("ok", "skipped"):
                 failed.append(record)

@@ -1,9 +1,11 @@
-"""Looking on while a method works: its volume on the way, at every iteration or at chosen times."""
+"""Looking on while a method works: how far it is, and its volume on the way."""
 
 import contextlib
 import contextvars
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -37,12 +39,40 @@ def watch(on_update: OnUpdate, *, at: Sequence[float] | None = None) -> Iterator
         _watcher.reset(token)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Progress:
+    """Where a fit stands: the share of its work that is done, seconds so far and about still to go, and its loss.
+
+    The loss is what the method makes small, of its last step alone; it may jump from one to the next.
+    """
+
+    share: float
+    seconds: float
+    remaining: float
+    loss: float
+
+
+OnProgress = Callable[[Progress], None]
+_listener: contextvars.ContextVar[tuple[OnProgress, float] | None] = contextvars.ContextVar("listener", default=None)
+
+
+@contextlib.contextmanager
+def listen(on_progress: OnProgress, *, every: float = 1.0) -> Iterator[None]:
+    """Call `on_progress` about every so many seconds of every splat fit run within, in this thread."""
+    token = _listener.set((on_progress, every))
+    try:
+        yield
+    finally:
+        _listener.reset(token)
+
+
 class Stopwatch:
     """A run's seconds, less what watching it took, and the times at which its watcher is still to be shown one."""
 
-    def __init__(self, seconds: float = 0.0) -> None:
-        """Start at `seconds`, those of an earlier part of the run."""
+    def __init__(self, seconds: float = 0.0, limit: float = math.inf) -> None:
+        """Start at `seconds`, those of an earlier part of the run, which is to end after `limit`."""
         self._began, self._paused = time.perf_counter() - seconds, 0.0
+        self.limit, self._told = limit, -math.inf
         self._watcher = _watcher.get()
         at = self._watcher.at if self._watcher else None
         self._at = None if at is None else [t for t in at if t > seconds or not seconds]
@@ -51,6 +81,21 @@ class Stopwatch:
     def seconds(self) -> float:
         """Seconds since the start."""
         return time.perf_counter() - self._began - self._paused
+
+    @property
+    def over(self) -> bool:
+        """Whether the limit is reached."""
+        return self.seconds >= self.limit
+
+    def tell(self, share: float, loss: float) -> None:
+        """Tell the listener, if there is one and it is due, that a `share` of the work is done."""
+        if (listener := _listener.get()) is None:
+            return
+        (on_progress, every), seconds = listener, self.seconds
+        if seconds >= self._told + every:
+            self._told = seconds
+            left = min(seconds * (1 / share - 1), max(0.0, self.limit - seconds))
+            on_progress(Progress(share=share, seconds=seconds, remaining=left, loss=loss))
 
     def show(self, view_updates: int, volume: Callable[[], NDArray[np.float32]], *, whole: bool = True) -> None:
         """Show the watcher, if there is one and it is due, the volume [z, y, x]; else `volume` is not called.

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from reconstruct import watch as module
-from reconstruct.watch import Stopwatch, watch
+from reconstruct.watch import Progress, Stopwatch, listen, watch
 
 
 class Clock:
@@ -79,3 +79,19 @@ def test_nobody_looking_costs_no_volume():
     stopwatch, began = Stopwatch(), time.perf_counter()
     stopwatch.show(1, volume)
     assert 0 <= stopwatch.seconds <= time.perf_counter() - began + 1
+
+
+def test_a_listener_hears_every_so_often_and_what_is_left(clock):
+    heard: list[Progress] = []
+    with listen(heard.append, every=2.0):
+        stopwatch = Stopwatch(limit=6.0)
+        for k in range(1, 6):
+            clock.now += 1
+            stopwatch.tell(k / 20, 1.0 / k)
+    assert [p.seconds for p in heard] == [1, 3, 5]
+    assert [p.share for p in heard] == [1 / 20, 3 / 20, 5 / 20] and [p.loss for p in heard] == [1, 1 / 3, 1 / 5]
+    assert [p.remaining for p in heard] == [5, 3, 1]  # the limit comes before the end of the work
+    stopwatch.tell(0.5, 0.0)
+    assert len(heard) == 3 and not stopwatch.over
+    clock.now += 1
+    assert stopwatch.over

@@ -86,14 +86,15 @@ class Settings:
 
 def reconstruct(scan: Scan, settings: Settings) -> Volume:
     """Reconstruct `scan`: attenuation in 1/mm; details hold the volumes "rho_a" and "rho_b" under "densities"."""
-    stopwatch = Stopwatch()
+    stopwatch = Stopwatch(limit=settings.seconds)
     p, clamped = line_integrals(scan, slice(None))
     data = weighted(finer(scan.geometry, settings.fineness), p.numpy(), ~clamped.numpy())
     response = settings.make_response(scan.e_max)
 
-    def proceed(fit: Fit, whole: bool) -> bool:
+    def proceed(fit: Fit, whole: bool, share: float) -> bool:
+        stopwatch.tell(share, fit.loss)
         stopwatch.show(fit.view_updates, lambda: _read(fit, settings, scan.geometry)[0], whole=whole)
-        return stopwatch.seconds < settings.seconds
+        return not stopwatch.over
 
     fit = None if bool(clamped.all()) else _coarse_to_fine(data, response, settings, proceed)
     details: dict[str, Any] = {
@@ -147,16 +148,19 @@ def _read(fit: Fit, settings: Settings, geometry: Geometry) -> tuple[NDArray[np.
 
 
 def _coarse_to_fine(
-    data: Data, response: Response, settings: Settings, proceed: Callable[[Fit, bool], bool]
+    data: Data, response: Response, settings: Settings, proceed: Callable[[Fit, bool, float], bool]
 ) -> Fit | None:
-    """Fit level by level; None where the scan shows nothing."""
+    """Fit level by level while `proceed(fit, whole, share of the work)`; None where the scan shows nothing."""
     met = max(OPEN / math.sqrt(_open_photons(data)), LEAST_OPEN)
     curve = MaterialCurve.of(response, _rough_length(data, response, met))
     levels = [data]
     while settings.passes[0] and min(levels[0].geometry.n_voxel) >= 2 * SMALLEST:
         levels.insert(0, coarser(levels[0]))
+    passes = [settings.passes[level is data] if len(levels) > 1 else sum(settings.passes) for level in levels]
+    updates = np.array([n * level.geometry.n_views for n, level in zip(passes, levels, strict=True)])
+    work = updates * [math.prod(level.geometry.n_voxel) for level in levels]
     fit, done = None, 0
-    for level in levels:
+    for k, level in enumerate(levels):
         if fit is None:
             support = carve(level, met)
             start = np.where(support, curve.water, 0).astype(np.float32)
@@ -168,7 +172,12 @@ def _coarse_to_fine(
         lattice = Lattice(geometry=level.geometry, support=support)
         u = lattice.gather(start)
         fit = Fit(data=level, lattice=lattice, response=response, curve=curve, u=u, tv=settings.tv, view_updates=done)
-        if not fit.run(settings.passes[level is data] if len(levels) > 1 else sum(settings.passes), proceed):
+
+        def go_on(fit: Fit, whole: bool, k: int = k, done: int = done) -> bool:
+            here = work[k] * (fit.view_updates - done) / updates[k]
+            return proceed(fit, whole, float((work[:k].sum() + here) / work.sum()))
+
+        if not fit.run(passes[k], go_on):
             break
         done = fit.view_updates
     return fit

@@ -39,7 +39,8 @@ Image = NDArray[np.float32]
 class Fit:
     """The unknowns `u`, float32 [splat] in 1/mm of the hardened beam, on one lattice, and how they fare.
 
-    `tv` is the denoiser's threshold a pass in units of water. `misfit` is the mean |P − p| of the last pass.
+    `tv` is the denoiser's threshold a pass in units of water. `loss` is the mean |P − p| of the last subset, `misfit`
+    that of the last pass.
     """
 
     data: Data
@@ -48,6 +49,7 @@ class Fit:
     curve: MaterialCurve
     u: Image
     tv: float
+    loss: float = math.inf
     misfit: float = math.inf
     view_updates: int = 0
     projector: LatticeProjector = field(init=False)
@@ -74,7 +76,8 @@ class Fit:
             for k, subset in enumerate(bit_reversed(n)):
                 views = np.arange(subset, n_views, n)
                 length = 1 / (1 + k / n) if turn == passes else 1.0
-                misfit += self._step(views, turn == 1 and k % MEASURE_EVERY == 0, length) / n
+                self.loss = self._step(views, turn == 1 and k % MEASURE_EVERY == 0, length)
+                misfit += self.loss / n
                 if (k + 1) % SMOOTH_EVERY == 0 or k + 1 == n:
                     share = (k % SMOOTH_EVERY + 1) / n
                     self.u = self.lattice.denoise(self.u, self.tv * self.curve.water * share, SMOOTHING)

@@ -6,8 +6,6 @@ stands in `published_settings`, what a step does in `learner` and `objective`.
 
 import dataclasses
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -31,25 +29,6 @@ VIEWS = 12  # that the hardening of the read-out is measured in
 BETTER = 1e-3  # share by which held-out views must be met better to count
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Progress:
-    """Where a fit stands: `step` of `steps`, seconds so far and still to go, the loss before the last step.
-
-    `eta` [node] are the shares of the response, `splats` the number of splats.
-    """
-
-    step: int
-    steps: int
-    seconds: float
-    remaining: float
-    loss: float
-    eta: NDArray[np.float64]
-    splats: int
-
-
-OnProgress = Callable[[Progress], None]
-
-
 def reconstruct(scan: Scan, *, device: str = "cpu", preset: str = "paper", **changes: Unpack[Changes]) -> Volume:
     """Reconstruct by a preset, "paper" or "r2", with `changes` of its settings; attenuation in 1/mm.
 
@@ -58,10 +37,8 @@ def reconstruct(scan: Scan, *, device: str = "cpu", preset: str = "paper", **cha
     return fit_published(scan, changed(preset, changes), device=device)
 
 
-def fit_published(
-    scan: Scan, settings: Settings, *, device: str = "cpu", on_progress: OnProgress | None = None, every: int = 100
-) -> Volume:
-    """Reconstruct `scan` with `settings`; `on_progress` is called after each `every` steps.
+def fit_published(scan: Scan, settings: Settings, *, device: str = "cpu") -> Volume:
+    """Reconstruct `scan` with `settings`.
 
     After the settings' seconds it returns what there is. `watch` is shown a volume each pass over the views, or at the
     times it asks for. The volume's details hold "densities": the volumes of ρa and ρb [z, y, x] in 1/mm as "rho_a" and
@@ -72,7 +49,7 @@ def fit_published(
         raise InputError(f"the published splat methods run on device 'cpu' only, got {device!r}")
     if settings.held_out >= scan.geometry.n_views:
         raise InputError(f"held_out must be below the {scan.geometry.n_views} views, got {settings.held_out}")
-    stopwatch = Stopwatch()
+    stopwatch = Stopwatch(limit=settings.seconds)
     objective = Objective.of(scan, settings)
     response = settings.make_response(scan.e_max)
     splats = seed_splats(objective.p, scan.geometry, settings, response)
@@ -86,7 +63,7 @@ def fit_published(
     run = _Run(Learner(objective, splats, response, views), held_out.tolist(), stopwatch)
     if settings.checkpoints:
         run.resume(Checkpoint(folder=Path(settings.checkpoints), identity=_identity(scan, settings)))
-    run.go(on_progress, every)
+    run.go()
     volume = run.volume()
     volume.details["clamped_pixels"] = clamped
     return volume
@@ -107,10 +84,10 @@ class _Run:
         self.best: dict[str, NDArray[Any]] = {}
         self.best_misfit, self.best_step, self.idle = math.inf, 0, 0
 
-    def go(self, on_progress: OnProgress | None, every: int) -> None:
+    def go(self) -> None:
         """Take the steps that are left; a loss that is not finite ends them."""
         settings, stopwatch = self.settings, self.stopwatch
-        while self.done < settings.steps and stopwatch.seconds < settings.seconds and self.idle < settings.patience:
+        while self.done < settings.steps and not stopwatch.over and self.idle < settings.patience:
             self.loss = self.learner.step(self.done)
             self.done += 1
             whole = self.done % len(self.learner.views) == 0
@@ -118,30 +95,15 @@ class _Run:
                 break
             if self.held_out and (whole or self.done == settings.steps):
                 self._judge()
-            if on_progress is not None and self.done % every == 0:
-                on_progress(self.progress())
+            stopwatch.tell(self.done / settings.steps, self.loss)
             stopwatch.show(self.done, self.values, whole=whole)
             if self.checkpoint is not None and self.checkpoint.due():
                 self.checkpoint.write(self._state())
         if self.checkpoint is not None:
-            if stopwatch.seconds < settings.seconds:
-                self.checkpoint.remove()
-            else:
+            if stopwatch.over:
                 self.checkpoint.write(self._state())
-
-    def progress(self) -> Progress:
-        """Say where the fit stands."""
-        seconds = self.stopwatch.seconds
-        left = seconds / self.done * (self.settings.steps - self.done)
-        return Progress(
-            step=self.done,
-            steps=self.settings.steps,
-            seconds=seconds,
-            remaining=min(left, max(0.0, self.settings.seconds - seconds)),
-            loss=self.loss,
-            eta=self.learner.response.eta,
-            splats=len(self.learner),
-        )
+            else:
+                self.checkpoint.remove()
 
     def _judge(self) -> None:
         """Keep the state that meets the held-out views best, and count the passes without one that is better."""
@@ -168,7 +130,7 @@ class _Run:
         except (KeyError, ValueError) as error:
             raise InputError(f"checkpoint {checkpoint.path} is damaged ({error}): delete it to start anew") from None
         self.best = {k.removeprefix("best."): v for k, v in state.items() if k.startswith("best.")}
-        self.stopwatch = Stopwatch(seconds + self.stopwatch.seconds)
+        self.stopwatch = Stopwatch(seconds + self.stopwatch.seconds, self.stopwatch.limit)
 
     def _found(self) -> tuple[Splats, Response]:
         learner = self.learner
