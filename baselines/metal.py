@@ -9,7 +9,7 @@ import scipy.ndimage
 import torch
 from numpy.typing import NDArray
 
-from baselines.morphology import dilate, filled, pieces
+from baselines.morphology import dilate, filled, pieces, spread
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.project import Tracer
@@ -135,14 +135,19 @@ def water_value(volume: NDArray[np.float32]) -> float:
     return float((edges[at] + edges[at + 1]) / 2)
 
 
-def reach(geometry: Geometry) -> int:
-    """Return how many pixels beyond a mask's shadow metal may still be seen.
+def reach(geometry: Geometry) -> tuple[int, int]:
+    """Return how many pixels (v, u) beyond a mask's shadow metal may still be seen.
 
     A voxel belongs to the mask from half its volume on, so metal ends up to half a voxel beyond, and a pixel
-    averages over its own width: half a voxel, magnified, and half a pixel, rounded.
+    averages over its own width: half a voxel, magnified, and half a pixel, rounded. Of a voxel's edges the one counts
+    that is longest along the pixels' rows or columns in any view.
     """
-    voxel = max(geometry.d_voxel) * geometry.dsd / geometry.dso
-    return math.floor(0.5 * voxel / min(geometry.d_detector) + 1.0)
+    d_z, d_y, d_x = geometry.d_voxel
+    axes = geometry.pose_array()[:, 6:12].reshape(-1, 2, 3)
+    along = np.abs(axes / np.linalg.norm(axes, axis=2, keepdims=True)) * np.array([d_x, d_y, d_z])
+    u, v = along.max((0, 2)) * geometry.dsd / geometry.dso
+    d_v, d_u = geometry.d_detector
+    return math.floor(0.5 * v / d_v + 1.0), math.floor(0.5 * u / d_u + 1.0)
 
 
 class Trace:
@@ -179,11 +184,11 @@ class Trace:
         shadow = self._lengths[1] > self.thinnest
         if self.dilation is not None or not shadow.any():
             return dilate(shadow, self.dilation or 0)
-        pixels = reach(self.geometry)
-        window = around(shadow, 2 * pixels + 2)
-        near = dilate(shadow[window], pixels)
+        v, u = reach(self.geometry)
+        window = around(shadow, (2 * v + 2, 2 * u + 2))
+        near = spread(shadow[window], (v, u))
         p = self.logarithm.of(view)[0][window]
-        darkest = scipy.ndimage.maximum_filter(np.where(near, np.float32(-np.inf), p), 2 * pixels + 3)
+        darkest = scipy.ndimage.maximum_filter(np.where(near, np.float32(-np.inf), p), (2 * v + 3, 2 * u + 3))
         shadow[window] |= near & (p > darkest)
         return shadow
 
@@ -200,10 +205,10 @@ class Trace:
         return self.tracer.background(self.geometry, view)[1]
 
 
-def around(mask: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:
-    """Return the smallest window of rows and columns that holds a mask [v, u] that is not empty, and a margin."""
+def around(mask: NDArray[np.bool_], margins: tuple[int, int]) -> tuple[slice, slice]:
+    """Return the smallest window of rows and columns that holds a mask [v, u] that is not empty, and margins."""
     ranges = []
-    for axis in (1, 0):
+    for axis, margin in zip((1, 0), margins, strict=True):
         found = np.flatnonzero(mask.any(axis))
         ranges.append(slice(max(int(found[0]) - margin, 0), int(found[-1]) + margin + 1))
     return ranges[0], ranges[1]

@@ -23,6 +23,14 @@ def dilate(mask: Mask, n: int, *, corners: bool = False) -> Mask:
     return np.asarray(scipy.ndimage.binary_dilation(mask, None, n), np.bool_)
 
 
+def spread(mask: Mask, reach: tuple[int, ...]) -> Mask:
+    """Grow a mask by its axes' reaches (≥ 1), less aslant: where Σ |distance|/reach ≤ 1. `dilate` if all are alike."""
+    if len(set(reach)) == 1:
+        return dilate(mask, reach[0])
+    grid = np.meshgrid(*(np.arange(-n, n + 1) / n for n in reach), indexing="ij", sparse=True)
+    return np.asarray(scipy.ndimage.binary_dilation(mask, sum(map(np.abs, grid)) <= 1 + 1e-9), np.bool_)
+
+
 def opened(mask: Mask) -> Mask:
     """Leave out of a mask what is thinner than three pixels."""
     return dilate(_filtered(scipy.ndimage.minimum_filter, mask, 3), 1, corners=True)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from baselines.limar import interpolated
 from baselines.metal import Metal, Trace, around, reach, water_value
-from baselines.morphology import dilate, opened
+from baselines.morphology import dilate, opened, spread
 from ctsim.errors import InputError
 from reconstruct.projector import forward_columns
 
@@ -118,9 +118,9 @@ def _beside(trace: Trace, view: int, q: Array) -> Array:
     shadow = trace.view(view)
     if not shadow.any():
         return q[shadow]
-    pixels = reach(trace.geometry)
-    window = around(shadow, pixels + RING)
+    v, u = reach(trace.geometry)
+    window = around(shadow, (v + RING, u + RING))
     p, clamped = trace.logarithm.of(view)
-    inner = dilate(shadow[window], pixels)  # what little metal is left there would be held against both
+    inner = spread(shadow[window], (v, u))  # what little metal is left there would be held against both
     ring = dilate(inner, RING) & ~inner & ~clamped[window]
     return (p - q)[window][ring]

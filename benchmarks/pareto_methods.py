@@ -33,6 +33,8 @@ BY_VALUE: dict[str, tuple[str, tuple[Any, ...]]] = {
     "splat": ("passes", ((1, 0), (1, 1), (2, 1), (3, 1), (3, 2), (3, 3), (4, 4))),
 }
 """Methods that run once for each of these values of a parameter; the default is added."""
+PUBLISHED, STEPS = ("paper", "r2"), 6000
+"""Presets of `splat` that run once, for so many steps of the published schedule, watched after each pass."""
 FDKS = {
     "fdk": 1.0,
     "limar": 2.0,
@@ -48,8 +50,10 @@ FDKS = {
     "asd-pocs": 2.3,
     "awpcsd": 3.7,
     "splat": 18.0,
+    "splat paper": 2000.0,
+    "splat r2": 2000.0,
 }
-"""Cost in FDKs, for estimates, as measured on lung-Fe of `quick`: of an iteration or a pass where there are any."""
+"""Cost in FDKs, for estimates, as measured on lung-Fe of `quick`: of an iteration or a pass where those are given."""
 UNKNOWN = 5.0
 LAST = 2  # times the default: how far iterations go
 
@@ -64,11 +68,16 @@ class Ended(RuntimeError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effort:
-    """One run to time: a method with its parameters, and what the run is called."""
+    """One run to time: a method with its parameters, what the run and its curve are called.
+
+    A run that is `watched` has a mark at each of `STOPS`, if the method shows its volume.
+    """
 
     method: Method
     label: str
+    curve: str
     default: bool = True
+    watched: bool = False
 
 
 def efforts(name: str) -> list[Effort]:
@@ -78,14 +87,22 @@ def efforts(name: str) -> list[Effort]:
         key, values = BY_VALUE[name]
         usually = usual.params[key]
         every = list(dict.fromkeys((*values, tuple(usually) if isinstance(usually, list) else usually)))
-        return [
-            Effort(method=find(name, {key: v}), label=f"{key} {_words(v)}", default=_words(v) == _words(usually))
-            for v in every
+        named = [(_words(v), find(name, {key: v})) for v in every]
+        found = [
+            Effort(method=method, label=f"{key} {words}", curve=name, default=words == _words(usually))
+            for words, method in named
         ]
+        return found + [_published(preset) for preset in PUBLISHED if name == "splat"]
     count = usual.params.get("iterations")
     if not isinstance(count, int):
-        return [Effort(method=usual, label="defaults")]
-    return [Effort(method=find(name, {"iterations": LAST * count}), label=f"{LAST * count} iterations")]
+        return [Effort(method=usual, label="defaults", curve=name)]
+    method = find(name, {"iterations": LAST * count})
+    return [Effort(method=method, label=f"{LAST * count} iterations", curve=name, watched=True)]
+
+
+def _published(preset: str) -> Effort:
+    method = find("splat", {"preset": preset, "steps": STEPS, "readout": "hardened"})
+    return Effort(method=method, label=f"{STEPS} steps", curve=f"splat {preset}", watched=True)
 
 
 def in_fdks(effort: Effort) -> float:
@@ -93,7 +110,7 @@ def in_fdks(effort: Effort) -> float:
     name, params = effort.method.name, effort.method.params
     amount = params.get(BY_VALUE[name][0] if name in BY_VALUE else "iterations")
     count = sum(amount) if isinstance(amount, tuple | list) else amount if isinstance(amount, int) else 1
-    return FDKS.get(name, UNKNOWN) * count
+    return FDKS.get(effort.curve, UNKNOWN) * count
 
 
 def fdk_seconds(geometry: Geometry) -> float:
@@ -124,7 +141,7 @@ class Bench:
             scene=self.stored.name,
             data=f"{self.stored.content_hash}, protocol {VERSION}",
             group=method.inputs,
-            curve=method.name,
+            curve=effort.curve,
             label=effort.label,
             params=method.params,
             code=method.code,
@@ -146,7 +163,7 @@ class Bench:
             raise Ended(str(Status.SKIPPED), reason)
         stops = STOPS | {usual, method.params.get("iterations")}
         marks = Marks(began=time.perf_counter(), score=self.values, stops=stops)
-        with watch(marks) if method.name not in BY_VALUE else contextlib.nullcontext():
+        with watch(marks) if effort.watched else contextlib.nullcontext():
             volume = method.reconstruct(scan, "cpu")
         ended = time.perf_counter()
         if volume.status is not Status.OK:

@@ -62,14 +62,12 @@ PHYSICAL = ("splat", "ibhc")  # take materials from tables in 1/mm
 class Scene:
     """A scan that is hard on methods; `near` says whether the data determine the object.
 
-    A method that is `far` need not come near it. `like` is a scan that must give the same volume but for a factor in
-    length: methods that need not are `unlike`.
+    `like` is a scan that must give the same volume but for a factor in length: methods that need not are `unlike`.
     """
 
     what: str
     make: Callable[[int], Example]
     near: bool = True
-    far: Collection[str] = ()
     like: Callable[[int], Example] | None = None
     factor: Callable[[int], float] = lambda _: 1.0
     unlike: Collection[str] = ()
@@ -176,7 +174,6 @@ SCENES: dict[str, Scene] = {
     "anisotropic": Scene(
         what="voxels of 50:1",
         make=lambda n: scan_of(n, of=OBLONG),
-        far=("limar",),  # its trace reaches out by half the longest edge of a voxel, here over the whole body
     ),
     "voxel-1um": Scene(
         what="voxels of 1 µm",
@@ -260,7 +257,7 @@ def under_stress(name: str, scene: Scene, side: int, found: Findings) -> None:
     if values.shape != given.scan.geometry.n_voxel:
         found.say(f"the volume has shape {values.shape}, the grid {given.scan.geometry.n_voxel}", holds=False)
         return
-    _judge(volume, found, given, near=scene.near and name not in scene.far, bounds=BOUNDS.get(name, 1.0))
+    _judge(volume, found, given, near=scene.near, bounds=BOUNDS.get(name, 1.0))
     if name in BY_MASK and given.scan.metal is not None and not given.scan.metal.any():
         found.same("without metal its bits and FDK's are", values, fdk(given.scan).values.numpy())
     if scene.like is not None and name not in scene.unlike:
@@ -305,7 +302,7 @@ def on_any_threads(name: str, side: int, found: Findings) -> None:
 
 def _expected(name: str, scene: Scene) -> str:
     words = ["finite, within " + (f"{BOUNDS[name]:g} times " if name in BOUNDS else "") + "the bound of values"]
-    if scene.near and name not in scene.far:
+    if scene.near:
         words.append(f"error ≤ {NEAR:g} of an empty volume's, or its limitation said")
     if scene.like is not None and name not in scene.unlike:
         words.append(f"as the other form of the scan to {_limit(name):g}")

@@ -10,7 +10,7 @@ import torch
 from baselines import limar, nmar
 from baselines.inpaint import Filled, fill, harmonic
 from baselines.metal import Metal, Trace, auto_mask, find_metal, reach, reinsert, water_value
-from baselines.morphology import dilate
+from baselines.morphology import dilate, spread
 from baselines.prior import tissue_prior
 from benchmarks.methods import find
 from ctsim.errors import InputError
@@ -189,9 +189,21 @@ def test_metal_that_the_mask_leaves_out_is_within_reach(iron):
 
 def test_the_reach_grows_with_the_pixels_that_a_voxel_covers():
     # half a voxel is 1.5 mm on the detector, 0.75 of its pixels: with half a pixel 1.25; then 3.0, and 0.65
-    assert reach(GEOMETRY) == 1
-    assert reach(msgspec.structs.replace(GEOMETRY, d_detector=(0.6, 0.6))) == 3
-    assert reach(msgspec.structs.replace(GEOMETRY, d_detector=(10.0, 10.0))) == 1
+    assert reach(GEOMETRY) == (1, 1)
+    assert reach(msgspec.structs.replace(GEOMETRY, d_detector=(0.6, 0.6))) == (3, 3)
+    assert reach(msgspec.structs.replace(GEOMETRY, d_detector=(10.0, 10.0))) == (1, 1)
+    # a long edge upright counts along the rows' columns alone, one lying down along the rows
+    d_z, d_y, d_x = GEOMETRY.d_voxel
+    assert reach(msgspec.structs.replace(GEOMETRY, d_voxel=(10 * d_z, d_y, d_x))) == (8, 1)
+    assert reach(msgspec.structs.replace(GEOMETRY, d_voxel=(d_z, 10 * d_y, d_x))) == (1, 7)
+
+
+def test_a_mask_spreads_as_far_along_each_axis_as_it_is_told():
+    point = np.zeros((9, 11), bool)
+    point[4, 5] = True
+    np.testing.assert_array_equal(spread(point, (3, 3)), dilate(point, 3))
+    found = spread(point, (1, 4))
+    assert found[:, 5].sum() == 3 and found[4].sum() == 9 and found.sum() == 11
 
 
 def test_voxels_that_hold_blurred_metal_do_not_pass_for_bone(iron):

@@ -180,8 +180,10 @@ def test_each_setting_runs_once_a_round_and_a_resumed_command_goes_on():
 def test_every_method_has_an_effort_and_one_default():
     for name in TABLE:
         found = pareto_methods.efforts(name)
-        assert sum(e.default for e in found) == 1, name
-        assert len({e.label for e in found}) == len(found), name
+        curves = {e.curve for e in found}
+        assert [sum(e.default for e in found if e.curve == curve) for curve in curves] == [1] * len(curves), name
+        assert len({(e.curve, e.label) for e in found}) == len(found), name
+    assert {e.curve for e in pareto_methods.efforts("splat")} == {"splat", "splat paper", "splat r2"}
     assert [e.label for e in pareto_methods.efforts("fdk")] == ["defaults"]
     assert [e.method.overrides for e in pareto_methods.efforts("cgls")] == [{"iterations": 30}]
 

@@ -101,17 +101,21 @@ class Fit:
         la, lb = (np.ascontiguousarray(paths[:, c]) for c in (0, 1))
         p, by_a, by_b = evaluate(self.response, la, lb)
         weights = self._weights[views]
-        slopes = np.stack([weights * by_a, weights * by_b], 1)
+        slopes = np.stack([weights * by_a, weights * by_b], 1, dtype=np.float32)
         if measure:
             along = by_a * la + by_b * lb  # J·u: the majoriser's other half
-            self._curvature += self.projector.adjoint(slopes * along[:, None], views)
+            self._curvature += self._back(slopes, along, views)
             self._measured += len(views)
-        lacking = (self._p[views] - p) * (weights > 0)
-        gradient = self.curve.transpose(self.u, self.projector.adjoint(slopes * lacking[:, None], views))
+        lacking = self._p[views] - p
+        lacking *= weights > 0
+        gradient = self.curve.transpose(self.u, self._back(slopes, lacking, views))
         curvature = self.curve.transpose(self.u, self._curvature) * np.float32(len(views) / self._measured)
         self._move(gradient * np.float32(length), curvature, len(views))
         self.view_updates += len(views)
         return float(np.abs(lacking).sum(dtype=np.float64)) / (len(views) * math.prod(self.data.geometry.n_detector))
+
+    def _back(self, slopes: Image, images: Image, views: NDArray[np.int64]) -> Image:
+        return self.projector.adjoint(np.asarray(slopes * images[:, None], np.float32), views)
 
     def _move(self, gradient: Image, curvature: Image, n_views: int) -> None:
         water = self.curve.water
