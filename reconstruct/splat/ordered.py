@@ -103,7 +103,7 @@ class Fit:
         weights = self._weights[views]
         slopes = np.stack([weights * by_a, weights * by_b], 1, dtype=np.float32)
         if measure:
-            along = by_a * la + by_b * lb  # J·u: the majoriser's other half
+            along = np.asarray(by_a * la + by_b * lb, np.float32)  # J·u: the majoriser's other half
             self._curvature += self._back(slopes, along, views)
             self._measured += len(views)
         lacking = self._p[views] - p
@@ -115,7 +115,7 @@ class Fit:
         return float(np.abs(lacking).sum(dtype=np.float64)) / (len(views) * math.prod(self.data.geometry.n_detector))
 
     def _back(self, slopes: Image, images: Image, views: NDArray[np.int64]) -> Image:
-        return self.projector.adjoint(np.asarray(slopes * images[:, None], np.float32), views)
+        return self.projector.adjoint(slopes * images[:, None], views)
 
     def _move(self, gradient: Image, curvature: Image, n_views: int) -> None:
         water = self.curve.water
