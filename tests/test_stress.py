@@ -23,6 +23,7 @@ from ctsim.types import Scanner
 from reconstruct import log
 from reconstruct.log import line_integrals
 from reconstruct.splat import level, ordered
+from reconstruct.splat.kernels.lanes import WIDTH
 from reconstruct.splat.learner import seed_splats
 from reconstruct.splat.loss import l1_ssim
 from reconstruct.splat.objective import Objective
@@ -185,8 +186,8 @@ def test_dead_pixels_are_left_out_by_weight_0(monkeypatch):
     """A pixel that never sees anything has P = 0, as an open one: counted in, it carves the object away."""
     given = scan_of(noise=Noise(dead_fraction=0.02))
     masked = error(given)
-    weighed = level.padded
-    everywhere(monkeypatch, "padded", lambda g, p, valid: weighed(g, p, np.ones_like(valid)))
+    weighed = level.weighted
+    everywhere(monkeypatch, "weighted", lambda g, p, valid: weighed(g, p, np.ones_like(valid)))
     # 0.14 and 0.45: what is carved away scores as an empty volume does
     assert masked < 0.2 < 2 * masked < error(given)
 
@@ -194,14 +195,12 @@ def test_dead_pixels_are_left_out_by_weight_0(monkeypatch):
 def test_starved_rays_count_for_little(monkeypatch):
     """Iron at a thousand photons: rays behind it say nothing but noise, at unit weight as loudly as the others."""
     given = scan_of(WATER, BONE, rod("Fe", 5.0, at=(9.0, 2.0)), i0=1e3)
-    weighted, weighed = error(given), level.padded
+    weighted, weighed = error(given), level.weighted
 
     def unweighted(g, p, valid):
-        data = weighed(g, p, valid)
-        data.weights[..., : g.n_detector[1]] = valid
-        return data
+        return dataclasses.replace(weighed(g, p, valid), weights=valid.astype(np.float32))
 
-    everywhere(monkeypatch, "padded", unweighted)
+    everywhere(monkeypatch, "weighted", unweighted)
     assert 1.4 * weighted < error(given)  # 0.16 and 0.29
 
 
@@ -248,7 +247,7 @@ def test_the_step_is_that_of_a_majoriser(monkeypatch):
         """Σ w·a² of every splat, a its line integrals at density 1, in the unit of the fit's gradient."""
         shapes = fit.lattice.splats(np.ones((len(fit.lattice), 1), np.float32)).shapes()
         view, ones, weights = Projector(geometry=fit.data.geometry), np.ones((1, 1), np.float32), fit.data.weights
-        images = (view.forward(shapes[:, k : k + 1].copy(), ones)[:, 0] for k in range(shapes.shape[1]))
+        images = (view.forward(shapes[:, k : k + 1].copy(), ones)[:, 0, :, :-WIDTH] for k in range(shapes.shape[1]))
         return np.array([(weights * image**2).sum() for image in images]) / fit.lattice.unit
 
     def jacobi(fit, gradient, curvature, n_views):
