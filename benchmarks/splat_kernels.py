@@ -58,11 +58,8 @@ def published() -> list[str]:
         rotations=rng.normal(size=(N_SPLATS, 4)).astype(np.float32),
         densities=rng.uniform(0, 0.1, (N_SPLATS, 2)).astype(np.float32),
     )
-    shapes, ewa, exact = (
-        splats.shapes(),
-        Projector(geometry=VIEW, tolerance=np.inf),
-        Projector(geometry=VIEW, tolerance=0),
-    )
+    ewa, exact = (Projector(geometry=VIEW, tolerance=tolerance) for tolerance in (np.inf, 0))
+    shapes = splats.shapes()
     back = np.zeros((2, 512, 512 + WIDTH), np.float32)
     back[..., :512] = rng.normal(size=(2, 512, 512))
     found = _rounds(
