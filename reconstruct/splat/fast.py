@@ -23,6 +23,7 @@ from ctsim.spectrum import Tube, spectrum
 from ctsim.types import Scan, Status, Volume
 from reconstruct.beam import Given, known_detector, known_tube
 from reconstruct.log import line_integrals
+from reconstruct.scatter import open_excess
 from reconstruct.splat.curve import MaterialCurve
 from reconstruct.splat.lattice import Lattice
 from reconstruct.splat.level import Data, carve, coarser, refined, weighted
@@ -48,7 +49,9 @@ class Settings:
     units of water a pass. The finest grid is `fineness` times that of the volume, at most as fine as the detector's
     pixels at the isocentre. `response` "tube" is a tube behind `filtration` mm of aluminium, seen by a scintillator;
     "known" takes `tube` and `detector`, tables of a scene file, whole or in part. `readout` is an energy in keV, or
-    "hardened": by the object's own water. After `seconds` it returns what there is. Raises InputError for values that
+    "hardened": by the object's own water. After `seconds` it returns what there is. `scatter` is what every reading
+    holds of it over the open field (S/I0); None has it found in the pixels that no shadow reaches (`open_excess`), 0 is
+    for scans whose open pixels are brighter than their open field for another reason. Raises InputError for values that
     make no sense.
     """
 
@@ -61,6 +64,7 @@ class Settings:
     detector: Given | Detector = None
     readout: float | Literal["hardened"] = "hardened"
     seconds: float = math.inf
+    scatter: float | None = None
 
     def __post_init__(self) -> None:
         if not (len(self.passes) == 2 and min(self.passes) >= 0 and max(self.passes) > 0):
@@ -68,6 +72,8 @@ class Settings:
         for name, least in (("tv", 0), ("seconds", 0), ("fineness", 1)):
             if not getattr(self, name) >= least:
                 raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        if self.scatter is not None and not 0 <= self.scatter < math.inf:
+            raise InputError(f"scatter must be at least 0 times the open field, got {self.scatter}")
         if self.response not in RESPONSES:
             raise InputError(f"response of preset 'fast' must be one of {', '.join(RESPONSES)}, got {self.response!r}")
         if self.response == "tube" and not (self.tube is None and self.detector is None):
@@ -88,7 +94,9 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     """Reconstruct `scan`: attenuation in 1/mm; details hold the volumes "rho_a" and "rho_b" under "densities"."""
     stopwatch = Stopwatch(limit=settings.seconds)
     p, clamped = line_integrals(scan, slice(None))
-    data = weighted(finer(scan.geometry, settings.fineness), p.numpy(), ~clamped.numpy())
+    valid = ~clamped.numpy()
+    scatter = open_excess(p.numpy(), valid) if settings.scatter is None else settings.scatter
+    data = weighted(finer(scan.geometry, settings.fineness), p.numpy(), valid, scatter)
     response = settings.make_response(scan.e_max)
 
     def proceed(fit: Fit, whole: bool, share: float) -> bool:
@@ -99,6 +107,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     fit = None if bool(clamped.all()) else _coarse_to_fine(data, response, settings, proceed)
     details: dict[str, Any] = {
         "response": {"name": response.name, "theta": list(response.trainable)},
+        "scatter": scatter,
         "clamped_pixels": int(clamped.sum()),
         "splats": 0 if fit is None else len(fit.lattice),
     }
@@ -184,8 +193,8 @@ def _coarse_to_fine(
 
 
 def _open_photons(data: Data) -> float:
-    """Estimate the photons of an open pixel from how far p falls below 0, which only noise does: 1/var."""
-    p = _readings(data)
+    """Estimate the photons of an open pixel from how far p falls below that of open rays, as only noise does: 1/var."""
+    p = _readings(data) - data.open
     below = p[p < 0].astype(np.float64)
     return float(1 / max(np.mean(below**2), 1e-12)) if below.size else 1e12
 
@@ -203,13 +212,13 @@ def _few_views(geometry: Geometry) -> NDArray[np.int64]:
 def _rough_length(data: Data, response: Response, met: float) -> float:
     """Return the water path (mm) behind which p is the median of the rays that met something."""
     p = _readings(data)
-    seen = p[p > met]
+    seen = p[p > met + data.open]
     if not seen.size:
         return 0.0
     lengths = np.linspace(0, 500, 2001)
     la, lb = ((lengths * density).astype(np.float32) for density in MaterialCurve.of(response, 0.0).of_water)
     found, _, _ = evaluate(response, la, lb)
-    return float(np.interp(np.median(seen), found, lengths))
+    return float(np.interp(np.median(seen), -np.log(np.exp(-found) + data.scatter), lengths))
 
 
 def typical_length(fit: Fit) -> float:

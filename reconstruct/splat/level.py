@@ -1,5 +1,6 @@
 """A scan at one resolution: binned data on a coarser grid, fewer views of it, and back."""
 
+import math
 from dataclasses import dataclass
 
 import msgspec
@@ -13,16 +14,23 @@ from ctsim.geometry import Geometry
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Data:
-    """Line integrals `p` and their weights, float32 [view, v, u]."""
+    """Line integrals `p` and their weights, float32 [view, v, u]; `scatter` over the open field is in p still."""
 
     geometry: Geometry
     p: NDArray[np.float32]
     weights: NDArray[np.float32]
+    scatter: float = 0.0
+
+    @property
+    def open(self) -> float:
+        """What p is where a ray met nothing."""
+        return -math.log1p(self.scatter)
 
 
-def weighted(geometry: Geometry, p: NDArray[np.float32], valid: NDArray[np.bool_]) -> Data:
+def weighted(geometry: Geometry, p: NDArray[np.float32], valid: NDArray[np.bool_], scatter: float = 0.0) -> Data:
     """Weight line integrals [view, v, u] by the photons that came through, exp(−p), and 0 where not `valid`."""
-    return Data(geometry=geometry, p=p, weights=np.where(valid, np.exp(-np.maximum(p, 0)), 0).astype(np.float32))
+    weights = np.where(valid, np.exp(-np.maximum(p, 0)), 0).astype(np.float32)
+    return Data(geometry=geometry, p=p, weights=weights, scatter=scatter)
 
 
 def coarser(data: Data) -> Data:
@@ -58,7 +66,7 @@ def coarser(data: Data) -> Data:
     n = np.maximum(valid.sum((2, 4)), 1)
     mean = np.where(valid, np.exp(-p), 0).sum((2, 4)) / n
     seen = np.asarray(valid.any((2, 4)), np.bool_)
-    return weighted(geometry, -np.log(np.where(seen, mean, 1)).astype(np.float32), seen)
+    return weighted(geometry, -np.log(np.where(seen, mean, 1)).astype(np.float32), seen, data.scatter)
 
 
 def refined(values: NDArray[np.float32], fine: Geometry) -> NDArray[np.float32]:
@@ -71,10 +79,10 @@ def refined(values: NDArray[np.float32], fine: Geometry) -> NDArray[np.float32]:
 def carve(data: Data, open_below: float) -> NDArray[np.bool_]:
     """Return the voxels [z, y, x] that some view sees and none shows to be empty.
 
-    A voxel is empty where a view has its shadow and p of the pixels around that lies below `open_below`. Pixels
-    without weight say nothing.
+    A voxel is empty where a view has its shadow and p of the pixels around that lies less than `open_below` above that
+    of a ray that met nothing. Pixels without weight say nothing.
     """
-    p = np.where(data.weights > 0, data.p, np.inf)
+    p = np.where(data.weights > 0, data.p - np.float32(data.open), np.inf)
     near = np.asarray(ndimage.maximum_filter(p, (1, 3, 3))) > open_below
     z, y, x = data.geometry.voxel_centres()
     state = np.zeros(data.geometry.n_voxel, np.int8)

@@ -32,6 +32,7 @@ class Options:
     tv: float | None = None
     fineness: float | None = None
     filtration: float | None = None
+    scatter: float | None = None
     tube: Mapping[str, Any] | None = None
     detector: Mapping[str, Any] | None = None
     basis: str | None = None

@@ -100,6 +100,10 @@ class Fit:
         paths = self.projector.forward(values, views)
         la, lb = (np.ascontiguousarray(paths[:, c]) for c in (0, 1))
         p, by_a, by_b = evaluate(self.response, la, lb)
+        if self.data.scatter:
+            primary = np.exp(-p)
+            seen = primary + np.float32(self.data.scatter)
+            p, by_a, by_b = -np.log(seen), by_a * (primary / seen), by_b * (primary / seen)
         weights = self._weights[views]
         slopes = np.stack([weights * by_a, weights * by_b], 1, dtype=np.float32)
         if measure:
