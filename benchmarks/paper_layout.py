@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import msgspec
 
+from benchmarks import latex
 from benchmarks.columns import COLUMNS, Column
 from benchmarks.methods import Method
 from benchmarks.texts import escape, ranked
@@ -211,7 +212,7 @@ def render(sheet: Sheet, form: Form) -> str:
     """Render a filled table."""
     sides = [sheet.table.sides(k) for k in range(len(sheet.table.columns))]
     body = [
-        [escape(stub, form) if form == "md" else _tex(stub) for stub in row.stubs]
+        [escape(stub, form) if form == "md" else latex.prose(stub) for stub in row.stubs]
         + [_text(sheet.cells[side][i][k], form) for k in range(len(sides)) for side in sides[k]]
         for i, row in enumerate(sheet.table.rows)
     ]
@@ -239,51 +240,14 @@ def _latex(sheet: Sheet, body: list[list[str]]) -> str:
     head: list[str] = []
     sides = [table.sides(k) for k in range(len(table.columns))]
     if any(column.group for column in table.columns):
-        head += _spanned(n_stubs, _runs([(c.group, len(s)) for c, s in zip(table.columns, sides, strict=True)]))
-    head += _spanned(n_stubs, [(c.title, len(s)) for c, s in zip(table.columns, sides, strict=True)])
-    head.append(
-        " & ".join([*(_tex(stub) for stub in table.stubs), *(side for pair in sides for side in pair)]) + r" \\"
+        head += latex.spanning(n_stubs, [(c.group, len(s)) for c, s in zip(table.columns, sides, strict=True)])
+    head += latex.spanning(n_stubs, [(c.title, len(s)) for c, s in zip(table.columns, sides, strict=True)], merge=False)
+    head.append(latex.row([*(latex.prose(stub) for stub in table.stubs), *(side for pair in sides for side in pair)]))
+    return latex.table(
+        latex.prose(f"{table.title}. {sheet.caption}"),
+        "l" * n_stubs + "r" * sum(map(len, sides)),
+        head,
+        [latex.row(line) for line in body],
+        label=f"tab:paper-{table.number}",
+        notes=[latex.prose(note) for note in sheet.notes],
     )
-    lines = [
-        r"\begin{table}",
-        r"\centering",
-        rf"\caption{{{_tex(f'{table.title}. {sheet.caption}')}}}",
-        rf"\label{{tab:paper-{table.number}}}",
-        rf"\begin{{tabular}}{{{'l' * n_stubs}{'r' * sum(map(len, sides))}}}",
-        r"\toprule",
-        *head,
-        r"\midrule",
-        *(" & ".join(line) + r" \\" for line in body),
-        r"\bottomrule",
-        r"\end{tabular}",
-        *(rf"\par\footnotesize {_tex(note)}" for note in sheet.notes),
-        r"\end{table}",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _runs(titles: list[tuple[str, int]]) -> list[tuple[str, int]]:
-    """Return neighbouring equal titles once, with the columns that they span together."""
-    found: list[tuple[str, int]] = []
-    for title, n in titles:
-        if found and found[-1][0] == title:
-            n += found.pop()[1]
-        found.append((title, n))
-    return found
-
-
-def _spanned(n_stubs: int, titles: list[tuple[str, int]]) -> list[str]:
-    """Return a head line of titles over several columns, and the rules below them."""
-    cells, rules, first = [""] * n_stubs, [], n_stubs + 1
-    for title, n in titles:
-        cells.append(rf"\multicolumn{{{n}}}{{c}}{{{_tex(title)}}}")
-        rules.append(rf"\cmidrule(lr){{{first}-{first + n - 1}}}")
-        first += n
-    return [" & ".join(cells) + r" \\", "".join(rules)]
-
-
-def _tex(text: str) -> str:
-    """Escape prose: a pair of hyphens is a flag and no dash, and what stands in backquotes is typewriter."""
-    parts = ["-{}-".join(escape(piece, "tex") for piece in part.split("--")) for part in text.split("`")]
-    typed = "".join(rf"\texttt{{{part}}}" if n % 2 else part for n, part in enumerate(parts))
-    return typed.replace("γ", r"$\gamma$").replace("²", "$^2$")

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import pandas as pd
 
+from benchmarks import latex
 from benchmarks.columns import COLUMNS, Column
 from benchmarks.compare import NMAR, derived, harm, row_of
 from benchmarks.records import OK, Record, latest, outdated
@@ -224,15 +225,11 @@ def render(records: list[Record], form: Format, protocols: Iterable[str] = tuple
             notes = "".join(f"- {escape(note, form)}\n" for note in declared)
             parts.append(f"## {protocol}\n\n{text}\n\n" + "\n".join(body) + "\n" + (f"\n{notes}" if notes else ""))
         else:
-            body = [" & ".join(line) + r" \\" for line in lines]
-            spec = "ll" + "r" * len(columns)
-            parts.append(
-                "\\begin{table}\n\\centering\n\\caption{" + text + "}\n\\begin{tabular}{" + spec + "}\n\\toprule\n"
-                f"{body[0]}\n\\midrule\n"
-                + "\n".join(body[1:])
-                + "\n\\bottomrule\n\\end{tabular}\n\\end{table}\n"
-                + "".join(f"% {note}\n" for note in declared)
-            )
+            titles = [escape(COLUMNS[protocol][metric].title, form) for _, metric in columns]
+            head = [*latex.spanning(2, [(scene, 1) for scene, _ in columns]), latex.row([*lines[0][:2], *titles])]
+            body = [latex.row(line) for line in lines[1:]]
+            comments = "".join(f"% {note}\n" for note in declared)
+            parts.append(latex.table(text, "ll" + "r" * len(columns), head, body) + comments)
     parts += [_failures(records, form), f"{'' if form == 'md' else '% '}{left_out}.\n" if left_out else ""]
     return "\n".join(p for p in parts if p)
 
@@ -247,7 +244,7 @@ def _failures(records: list[Record], form: Format) -> str:
     ]
     if form == "md":
         return "## Failures and skips\n\n" + "\n".join(f"- {escape(line, form)}" for line in lines) + "\n"
-    return "\n".join("% " + line for line in lines) + "\n"
+    return "\n".join("% " + " ".join(line.split()) for line in lines) + "\n"
 
 
 def write(records: list[Record], results: Path) -> None:

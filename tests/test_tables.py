@@ -1,8 +1,11 @@
+import shutil
+import subprocess
+
 import msgspec
 import pandas as pd
 import pytest
 
-from benchmarks import tables
+from benchmarks import latex, tables
 from benchmarks.protocol import Score
 from benchmarks.records import Cost, Record, Run
 from benchmarks.texts import escape, ranked
@@ -217,3 +220,25 @@ def test_texts_that_differ_in_numbers_only_are_merged_to_ranges():
     assert tables.merged(["behind 9.5 mm", "behind 30.25 mm", "behind 12.0 mm"]) == "behind 9.5 to 30.25 mm"
     assert tables.merged(["50 keV", "behind 1.0 of 2.0", "behind 1.0 of 3.0"]) == "50 keV / behind 1.0 of 2.0 to 3.0"
     assert tables.merged([]) == ""
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex is not installed")
+def test_latex_compiles_with_whatever_a_caption_or_a_reason_holds(tmp_path):
+    odd = "50 % of {a_b} & c^2 ≤ 3 µm ~ $x$ # \\n ± − – > 2×10³ μ γ ² ° ·"
+    failed = record("net", status="error", scene="teeth")
+    given = [record(odd), record("b", scene="teeth"), msgspec.structs.replace(failed, reason=f"{odd}\nand more")]
+    sheet = tables.render(given, "tex") + latex.table(latex.prose(f"{odd} `--flag {odd}`"), "l", [], [latex.row(["1"])])
+    page = "\\documentclass{article}\\usepackage{booktabs}\\begin{document}" + sheet + "\\end{document}"
+    (tmp_path / "page.tex").write_text(page, encoding="utf-8")
+    told = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex"]
+    done = subprocess.run(told, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "\nand more" not in sheet  # a comment is one line
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert (tmp_path / "page.pdf").exists()
+
+
+def test_latex_heads_name_a_scene_once_over_its_columns():
+    text = tables.render([record(), record(scene="teeth")], "tex", ["tissue"])
+    head = text[text.index("\\toprule") : text.index("\\midrule")]
+    assert head.count("lung") == head.count("teeth") == 1
+    assert "\\cmidrule(lr){3-4}\\cmidrule(lr){5-6}" in head
