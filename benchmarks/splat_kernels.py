@@ -60,8 +60,9 @@ def published() -> list[str]:
     )
     ewa, exact = (Projector(geometry=VIEW, tolerance=tolerance) for tolerance in (np.inf, 0))
     shapes = splats.shapes()
-    back = np.zeros((2, 512, 512 + WIDTH), np.float32)
-    back[..., :512] = rng.normal(size=(2, 512, 512))
+    n_v, n_u = VIEW.n_detector
+    back = np.zeros((2, n_v, n_u + WIDTH), np.float32)
+    back[..., :n_u] = rng.normal(size=(2, n_v, n_u))
     found = _rounds(
         {
             "exact forward": lambda: exact.forward(shapes, splats.densities),
@@ -71,7 +72,7 @@ def published() -> list[str]:
     )
     reference = found["exact forward"][1]
     errors = {name: _error(found[name][1], reference) for name in ("exact forward", "EWA forward")}
-    case = f"{N_SPLATS} splats, σ = {SIGMA:g} pixels, 512², 1 view"
+    case = f"{N_SPLATS} splats, σ = {SIGMA:g} pixels, {n_v} × {n_u}, 1 view"
     return [_row(case, name, s, N_SPLATS, errors.get(name)) for name, (s, _) in found.items()]
 
 
@@ -96,7 +97,7 @@ def lattice() -> list[str]:
         }
     )
     back = Projector(geometry=geometry, tolerance=0).adjoint(shapes, exact, views)
-    case = f"lattice of {len(grid)} splats, 224², {len(views)} views"
+    case = f"lattice of {len(grid)} splats, {geometry.n_detector[0]} × {geometry.n_detector[1]}, {len(views)} views"
     return [
         _row(case, name, s, len(grid) * len(views), _error(result, back if "adjoint" in name else pictures))
         for name, (s, result) in found.items()

@@ -71,9 +71,14 @@ def coarser(data: Data) -> Data:
 
 def refined(values: NDArray[np.float32], fine: Geometry) -> NDArray[np.float32]:
     """Interpolate a volume on `coarser`'s grid onto the fine grid that it was made of: [z, y, x]."""
-    where = np.meshgrid(*[(np.arange(n) - 0.5) / 2 for n in fine.n_voxel], indexing="ij", sparse=True)
-    full = np.broadcast_arrays(*where)
-    return np.asarray(ndimage.map_coordinates(values, full, order=1, mode="nearest"), np.float32)
+    for axis, n in enumerate(fine.n_voxel):
+        last = values.shape[axis] - 1
+        at = np.clip((np.arange(n) - 0.5) / 2, 0, last)
+        low = at.astype(np.int64)
+        share = (at - low).astype(np.float32).reshape([-1 if k == axis else 1 for k in range(3)])
+        below, above = values.take(low, axis), values.take(np.minimum(low + 1, last), axis)
+        values = below + share * (above - below)
+    return values
 
 
 def carve(data: Data, open_below: float) -> NDArray[np.bool_]:
