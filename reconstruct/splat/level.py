@@ -77,7 +77,7 @@ def refined(values: NDArray[np.float32], fine: Geometry) -> NDArray[np.float32]:
         low = at.astype(np.int64)
         share = (at - low).astype(np.float32).reshape([-1 if k == axis else 1 for k in range(3)])
         below, above = values.take(low, axis), values.take(np.minimum(low + 1, last), axis)
-        values = below + share * (above - below)
+        values = np.asarray(below + share * (above - below), np.float32)
     return values
 
 

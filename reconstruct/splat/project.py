@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import get_num_threads
 from numpy.typing import NDArray
 
 from ctsim.errors import InputError
@@ -18,6 +19,7 @@ CUTOFF = 3.5
 TOLERANCE = 1e-3
 """A splat is projected exactly where EWA would leave out more than this share of its peak: 0 always, inf never."""
 MANY_VIEWS = 8  # from so many on a thread takes whole views
+TASKS = 2  # bands of rows a thread: splats over two bands are begun twice
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,8 +76,9 @@ class Projector:
             kernels.forward_views(shapes, values, self.cameras[chosen], images)
         else:
             table, reach = np.empty((n, kernels.FOOTPRINT)), np.empty((n, 2), np.int32)
+            tasks = TASKS * get_num_threads()
             for view, image in zip(chosen, images, strict=True):
-                kernels.forward_view(shapes, values, self.cameras[view], table, reach, image)
+                kernels.forward_view(shapes, values, self.cameras[view], table, reach, image, tasks)
         return images.reshape(len(chosen), n_c, n_v, n_u + WIDTH)
 
     def adjoint(

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from reconstruct.splat.kernels.lanes import WIDTH, below, div, exp, fma, load, mul, ramp, spread, sqrt, store, total
 
 CHUNKS = 16  # of splats at least, one a task
-BANDS, BAND = 16, 32  # at most so many bands of rows, each of at least so many: a task adds splats in their order
-ROWS = 16  # rows by multiplication before the exponentials are taken anew
+ROWS = 32  # rows by multiplication before the exponentials are taken anew
 STEEP = 110.0  # −2 log of the faintest value that multiplication may start from
 CHANGE = 50.0  # −2 log of what multiplication may make of a fainter one: e^(25 − 55) of the peak is nothing
 UPRIGHT, NARROWEST = 0.1, 12.5  # C_uv/C_vv and C_vv up to which a change, (cutoff + 0.8 √C_vv)², stays below it
@@ -244,7 +243,10 @@ def _start(fp, column, dv, n_u):
 
 @njit(cache=True, error_model="numpy")
 def add_splat(fp, values, i, cutoff, image, n_u, rows):
-    """Add values[i, c]·w to the image of every channel, one or two, in the half-open range of rows."""
+    """Add values[i, c]·w to the image of every channel, one or two, in the half-open range of rows.
+
+    Multiplication starts anew where rows are multiples of ROWS, which `rows` must be, too.
+    """
     n_c = values.shape[1]
     n_v = image.shape[0] // n_c
     first, last = values[i, 0] * fp[W0], values[i, n_c - 1] * fp[W0]
@@ -255,16 +257,18 @@ def add_splat(fp, values, i, cutoff, image, n_u, rows):
     a, b = spread(np.float32(first)), spread(np.float32(last))
     for column in range(left, right, WIDTH):
         low, high = _rows(fp, column, cutoff, n_v)
-        low, high = max(low, rows[0]), min(high, rows[1])
         by_rows = fp[EXACT] == 0 and not _is_steep(fp, column, low, high)
-        for start in range(low, high, ROWS if by_rows else 1):
+        start, high = max(low, rows[0]), min(high, rows[1])
+        while start < high:
+            stop = min((start // ROWS + 1) * ROWS, high) if by_rows else start + 1
             g, r = _start(fp, column, start - fp[V0], n_u)
-            for v in range(start, min(start + ROWS, high) if by_rows else start + 1):
+            for v in range(start, stop):
                 store(image, v, column, fma(g, a, load(image, v, column)))
                 if n_c == 2:
                     store(image, n_v + v, column, fma(g, b, load(image, n_v + v, column)))
                 g = mul(g, r)
                 r = mul(r, fall)
+            start = stop
 
 
 @njit(cache=True, error_model="numpy")
@@ -318,17 +322,20 @@ def _add_band(table, reach, values, cutoff, band, image):
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
-def forward_view(shapes, values, camera, table, reach, image):
-    """Project onto one view by all threads; `image` must be zero.
+def forward_view(shapes, values, camera, table, reach, image, tasks):
+    """Project onto one view by all threads, in `tasks` bands of rows; `image` must be zero.
 
-    Values [splat, channel], table float64 [splat, FOOTPRINT] and reach int32 [splat, 2] are scratch.
+    Table, float64 [splat, FOOTPRINT], and reach, int32 [splat, 2], are scratch. As bands begin at multiples of ROWS,
+    their number changes no bit.
     """
     n, n_v = values.shape[0], image.shape[0] // values.shape[1]
     for c in prange(CHUNKS):
         _footprints(shapes, camera, n_v, (c * n // CHUNKS, (c + 1) * n // CHUNKS), table, reach)
-    bands = max(1, min(BANDS, n_v // BAND))
+    blocks = (n_v + ROWS - 1) // ROWS
+    bands = min(tasks, blocks)
     for k in prange(bands):
-        _add_band(table, reach, values, camera[CUTOFF], (k * n_v // bands, (k + 1) * n_v // bands), image)
+        band = (k * blocks // bands * ROWS, min((k + 1) * blocks // bands * ROWS, n_v))
+        _add_band(table, reach, values, camera[CUTOFF], band, image)
 
 
 @njit(cache=True, error_model="numpy")
