@@ -8,11 +8,13 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from ctsim.geometry import Geometry
+from reconstruct.splat.kernels import step_cpu
 from reconstruct.splat.model import Splats
 from reconstruct.tv import Denoiser, axis_ratios
 
 SIGMA = 0.45
 """σ of a splat in voxels: wider ones, not negative, cannot make the edges of a volume of this grid."""
+SLICES = 32  # of a volume that are filtered together
 
 
 @dataclass(slots=True, kw_only=True)
@@ -20,7 +22,8 @@ class Lattice:
     """One round splat in the middle of each voxel of `support` [z, y, x] (bool); values are per splat.
 
     Splats are ordered by y, x and z, so that upright columns of them lie together. `unit` is what a lattice of ones
-    sums to at a point, on average; a splat's density is its attenuation over it.
+    sums to at a point, on average; a splat's density is its attenuation over it. `index` tells where a splat is in the
+    flat box, [y, x, z], that holds the support.
     """
 
     geometry: Geometry
@@ -28,10 +31,11 @@ class Lattice:
     positions: NDArray[np.float32] = field(init=False)
     scale: float = field(init=False)
     unit: float = field(init=False)
+    index: NDArray[np.int64] = field(init=False)
     _box: tuple[slice, ...] = field(init=False)
     _size: tuple[int, ...] = field(init=False)
-    _index: NDArray[np.int64] = field(init=False)
     _denoiser: Denoiser = field(init=False)
+    _volume: NDArray[np.float32] = field(init=False)
 
     def __post_init__(self) -> None:
         z, y, x = (axis.astype(np.float32) for axis in self.geometry.voxel_centres())
@@ -43,11 +47,12 @@ class Lattice:
         self.unit = float((math.sqrt(2 * math.pi) * self.scale) ** 3 / np.prod(d))
         self._box = tuple(slice(int(n.min()), int(n.max()) + 1) if n.size else slice(0, 0) for n in (j, i, k))
         inside = np.ascontiguousarray(columns[self._box])
-        self._size, self._index = inside.shape, np.flatnonzero(inside)
+        self._size, self.index = inside.shape, np.flatnonzero(inside)
+        self._volume = np.empty(self._size, np.float32)
         self._denoiser = Denoiser(inside, axis_ratios(self.geometry), positivity=True)
 
     def __len__(self) -> int:
-        return len(self._index)
+        return len(self.index)
 
     def splats(self, densities: NDArray[np.float32]) -> Splats:
         """Return the splats with densities [splat, channel] that are given as attenuations of the volume."""
@@ -65,22 +70,32 @@ class Lattice:
 
     def gather(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
         """Take the values of a volume [z, y, x] at the splats: [splat]."""
-        return volume.transpose(1, 2, 0)[self._box].reshape(-1)[self._index]
+        return volume.transpose(1, 2, 0)[self._box].reshape(-1)[self.index]
 
     def denoise(self, values: NDArray[np.float32], tau: float, iterations: int) -> NDArray[np.float32]:
         """Return argmin ½‖x − values‖² + tau·TV(x), x not negative."""
-        return self._denoiser.run(self._filled(values), tau, iterations).reshape(-1)[self._index]
+        return self._denoiser.run(self._filled(values), tau, iterations).reshape(-1)[self.index]
 
-    def filter_slices(self, values: NDArray[np.float32], gain: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Multiply the spectrum of every slice, `padded`, by `gain`, as `rfft2` orders it."""
-        (n_y, n_x, _), size = self._size, self.padded
-        spectrum = np.asarray(fft.rfft2(self._filled(values), s=size, axes=(0, 1), workers=-1))
-        spectrum *= gain[..., None]
-        filtered = np.asarray(fft.irfft2(spectrum, s=size, axes=(0, 1), workers=-1, overwrite_x=True), np.float32)
-        return filtered[:n_y, :n_x].reshape(-1)[self._index]
+    def filter_slices(
+        self, u: NDArray[np.float32], below: np.float32, values: NDArray[np.float32], gain: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Multiply the spectrum, `padded`, of every slice of the values where `u` is below a limit by `gain`.
+
+        The gain is ordered as `rfft2` does it. The result is flat, at `index` for each splat, and holds until the next
+        call.
+        """
+        (n_y, n_x, n_z), size = self._size, self.padded
+        self._volume.fill(0)
+        step_cpu.scatter_tissue(values, u, below, self.index, self._volume.reshape(-1))
+        for first in range(0, n_z, SLICES):  # few at a time, whose memory is used again
+            slices = self._volume[:, :, first : first + SLICES]
+            spectrum = np.asarray(fft.rfft2(slices, s=size, axes=(0, 1), workers=-1))
+            spectrum *= gain[..., None]
+            slices[...] = fft.irfft2(spectrum, s=size, axes=(0, 1), workers=-1, overwrite_x=True)[:n_y, :n_x]
+        return self._volume.reshape(-1)
 
     def _filled(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Put values [splat] into the smallest box [y, x, z] that holds the support, zero elsewhere."""
-        volume = np.zeros(self._size, np.float32)
-        volume.reshape(-1)[self._index] = values
-        return volume
+        self._volume.fill(0)
+        self._volume.reshape(-1)[self.index] = values
+        return self._volume

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from reconstruct.splat.columns import LatticeProjector
 from reconstruct.splat.curve import METAL, MaterialCurve
+from reconstruct.splat.kernels import step_cpu
 from reconstruct.splat.lattice import Lattice
 from reconstruct.splat.level import Data
 from reconstruct.splat.response import Response, evaluate
@@ -30,6 +31,7 @@ MEASURE_EVERY = 4
 """Subsets of the first pass from one measurement of the curvature to the next."""
 SMOOTH_EVERY, SMOOTHING = 4, 8  # subsets from one denoising to the next, and its iterations
 LONGEST = 3.0  # times the median root of a step: hardly seen splats, their steps spread by F, make a fit diverge
+SAMPLE = 1 << 18  # roots of which the median is taken
 FAINT = 0.3  # times water: splats below are preconditioned as if they held this
 
 Image = NDArray[np.float32]
@@ -113,8 +115,10 @@ class Fit:
         lacking = self._p[views] - p
         lacking *= weights > 0
         gradient = self.curve.transpose(self.u, self._back(slopes, lacking, views))
-        curvature = self.curve.transpose(self.u, self._curvature) * np.float32(len(views) / self._measured)
-        self._move(gradient * np.float32(length), curvature, len(views))
+        gradient *= np.float32(length)
+        curvature = self.curve.transpose(self.u, self._curvature)
+        curvature *= np.float32(len(views) / self._measured)
+        self._move(gradient, curvature, len(views))
         self.view_updates += len(views)
         return float(np.abs(lacking).sum(dtype=np.float64)) / (len(views) * math.prod(self.data.geometry.n_detector))
 
@@ -122,16 +126,18 @@ class Fit:
         return self.projector.adjoint(slopes * images[:, None], views)
 
     def _move(self, gradient: Image, curvature: Image, n_views: int) -> None:
+        """Step; gradient and curvature are overwritten."""
         water = self.curve.water
-        held = np.maximum(self.u, np.float32(FAINT * water))
-        root = np.sqrt(held / np.maximum(curvature, np.float32(1e-20)))
-        tissue = self.u < METAL * water  # a metal's own steps are so large that spread they swamp the tissue
-        if tissue.any():
-            np.minimum(root, np.float32(LONGEST * np.median(root[tissue])), out=root, where=tissue)
-        half = root * gradient
-        spread = self.lattice.filter_slices(np.where(tissue, half, 0), self._ramp(n_views))
-        step = root * np.where(tissue, spread, half)
-        self.u = np.clip(self.u + step, 0, np.float32(self.curve.knots[-1]))
+        faint, metal = np.float32(FAINT * water), np.float32(METAL * water)
+        few = slice(None, None, max(len(self.u) // SAMPLE, 1))
+        u, seen = self.u[few], np.maximum(curvature[few], np.float32(step_cpu.LEAST))
+        roots = np.sqrt(np.maximum(u, faint) / seen)[u < metal]
+        longest = np.float32(LONGEST * np.median(roots)) if roots.size else np.float32(np.inf)
+        step_cpu.precondition(self.u, faint, metal, longest, gradient, curvature)
+        # a metal's own steps are so large that spread they swamp the tissue
+        spread = self.lattice.filter_slices(self.u, metal, gradient, self._ramp(n_views))
+        last = np.float32(self.curve.knots[-1])
+        step_cpu.move(self.u, metal, last, curvature, gradient, self.lattice.index, spread)
 
     def _ramp(self, n_views: int) -> Image:
         _, n_y, n_x = self.lattice.support.shape

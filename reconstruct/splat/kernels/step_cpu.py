@@ -1,0 +1,37 @@
+"""A preconditioned step of the splats' unknowns, in passes without temporaries: they are tens of millions."""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+LEAST = 1e-20  # curvature, of what no ray sees
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def precondition(u, faint, metal, longest, gradient, curvature):
+    """Turn curvatures into the roots of steps, and gradients into roots times gradients.
+
+    An unknown below `faint` counts as that; roots are at most `longest` in what is below `metal`.
+    """
+    for i in prange(u.size):
+        root = math.sqrt(max(u[i], faint) / max(curvature[i], np.float32(LEAST)))
+        if u[i] < metal:
+            root = min(root, longest)
+        curvature[i] = root
+        gradient[i] *= root
+
+
+@njit(parallel=True, cache=True)
+def scatter_tissue(values, u, metal, index, volume):
+    """Write values of unknowns below `metal`, and 0 for others, into the flat `volume` at `index`."""
+    for i in prange(u.size):
+        volume[index[i]] = values[i] if u[i] < metal else np.float32(0)
+
+
+@njit(parallel=True, cache=True)
+def move(u, metal, last, roots, halves, index, spread):
+    """Step in place by a root times the flat volume `spread` at `index`, metal times its own half; 0 to `last`."""
+    for i in prange(u.size):
+        half = spread[index[i]] if u[i] < metal else halves[i]
+        u[i] = min(max(u[i] + roots[i] * half, np.float32(0)), last)
