@@ -55,7 +55,7 @@ class Settings:
     make no sense.
     """
 
-    passes: tuple[int, int] = (3, 3)
+    passes: tuple[int, int] = (3, 4)
     tv: float = 0.03
     fineness: float = 1.5
     response: Literal["tube", "known"] = "tube"

@@ -91,7 +91,8 @@ class Lattice:
             slices = self._volume[:, :, first : first + SLICES]
             spectrum = np.asarray(fft.rfft2(slices, s=size, axes=(0, 1), workers=-1))
             spectrum *= gain[..., None]
-            slices[...] = fft.irfft2(spectrum, s=size, axes=(0, 1), workers=-1, overwrite_x=True)[:n_y, :n_x]
+            filtered = np.asarray(fft.irfft2(spectrum, s=size, axes=(0, 1), workers=-1, overwrite_x=True))
+            slices[...] = filtered[:n_y, :n_x]
         return self._volume.reshape(-1)
 
     def _filled(self, values: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -32,7 +32,7 @@ MEASURE_EVERY = 4
 SMOOTH_EVERY, SMOOTHING = 4, 8  # subsets from one denoising to the next, and its iterations
 LONGEST = 3.0  # times the median root of a step: hardly seen splats, their steps spread by F, make a fit diverge
 SAMPLE = 1 << 18  # roots of which the median is taken
-FAINT = 0.3  # times water: splats below are preconditioned as if they held this
+FAINT = 0.5  # times water: splats below are preconditioned as if they held this
 
 Image = NDArray[np.float32]
 
