@@ -27,9 +27,9 @@ SUBSET, LEAST_SUBSETS = 10, 8
 """Views in a subset, fewer where there would be too few subsets."""
 STEEPEST = 0.8
 """Greatest gain of the ramp, as a share of the views in a subset."""
-MEASURE_EVERY = 4
-"""Subsets of the first pass from one measurement of the curvature to the next."""
-SMOOTH_EVERY, SMOOTHING = 4, 8  # subsets from one denoising to the next, and its iterations
+REST, A_PASS = 4, 6
+"""Denoisings are so many subsets apart, but six in a long pass; so are measurements of the curvature in the first."""
+SMOOTHING = 8  # iterations of a denoising
 LONGEST = 3.0  # times the median root of a step: hardly seen splats, their steps spread by F, make a fit diverge
 SAMPLE = 1 << 18  # roots of which the median is taken
 FAINT = 0.5  # times water: splats below are preconditioned as if they held this
@@ -55,14 +55,11 @@ class Fit:
     misfit: float = math.inf
     view_updates: int = 0
     projector: LatticeProjector = field(init=False)
-    _p: Image = field(init=False)
-    _weights: Image = field(init=False)
     _curvature: Image = field(init=False)  # by both densities, summed over the views that it was measured in
     _measured: int = 0
 
     def __post_init__(self) -> None:
         self.projector = LatticeProjector(self.data.geometry, self.lattice)
-        self._p, self._weights = (self.projector.arranged(a) for a in (self.data.p, self.data.weights))
         self._curvature = np.zeros((len(self.lattice), 2), np.float32)
 
     def run(self, passes: int, proceed: Callable[["Fit", bool], bool]) -> bool:
@@ -73,15 +70,16 @@ class Fit:
         """
         n_views = self.data.geometry.n_views
         n = min(max(n_views // SUBSET, LEAST_SUBSETS), n_views)
+        every = max(REST, n // A_PASS)
         for turn in range(1, passes + 1):
             misfit = 0.0
             for k, subset in enumerate(bit_reversed(n)):
                 views = np.arange(subset, n_views, n)
                 length = 1 / (1 + k / n) if turn == passes else 1.0
-                self.loss = self._step(views, turn == 1 and k % MEASURE_EVERY == 0, length)
+                self.loss = self._step(views, turn == 1 and k % every == 0, length)
                 misfit += self.loss / n
-                if (k + 1) % SMOOTH_EVERY == 0 or k + 1 == n:
-                    share = (k % SMOOTH_EVERY + 1) / n
+                if (k + 1) % every == 0 or k + 1 == n:
+                    share = (k % every + 1) / n
                     self.u = self.lattice.denoise(self.u, self.tv * self.curve.water * share, SMOOTHING)
                 if k + 1 == n:
                     self.misfit = misfit
@@ -106,13 +104,13 @@ class Fit:
             primary = np.exp(-p)
             seen = primary + np.float32(self.data.scatter)
             p, by_a, by_b = -np.log(seen), by_a * (primary / seen), by_b * (primary / seen)
-        weights = self._weights[views]
+        measured, weights = (self.projector.arranged(a[views]) for a in (self.data.p, self.data.weights))
         slopes = np.stack([weights * by_a, weights * by_b], 1, dtype=np.float32)
         if measure:
             along = np.asarray(by_a * la + by_b * lb, np.float32)  # J·u: the majoriser's other half
             self._curvature += self._back(slopes, along, views)
             self._measured += len(views)
-        lacking = self._p[views] - p
+        lacking = measured - p
         lacking *= weights > 0
         gradient = self.curve.transpose(self.u, self._back(slopes, lacking, views))
         gradient *= np.float32(length)
