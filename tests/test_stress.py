@@ -187,7 +187,7 @@ def test_dead_pixels_are_left_out_by_weight_0(monkeypatch):
     given = scan_of(noise=Noise(dead_fraction=0.02))
     masked = error(given)
     weighed = level.weighted
-    everywhere(monkeypatch, "weighted", lambda g, p, valid: weighed(g, p, np.ones_like(valid)))
+    everywhere(monkeypatch, "weighted", lambda g, p, valid, *s: weighed(g, p, np.ones_like(valid), *s))
     # 0.14 and 0.45: what is carved away scores as an empty volume does
     assert masked < 0.2 < 2 * masked < error(given)
 
@@ -197,8 +197,8 @@ def test_starved_rays_count_for_little(monkeypatch):
     given = scan_of(WATER, BONE, rod("Fe", 5.0, at=(9.0, 2.0)), i0=1e3)
     weighted, weighed = error(given), level.weighted
 
-    def unweighted(g, p, valid):
-        return dataclasses.replace(weighed(g, p, valid), weights=valid.astype(np.float32))
+    def unweighted(g, p, valid, *scatter):
+        return dataclasses.replace(weighed(g, p, valid, *scatter), weights=valid.astype(np.float32))
 
     everywhere(monkeypatch, "weighted", unweighted)
     assert 1.4 * weighted < error(given)  # 0.16 and 0.29
