@@ -86,7 +86,7 @@ class Lattice:
         """
         (n_y, n_x, n_z), size = self._size, self.padded
         self._volume.fill(0)
-        step_cpu.scatter_tissue(values, u, below, self.index, self._volume.reshape(-1))
+        step_cpu.put_tissue(values, u, below, self.index, self._volume.reshape(-1))
         for first in range(0, n_z, SLICES):  # few at a time, whose memory is used again
             slices = self._volume[:, :, first : first + SLICES]
             spectrum = np.asarray(fft.rfft2(slices, s=size, axes=(0, 1), workers=-1))

@@ -14,7 +14,7 @@ from ctsim.geometry import Geometry
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Data:
-    """Line integrals `p` and their weights, float32 [view, v, u]; `scatter` over the open field is in p still."""
+    """Line integrals `p` and their weights, float32 [view, v, u]; `scatter`, S/I0, is in p still."""
 
     geometry: Geometry
     p: NDArray[np.float32]

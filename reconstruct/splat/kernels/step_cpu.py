@@ -23,8 +23,8 @@ def precondition(u, faint, metal, longest, gradient, curvature):
 
 
 @njit(parallel=True, cache=True)
-def scatter_tissue(values, u, metal, index, volume):
-    """Write values of unknowns below `metal`, and 0 for others, into the flat `volume` at `index`."""
+def put_tissue(values, u, metal, index, volume):
+    """Put values of unknowns below `metal`, and 0 for others, into the flat `volume` at `index`."""
     for i in prange(u.size):
         volume[index[i]] = values[i] if u[i] < metal else np.float32(0)
 
