@@ -46,8 +46,13 @@ def shifted(geometry, **changes):
 
 @pytest.mark.parametrize(
     "geometry",
-    [GEOMETRY, shifted(GEOMETRY, off_detector=(0.0, 12.0)), shifted(GEOMETRY, n_detector=(6, 5))],
-    ids=["whole", "shifted", "truncated"],
+    [
+        GEOMETRY,
+        shifted(GEOMETRY, off_detector=(0.0, 12.0)),
+        shifted(GEOMETRY, n_detector=(6, 5)),
+        shifted(GEOMETRY, d_detector=(0.15, 0.15)),
+    ],
+    ids=["whole", "shifted", "truncated", "fine"],
 )
 def test_columns_agree_with_splats(geometry):
     lattice = lattice_of(geometry)
@@ -79,31 +84,33 @@ def test_each_column_is_its_product_of_gaussians_to_float32():
         np.testing.assert_allclose(found[1], -2 * found[0], rtol=1e-6)
 
 
-def test_the_transpose_is_one():
-    lattice = lattice_of(GEOMETRY)
-    projector = LatticeProjector(GEOMETRY, lattice)
-    found, _, values = both(GEOMETRY, lattice)
-    pictures = np.random.default_rng(1).uniform(-1, 1, found.shape).astype(np.float32)
-    sums = projector.adjoint(projector.arranged(pictures), VIEWS).astype(np.float64)
-    left = (found.astype(np.float64) * pictures).sum()
-    assert (sums * values).sum() == pytest.approx(left, rel=1e-5, abs=1e-5 * float(np.abs(found).sum()))
-
-
-def test_a_tilted_detector_and_wide_splats_go_one_by_one():
+def test_a_tilted_detector_goes_splat_by_splat():
     poses = GEOMETRY.pose_array()
     tilted = poses.copy()
     tilted[:, 9:11] += 0.05
-    geometry = shifted(GEOMETRY, poses=tuple(tuple(row) for row in tilted.tolist()))
-    wide = shifted(GEOMETRY, d_detector=(0.15, 0.15))
-    for case in (geometry, wide):
-        lattice = lattice_of(case)
-        projector = LatticeProjector(case, lattice)
-        assert not projector.by_columns
-        found, exact, _ = both(case, lattice)
-        np.testing.assert_allclose(found, exact, atol=2e-3 * np.abs(exact).max())  # EWA against exact
-        assert np.array_equal(projector.pictures(projector.arranged(found)), found)
+    case = shifted(GEOMETRY, poses=tuple(tuple(row) for row in tilted.tolist()))
+    lattice = lattice_of(case)
+    projector = LatticeProjector(case, lattice)
+    assert not projector.by_columns
+    found, exact, _ = both(case, lattice)
+    np.testing.assert_allclose(found, exact, atol=2e-3 * np.abs(exact).max())  # EWA against exact
+    assert np.array_equal(projector.pictures(projector.arranged(found)), found)
     upright = shifted(GEOMETRY, poses=tuple(tuple(row) for row in poses.tolist()))
     assert LatticeProjector(upright, lattice_of(upright)).by_columns
+
+
+@pytest.mark.parametrize("size", [(30, 34), (1, 1), (3, 9), (8, 8), (17, 4)])
+@pytest.mark.parametrize("scale", [(1, 1), (0.1, 0.1), (8, 8)], ids=["pixels", "fine pixels", "coarse pixels"])
+def test_the_transpose_is_one(size, scale):
+    geometry = shifted(GEOMETRY, n_detector=size, d_detector=scale)
+    lattice = lattice_of(geometry)
+    projector = LatticeProjector(geometry, lattice)
+    found, _, values = both(geometry, lattice)
+    pictures = np.random.default_rng(1).uniform(-1, 1, found.shape).astype(np.float32)
+    sums = projector.adjoint(projector.arranged(pictures), VIEWS).astype(np.float64)
+    left = (found.astype(np.float64) * pictures).sum()
+    assert found.any()
+    assert (sums * values).sum() == pytest.approx(left, abs=1e-5 * float(np.abs(found * pictures).sum()))
 
 
 def test_any_number_of_threads_gives_the_same_bits():

@@ -10,7 +10,7 @@ from reconstruct.splat.kernels import separable_cpu as kernels
 from reconstruct.splat.kernels.lanes import WIDTH
 from reconstruct.splat.kernels.splat_cpu import DEPTH, DUAL_U, DUAL_V
 from reconstruct.splat.lattice import Lattice
-from reconstruct.splat.project import CUTOFF, Projector
+from reconstruct.splat.project import Projector
 
 LEVEL = 1e-9  # share of a vector that may point along z, or across
 Image = NDArray[np.float32]
@@ -19,7 +19,7 @@ Image = NDArray[np.float32]
 class LatticeProjector:
     """Projects the splats of `lattice`, in its order, along the rays of `geometry`, in two channels.
 
-    Images lie as the kernels want them, [view, channel, u, v + 32] or as `Projector` has them: `arranged` puts pictures
+    Images lie as the kernels want them, [view, channel, u, v + 8] or as `Projector` has them: `arranged` puts pictures
     [view, v, u] into that form, and `pictures` takes them out of it.
     """
 
@@ -28,21 +28,21 @@ class LatticeProjector:
         self._projector = Projector(geometry=geometry, tolerance=math.inf)
         self._n_detector, self._scale = geometry.n_detector, lattice.scale
         self._shapes = lattice.splats(np.zeros((len(lattice), 1), np.float32)).shapes()
-        self.by_columns = _upright(self._projector.cameras) and _reach(geometry, lattice) < kernels.WIDEST
+        self.by_columns = _upright(self._projector.cameras)
         if self.by_columns:
             places = lattice.positions[:, :2]
-            first = np.flatnonzero(np.any(places[1:] != places[:-1], axis=1)) + 1
-            starts = np.concatenate([[0], first, [len(lattice)]]).astype(np.int64)
+            apart = np.any(places[1:] != places[:-1], axis=1) | (np.diff(lattice.index) != 1)
+            starts = np.concatenate([[0], np.flatnonzero(apart) + 1, [len(lattice)]]).astype(np.int64)
             z = np.pad(lattice.positions[None, :, 2], [(0, 0), (0, WIDTH)])
-            self._columns = (places[starts[:-1]].astype(np.float64), starts, z, int(np.diff(starts).max(initial=0)))
+            self._runs = (places[starts[:-1]].astype(np.float64), starts, z, int(np.diff(starts).max(initial=0)))
 
     def forward(self, values: Image, views: NDArray[np.int64]) -> Image:
         """Sum values [splat, 2] times line integrals (mm) over the splats; scratch columns may hold anything finite."""
         if not self.by_columns:
             return self._projector.forward(self._shapes, values, views)
         n_v, n_u = self._n_detector
-        images = np.zeros((len(views), 2 * n_u, n_v + 2 * kernels.PAD), np.float32)
-        kernels.forward(self._columns, values, self._scale, self._projector.cameras[views], images)
+        images = np.zeros((len(views), 2 * n_u, n_v + WIDTH), np.float32)
+        kernels.forward(self._runs, values, self._scale, self._projector.cameras[views], images)
         return images.reshape(len(views), 2, n_u, -1)
 
     def adjoint(self, images: Image, views: NDArray[np.int64]) -> Image:
@@ -51,7 +51,7 @@ class LatticeProjector:
             return self._projector.adjoint(self._shapes, images, views)
         stack = images.reshape(len(views), -1, images.shape[-1])
         sums = np.zeros((self._shapes.shape[1], 2), np.float32)
-        kernels.backward(self._columns, self._scale, self._projector.cameras[views], stack, sums)
+        kernels.backward(self._runs, self._scale, self._projector.cameras[views], stack, sums)
         return sums
 
     def arranged(self, pictures: Image) -> Image:
@@ -59,7 +59,7 @@ class LatticeProjector:
         n_v, n_u = self._n_detector
         if not self.by_columns:
             return np.pad(pictures, [(0, 0)] * (pictures.ndim - 1) + [(0, WIDTH)])
-        out = np.zeros((*pictures.shape[:-2], n_u, n_v + 2 * kernels.PAD), np.float32)
+        out = np.zeros((*pictures.shape[:-2], n_u, n_v + WIDTH), np.float32)
         self.pictures(out)[...] = pictures
         return out
 
@@ -68,7 +68,7 @@ class LatticeProjector:
         n_v, n_u = self._n_detector
         if not self.by_columns:
             return images[..., :n_u]
-        return images[..., kernels.PAD : kernels.PAD + n_v].swapaxes(-1, -2)
+        return images[..., :n_v].swapaxes(-1, -2)
 
 
 def _upright(cameras: NDArray[np.float64]) -> bool:
@@ -76,14 +76,3 @@ def _upright(cameras: NDArray[np.float64]) -> bool:
     depth, dual_u, dual_v = (cameras[:, at : at + 3] for at in (DEPTH, DUAL_U, DUAL_V))
     level = all(np.all(np.abs(a[:, 2]) <= LEVEL * np.linalg.norm(a, axis=1)) for a in (depth, dual_u))
     return level and bool(np.all(np.abs(dual_v[:, :2]).max(1) <= LEVEL * np.abs(dual_v[:, 2])))
-
-
-def _reach(geometry: Geometry, lattice: Lattice) -> float:
-    """Return the cutoff in pixels of the largest shadow that a splat of the lattice may throw."""
-    source = geometry.pose_array()[:, :2]
-    away = np.hypot(*source.T).min() - np.hypot(*lattice.positions[:, :2].T).max()
-    if away <= 0:
-        return math.inf
-    pixel = lattice.scale * geometry.dsd / away / min(geometry.d_detector)
-    oblique = 1 + (max(geometry.n_detector) * max(geometry.d_detector) / geometry.dsd) ** 2
-    return CUTOFF * math.sqrt(pixel**2 * oblique + 1 / 12)

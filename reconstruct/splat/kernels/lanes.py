@@ -18,6 +18,7 @@ from numba.extending import intrinsic, register_model
 WIDTH = 8
 _FLOATS, _INTS = ir.VectorType(ir.FloatType(), WIDTH), ir.VectorType(ir.IntType(32), WIDTH)
 _LARGEST = 115.0  # 2^115 = 4e34: the clamp of exponents keeps results normal float32
+_MAGIC = 1.5 * 2.0**23  # added to a float32 it leaves the nearest whole number in the last bits
 # 2^f on [−½, ½], Chebyshev fit of degree 6 in float64, rounded; relative error below 2e-8
 _NODES = 0.5 * np.cos((np.arange(64) + 0.5) * math.pi / 64)
 _POWERS = np.polynomial.Polynomial.fit(_NODES, 2.0**_NODES, 6, domain=[-0.5, 0.5]).convert().coef.astype(np.float32)
@@ -100,6 +101,19 @@ def spread(typingctx, number):
 
 
 @_operation
+def pick(typingctx, array, row, column):
+    """Return eight copies of array[row, column]; nothing is checked."""
+
+    def codegen(context, builder, signature, args):
+        array_type = signature.args[0]
+        view = context.make_array(array_type)(context, builder, args[0])
+        at = cgutils.get_item_pointer(context, builder, array_type, view, args[1:], wraparound=False)
+        return _spread(builder, builder.load(at))
+
+    return lanes(array, types.intp, types.intp), codegen
+
+
+@_operation
 def ramp(typingctx, first):
     """Return first, first + 1, … first + 7."""
 
@@ -139,6 +153,7 @@ def _binary(instruction: str, doc: str):
 
 
 add = _binary("fadd", "a + b")
+sub = _binary("fsub", "a − b")
 mul = _binary("fmul", "a · b")
 div = _binary("fdiv", "a / b")
 
@@ -163,6 +178,17 @@ def sqrt(typingctx, a):
     return lanes(lanes), codegen
 
 
+def _power_of_two(builder, y):
+    """2^y for |y| below 126, anything beyond."""
+    shifted = builder.fadd(y, _same(_MAGIC))
+    f = builder.fsub(y, builder.fsub(shifted, _same(_MAGIC)))
+    power = _same(_POWERS[-1])
+    for c in _POWERS[-2::-1]:
+        power = _call(builder, "fma", power, f, _same(c))
+    whole = builder.shl(builder.bitcast(shifted, _INTS), ir.Constant(_INTS, [23] * WIDTH))
+    return builder.bitcast(builder.add(builder.bitcast(power, _INTS), whole), _FLOATS)
+
+
 @_operation
 def exp(typingctx, a):
     """Return eᵃ with a clamped to ±79; relative error below 2e-7 + 6e-8·|a|."""
@@ -170,16 +196,20 @@ def exp(typingctx, a):
     def codegen(context, builder, signature, args):
         y = builder.fmul(args[0], _same(math.log2(math.e)))
         y = _call(builder, "maxnum", _call(builder, "minnum", y, _same(_LARGEST)), _same(-_LARGEST))
-        whole = _call(builder, "floor", builder.fadd(y, _same(0.5)))
-        f = builder.fsub(y, whole)
-        power = _same(_POWERS[6])
-        for c in _POWERS[5::-1]:
-            power = _call(builder, "fma", power, f, _same(c))
-        biased = builder.add(builder.fptosi(whole, _INTS), ir.Constant(_INTS, [127] * WIDTH))
-        scale = builder.bitcast(builder.shl(biased, ir.Constant(_INTS, [23] * WIDTH)), _FLOATS)
-        return builder.fmul(power, scale)
+        return _power_of_two(builder, y)
 
     return lanes(lanes), codegen
+
+
+@_operation
+def decay(typingctx, a, least):
+    """Return eᵃ for a up to 79, and 0 where a is below `least`, which is −79 or more; errors as those of `exp`."""
+
+    def codegen(context, builder, signature, args):
+        power = _power_of_two(builder, builder.fmul(args[0], _same(math.log2(math.e))))
+        return builder.select(builder.fcmp_ordered(">=", *args), power, _same(0.0))
+
+    return lanes(lanes, lanes), codegen
 
 
 @_operation

@@ -1,14 +1,18 @@
-"""Line integrals of equal round splats that stand in upright columns, and their transpose (numba).
+"""Line integrals of equal round splats that stand in upright runs, and their transpose (numba).
 
 Where the rotation axis and the detector's columns are parallel to z, all splats of one (x, y) have their shadows in the
-same detector columns. A column's profile along v is summed first, one row of Gaussians a splat, and laid over the few
-detector columns once. A splat's shadow is taken as exp(−½ du²/S_uu − ½ dv²/S_vv), of the mass that EWA gives it
-(`splat_cpu`): the separable footprint of Long, Fessler and Balter (IEEE Trans. Med. Imaging 29, 2010,
-doi:10.1109/TMI.2010.2050898) with Gaussians. What it leaves out is S_uv, of the order of u·v/dsd² of the others.
+same detector columns. A run's profile along v is summed first and laid over the few detector columns once. A splat's
+shadow is taken as exp(−½ du²/S_uu − ½ dv²/S_vv), of the mass that EWA gives it (`splat_cpu`): the separable footprint
+of Long, Fessler and Balter (IEEE Trans. Med. Imaging 29, 2010, doi:10.1109/TMI.2010.2050898) with Gaussians. What it
+leaves out is S_uv, of the order of u·v/dsd² of the others.
 
-Splats are ordered by column, z ascending: `columns` holds xy float64 [column, 2], the starts [column + 1] of columns in
-z float32 [1, splat + 8], both mm, and the most splats that a column has. Images are
-float32 [channel · u, v + 32], transposed and with 16 columns of scratch on either side.
+A profile is summed eight rows at a time over the splats within reach of them, and the transpose eight splats at a time
+over the rows within theirs: sums stay in registers, and both take the same pairs, since what lies beyond a splat's
+cutoff is zero.
+
+Splats are ordered by run, z ascending in even steps: `runs` holds xy float64 [run, 2], the starts [run + 1] of runs in
+z float32 [1, splat + 8], both mm, and the most splats that a run has. Images are float32
+[channel · u, v + 8], transposed and with 8 columns of scratch.
 """
 
 import math
@@ -16,7 +20,21 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from reconstruct.splat.kernels.lanes import WIDTH, add, div, exp, fma, load, mul, ramp, spread, sqrt, store, total
+from reconstruct.splat.kernels.lanes import (
+    WIDTH,
+    add,
+    decay,
+    div,
+    fma,
+    load,
+    mul,
+    pick,
+    ramp,
+    spread,
+    sqrt,
+    store,
+    sub,
+)
 from reconstruct.splat.kernels.splat_cpu import (
     BOX,
     CUTOFF,
@@ -30,17 +48,17 @@ from reconstruct.splat.kernels.splat_cpu import (
     SOURCE,
 )
 
-PAD = 16
-WIDEST = PAD / 2 - 1.0  # reach in rows up to which a shadow fits the scratch columns; the caller sees to it
-COLUMNS = 256  # in a task of the transpose
-# what a column has in common: u, S_uu, v per mm of z, S_vv's two parts, |ray|²'s two, and the peak over √S_vv
+RUNS = 256  # in a task of the transpose
+SLACK = 1e-3  # of a splat or row: ranges are wider by that, so that rounding leaves nothing out
+ROW, FALLING, PEAKS, FIRST, SECOND = range(5)  # of a run's table [5, splat]: row, −1/(2 S_vv), peak, two channels
+# what a run has in common: u, S_uu, v per mm of z, S_vv's two parts, |ray|²'s two, and the peak over √S_vv
 U0, S_UU, PER_Z, S_VV, S_VV_2, RAY, RAY_2, W0 = range(8)
 PLACE = 8
 
 
 @njit(cache=True, error_model="numpy")
 def _place(camera, x, y, scale, place):
-    """Write what a column's splats share; return whether it lies before the source."""
+    """Write what a run's splats share; return whether it lies before the source."""
     cx, cy = x - camera[SOURCE], y - camera[SOURCE + 1]
     tau = cx * camera[DEPTH] + cy * camera[DEPTH + 1]
     if not tau > 1e-6:
@@ -60,9 +78,9 @@ def _place(camera, x, y, scale, place):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _reach_v(camera, place, z_first, z_last):
-    """Return the cutoff in rows of the column's widest shadow."""
+    """Return the cutoff in rows of the run's widest shadow."""
     at = max(abs(place[PER_Z] * (z_first - camera[SOURCE + 2])), abs(place[PER_Z] * (z_last - camera[SOURCE + 2])))
-    return min(camera[CUTOFF] * math.sqrt(place[S_VV] + place[S_VV_2] * at * at), WIDEST)
+    return camera[CUTOFF] * math.sqrt(place[S_VV] + place[S_VV_2] * at * at)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -72,7 +90,7 @@ def _row(camera, place, z):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _shadows(camera, place, z, bounds, table):
-    """Write the rows, −1/(2 S_vv) and peaks of a column's splats: table [3, splat of the column]."""
+    """Write the rows, −1/(2 S_vv) and peaks of a run's splats."""
     source, origin = spread(np.float32(-camera[SOURCE + 2])), spread(np.float32(-camera[ORIGIN_V]))
     per_z, peak = spread(np.float32(place[PER_Z])), spread(np.float32(place[W0]))
     across, along = spread(np.float32(place[S_VV])), spread(np.float32(place[S_VV_2]))
@@ -82,9 +100,9 @@ def _shadows(camera, place, z, bounds, table):
         cz = add(load(z, 0, i), source)
         at = mul(per_z, cz)
         over = div(one, fma(mul(at, at), along, across))
-        store(table, 0, i - bounds[0], add(at, origin))
-        store(table, 1, i - bounds[0], mul(half, over))
-        store(table, 2, i - bounds[0], mul(peak, sqrt(mul(fma(mul(cz, cz), ray_2, ray), over))))
+        store(table, ROW, i - bounds[0], add(at, origin))
+        store(table, FALLING, i - bounds[0], mul(half, over))
+        store(table, PEAKS, i - bounds[0], mul(peak, sqrt(mul(fma(mul(cz, cz), ray_2, ray), over))))
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -95,14 +113,23 @@ def _columns(camera, place, n_u):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _gain(place, u):
-    du = u - place[U0]
-    return np.float32(math.exp(-0.5 * du * du / place[S_UU]))
+def _gains(camera, place, left, right, gains):
+    """Write to gains [1, u − left] what the columns left … right − 1 have of a shadow."""
+    falling, least = spread(np.float32(-0.5 / place[S_UU])), _least(camera)
+    for u in range(left, right, WIDTH):
+        t = ramp(np.float32(u - place[U0]))
+        store(gains, 0, u - left, decay(mul(mul(t, t), falling), least))
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _least(camera):
+    """Return the exponent at the cutoff."""
+    return spread(np.float32(-0.5 * camera[CUTOFF] * camera[CUTOFF]))
 
 
 @njit(cache=True, error_model="numpy")
 def _window(at, scale, camera, z, bounds, size, place):
-    """Place a column; return the half-open ranges of u and v within the detector that it reaches, and its reach in v.
+    """Place a run; return the half-open ranges of u and v within the detector that it reaches, and its reach in v.
 
     All are 0 where it throws no shadow on the detector of `size` (v, u).
     """
@@ -121,97 +148,99 @@ def _window(at, scale, camera, z, bounds, size, place):
     return left, right, first, last, reach
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _weighted(values, bounds, table):
+    """Write a run's values times peaks."""
+    for k in range(bounds[1] - bounds[0]):
+        table[FIRST, k] = values[bounds[0] + k, 0] * table[PEAKS, k]
+        table[SECOND, k] = values[bounds[0] + k, 1] * table[PEAKS, k]
+
+
 @njit(cache=True, error_model="numpy")
-def _forward_view(columns, values, scale, camera, image):
-    xy, starts, z, tallest = columns
-    n_u, n_v = image.shape[0] // 2, image.shape[1] - 2 * PAD
-    place, profile = np.empty(PLACE), np.empty((2, image.shape[1]), np.float32)
-    table, gains = np.empty((3, tallest + WIDTH), np.float32), np.empty(n_u, np.float32)
-    for column in range(xy.shape[0]):
-        bounds = (starts[column], starts[column + 1])
-        left, right, low, high, reach = _window(xy[column], scale, camera, z, bounds, (n_v, n_u), place)
+def _forward_view(runs, values, scale, camera, image):
+    xy, starts, z, tallest = runs
+    n_u, n_v = image.shape[0] // 2, image.shape[1] - WIDTH
+    place, least, zero = np.empty(PLACE), _least(camera), spread(np.float32(0))
+    table, gains = np.empty((5, tallest + WIDTH), np.float32), np.empty((1, n_u + WIDTH), np.float32)
+    for run in range(xy.shape[0]):
+        bounds = (starts[run], starts[run + 1])
+        left, right, low, high, reach = _window(xy[run], scale, camera, z, bounds, (n_v, n_u), place)
         if left >= right:
             continue
-        for v in range(profile.shape[1]):
-            profile[0, v] = profile[1, v] = 0
         _shadows(camera, place, z, bounds, table)
-        for i in range(bounds[0], bounds[1]):
-            k = i - bounds[0]
-            row, falling, peak = table[0, k], table[1, k], table[2, k]
-            if not -reach <= row <= n_v - 1 + reach:
-                continue
-            first, last = int(math.ceil(row - reach)), int(math.floor(row + reach))
-            a, b = spread(values[i, 0] * peak), spread(values[i, 1] * peak)
-            for start in range(first, last + 1, WIDTH):
-                t = ramp(np.float32(start) - row)
-                g = exp(mul(mul(t, t), spread(falling)))
-                at = start + PAD
-                store(profile, 0, at, fma(g, a, load(profile, 0, at)))
-                store(profile, 1, at, fma(g, b, load(profile, 1, at)))
-        for u in range(left, right):
-            gains[u] = _gain(place, u)
-        for v in range(low + PAD, high + PAD, WIDTH):
-            a, b = load(profile, 0, v), load(profile, 1, v)
+        _weighted(values, bounds, table)
+        _gains(camera, place, left, right, gains)
+        n, lowest = bounds[1] - bounds[0], _row(camera, place, z[0, bounds[0]])
+        highest = _row(camera, place, z[0, bounds[1] - 1])
+        a_row = (n - 1) / (highest - lowest) if n > 1 else 0.0  # splats, of either sign
+        wide = abs(a_row) * (0.5 * (WIDTH - 1) + reach) + SLACK
+        for v in range(low, high, WIDTH):
+            middle = (v + 0.5 * (WIDTH - 1) - lowest) * a_row
+            first, last = max(0, int(math.ceil(middle - wide))), min(n, int(math.floor(middle + wide)) + 1)
+            a, b, rows = zero, zero, ramp(np.float32(v))
+            for k in range(first, last):
+                t = sub(rows, pick(table, ROW, k))
+                g = decay(mul(mul(t, t), pick(table, FALLING, k)), least)
+                a = fma(g, pick(table, FIRST, k), a)
+                b = fma(g, pick(table, SECOND, k), b)
             for u in range(left, right):
-                g = spread(gains[u])
+                g = pick(gains, 0, u - left)
                 store(image, u, v, fma(g, a, load(image, u, v)))
                 store(image, n_u + u, v, fma(g, b, load(image, n_u + u, v)))
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
-def forward(columns, values, scale, cameras, images):
-    """Project values [splat, 2] onto views, one a thread: images [view, 2 · u, v + 32] must be zero."""
+def forward(runs, values, scale, cameras, images):
+    """Project values [splat, 2] onto views, one a thread: images [view, 2 · u, v + 8] must be zero."""
     for view in prange(cameras.shape[0]):
-        _forward_view(columns, values, scale, cameras[view], images[view])
+        _forward_view(runs, values, scale, cameras[view], images[view])
 
 
 @njit(cache=True, error_model="numpy")
-def _backward_columns(chosen, columns, scale, camera, image, sums):
-    xy, starts, z, tallest = columns
-    n_u, n_v = image.shape[0] // 2, image.shape[1] - 2 * PAD
-    place, profile = np.empty(PLACE), np.zeros((2, image.shape[1]), np.float32)
-    table = np.empty((3, tallest + WIDTH), np.float32)
-    gains, zero = np.empty(n_u, np.float32), spread(np.float32(0))
-    for column in range(chosen[0], chosen[1]):
-        bounds = (starts[column], starts[column + 1])
-        left, right, low, high, reach = _window(xy[column], scale, camera, z, bounds, (n_v, n_u), place)
+def _backward_runs(chosen, runs, scale, camera, image, sums):
+    xy, starts, z, tallest = runs
+    n_u, n_v = image.shape[0] // 2, image.shape[1] - WIDTH
+    place, profile = np.empty(PLACE), np.empty((2, n_v + WIDTH), np.float32)
+    least, zero = _least(camera), spread(np.float32(0))
+    table, gains = np.empty((5, tallest + WIDTH), np.float32), np.empty((1, n_u + WIDTH), np.float32)
+    for run in range(chosen[0], chosen[1]):
+        bounds = (starts[run], starts[run + 1])
+        left, right, low, high, reach = _window(xy[run], scale, camera, z, bounds, (n_v, n_u), place)
         if left >= right:
             continue
-        for v in range(profile.shape[1]):
-            profile[0, v] = profile[1, v] = 0
-        for u in range(left, right):
-            gains[u] = _gain(place, u)
-        for v in range(low + PAD, high + PAD, WIDTH):
+        _gains(camera, place, left, right, gains)
+        for v in range(low, high, WIDTH):
             a, b = zero, zero
             for u in range(left, right):
-                g = spread(gains[u])
+                g = pick(gains, 0, u - left)
                 a = fma(g, load(image, u, v), a)
                 b = fma(g, load(image, n_u + u, v), b)
             store(profile, 0, v, a)
             store(profile, 1, v, b)
         _shadows(camera, place, z, bounds, table)
-        for i in range(bounds[0], bounds[1]):
-            k = i - bounds[0]
-            row, falling, peak = table[0, k], table[1, k], table[2, k]
-            if not -reach <= row <= n_v - 1 + reach:
-                continue
-            first, last = int(math.ceil(row - reach)), int(math.floor(row + reach))
-            a, b = zero, zero
-            for start in range(first, last + 1, WIDTH):
-                t = ramp(np.float32(start) - row)
-                g = exp(mul(mul(t, t), spread(falling)))
-                at = start + PAD
-                a = fma(g, load(profile, 0, at), a)
-                b = fma(g, load(profile, 1, at), b)
-            sums[i, 0] += peak * total(a)
-            sums[i, 1] += peak * total(b)
+        n = bounds[1] - bounds[0]
+        for k in range(0, n, WIDTH):
+            one, other = table[ROW, k], table[ROW, min(k + WIDTH, n) - 1]
+            first = max(low, int(math.ceil(min(one, other) - reach - SLACK)))
+            last = min(high, int(math.floor(max(one, other) + reach + SLACK)) + 1)
+            a, b, rows, falling = zero, zero, load(table, ROW, k), load(table, FALLING, k)
+            for v in range(first, last):
+                t = sub(spread(np.float32(v)), rows)
+                g = decay(mul(mul(t, t), falling), least)
+                a = fma(g, pick(profile, 0, v), a)
+                b = fma(g, pick(profile, 1, v), b)
+            store(table, FIRST, k, mul(a, load(table, PEAKS, k)))
+            store(table, SECOND, k, mul(b, load(table, PEAKS, k)))
+        for k in range(n):
+            sums[bounds[0] + k, 0] += table[FIRST, k]
+            sums[bounds[0] + k, 1] += table[SECOND, k]
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
-def backward(columns, scale, cameras, images, sums):
-    """Apply the transpose: sums [splat, 2] += Σ w·images over all pixels of images [view, 2 · u, v + 32]."""
-    n = columns[0].shape[0]
-    for task in prange((n + COLUMNS - 1) // COLUMNS):
-        chosen = (task * COLUMNS, min((task + 1) * COLUMNS, n))
+def backward(runs, scale, cameras, images, sums):
+    """Apply the transpose: sums [splat, 2] += Σ w·images over all pixels of images [view, 2 · u, v + 8]."""
+    n = runs[0].shape[0]
+    for task in prange((n + RUNS - 1) // RUNS):
+        chosen = (task * RUNS, min((task + 1) * RUNS, n))
         for view in range(cameras.shape[0]):
-            _backward_columns(chosen, columns, scale, cameras[view], images[view], sums)
+            _backward_runs(chosen, runs, scale, cameras[view], images[view], sums)
