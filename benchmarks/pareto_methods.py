@@ -25,12 +25,13 @@ from ctsim.geometry import Geometry
 from ctsim.store import StoredScan, open_scan
 from ctsim.types import Scan, Status
 from reconstruct.fdk import reconstruct as fdk
+from reconstruct.splat.fast import PASSES
 from reconstruct.watch import watch
 
 STOPS = frozenset((1, 2, 3, 5, 8, 12, 20, 30, 50, 80, 120, 200))
 BY_VALUE: dict[str, tuple[str, tuple[Any, ...]]] = {
     "ibhc": ("iterations", (1, 2, 3, 4, 6)),
-    "splat": ("passes", ((1, 0), (1, 1), (2, 1), (3, 1), (3, 2), (3, 3), (3, 4), (3, 6))),
+    "splat": ("passes", ((1, 0), (1, 1), (2, 1), (3, 1), (3, 2), (3, 3), (3, 6))),
 }
 """Methods that run once for each of these values of a parameter; the default is added."""
 PUBLISHED, STEPS = ("paper", "r2"), 6000
@@ -86,12 +87,10 @@ def efforts(name: str) -> list[Effort]:
     if name in BY_VALUE:
         key, values = BY_VALUE[name]
         usually = usual.params[key]
-        every = list(dict.fromkeys((*values, tuple(usually) if isinstance(usually, list) else usually)))
-        named = [(_words(v), find(name, {key: v})) for v in every]
-        found = [
-            Effort(method=method, label=f"{key} {words}", curve=name, default=words == _words(usually))
-            for words, method in named
-        ]
+        runs = {"defaults": usual} if usually is None else {}
+        runs |= {f"{key} {_words(v)}": find(name, {key: v}) for v in dict.fromkeys((*values, usually)) if v is not None}
+        usually = "defaults" if usually is None else f"{key} {_words(usually)}"
+        found = [Effort(method=m, label=label, curve=name, default=label == usually) for label, m in runs.items()]
         return found + [_published(preset) for preset in PUBLISHED if name == "splat"]
     count = usual.params.get("iterations")
     if not isinstance(count, int):
@@ -108,7 +107,8 @@ def _published(preset: str) -> Effort:
 def in_fdks(effort: Effort) -> float:
     """Return about how many times FDK's time a run takes."""
     name, params = effort.method.name, effort.method.params
-    amount = params.get(BY_VALUE[name][0] if name in BY_VALUE else "iterations")
+    amount = PASSES if effort.curve == "splat" else None
+    amount = params.get(BY_VALUE[name][0] if name in BY_VALUE else "iterations") or amount
     count = sum(amount) if isinstance(amount, tuple | list) else amount if isinstance(amount, int) else 1
     return FDKS.get(effort.curve, UNKNOWN) * count
 

@@ -27,7 +27,7 @@ from reconstruct.scatter import open_excess
 from reconstruct.splat.curve import MaterialCurve
 from reconstruct.splat.lattice import Lattice
 from reconstruct.splat.level import Data, carve, coarser, refined, weighted
-from reconstruct.splat.ordered import Fit
+from reconstruct.splat.ordered import Fit, n_subsets
 from reconstruct.splat.response import Response, basis_functions, evaluate, make_response, tangent
 from reconstruct.splat.volume import voxelise
 from reconstruct.watch import Stopwatch
@@ -39,14 +39,17 @@ VIEWS, SHORTEST = 12, 0.5  # views whose pixels stand for all, and the least pat
 DENSEST = 15.0  # times water, that is no metal: enamel 9, titanium 43
 SMALLEST = 24  # voxels along an axis below which there is no coarser level
 RESPONSES = ("tube", "known")
+PASSES, STEPS = (3, 4), 96
+"""Passes over each coarser grid and the finest; fewer where that many steps, one a subset of views, take fewer."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """What the preset "fast" may be told.
 
-    `passes` over the views are those of each coarser level and of the finest; `tv` is the threshold of denoising in
-    units of water a pass. The finest grid is `fineness` times that of the volume, at most as fine as the detector's
+    `passes` over the views are those of each coarser level and of the finest; None makes them 3 and 4, or as few, but
+    one, as make 96 steps, which is 1 on the finest level from 640 views on. `tv` is the threshold of denoising in units
+    of water a pass. The finest grid is `fineness` times that of the volume, at most as fine as the detector's
     pixels at the isocentre. `response` "tube" is a tube behind `filtration` mm of aluminium, seen by a scintillator;
     "known" takes `tube` and `detector`, tables of a scene file, whole or in part. `readout` is an energy in keV, or
     "hardened": by the object's own water. After `seconds` it returns what there is. `scatter` is what every reading
@@ -55,7 +58,7 @@ class Settings:
     make no sense.
     """
 
-    passes: tuple[int, int] = (3, 4)
+    passes: tuple[int, int] | None = None
     tv: float = 0.03
     fineness: float = 1.5
     response: Literal["tube", "known"] = "tube"
@@ -67,8 +70,9 @@ class Settings:
     scatter: float | None = None
 
     def __post_init__(self) -> None:
-        if not (len(self.passes) == 2 and min(self.passes) >= 0 and max(self.passes) > 0):
-            raise InputError(f"passes must be two counts, not both 0, got {self.passes}")
+        passes = PASSES if self.passes is None else self.passes
+        if not (len(passes) == 2 and min(passes) >= 0 and max(passes) > 0):
+            raise InputError(f"passes must be two counts, not both 0, got {passes}")
         for name, least in (("tv", 0), ("seconds", 0), ("fineness", 1)):
             if not getattr(self, name) >= least:
                 raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
@@ -163,9 +167,9 @@ def _coarse_to_fine(
     met = max(OPEN / math.sqrt(_open_photons(data)), LEAST_OPEN)
     curve = MaterialCurve.of(response, _rough_length(data, response, met))
     levels = [data]
-    while settings.passes[0] and min(levels[0].geometry.n_voxel) >= 2 * SMALLEST:
+    while (settings.passes or PASSES)[0] and min(levels[0].geometry.n_voxel) >= 2 * SMALLEST:
         levels.insert(0, coarser(levels[0]))
-    passes = [settings.passes[level is data] if len(levels) > 1 else sum(settings.passes) for level in levels]
+    passes = _passes(levels, settings.passes)
     updates = np.array([n * level.geometry.n_views for n, level in zip(passes, levels, strict=True)])
     work = updates * [math.prod(level.geometry.n_voxel) for level in levels]
     fit, done = None, 0
@@ -190,6 +194,15 @@ def _coarse_to_fine(
             break
         done = fit.view_updates
     return fit
+
+
+def _passes(levels: list[Data], given: tuple[int, int] | None) -> list[int]:
+    """Return the passes over each level, coarsest first; a level that is alone has those of all."""
+    most = [(given or PASSES)[level is levels[-1]] for level in levels] if len(levels) > 1 else [sum(given or PASSES)]
+    if given is not None:
+        return most
+    enough = [max(round(STEPS / n_subsets(level.geometry.n_views)), 1) for level in levels]
+    return [min(n, steps) for n, steps in zip(most, enough, strict=True)]
 
 
 def _open_photons(data: Data) -> float:

@@ -69,7 +69,7 @@ class Fit:
         to a half: subsets that disagree, by noise or by what no model explains, would keep the fit from settling.
         """
         n_views = self.data.geometry.n_views
-        n = min(max(n_views // SUBSET, LEAST_SUBSETS), n_views)
+        n = n_subsets(n_views)
         every = max(REST, n // A_PASS)
         for turn in range(1, passes + 1):
             misfit = 0.0
@@ -142,6 +142,11 @@ class Fit:
         p_y, p_x = self.lattice.padded
         cycles = np.hypot((np.fft.fftfreq(p_y) * n_y)[:, None], np.fft.rfftfreq(p_x) * n_x)
         return np.clip(cycles * math.pi / n_views, 1, max(STEEPEST * n_views, 1)).astype(np.float32)
+
+
+def n_subsets(n_views: int) -> int:
+    """Return into how many subsets the views fall, each of which makes a step."""
+    return min(max(n_views // SUBSET, LEAST_SUBSETS), n_views)
 
 
 def bit_reversed(n: int) -> list[int]:
