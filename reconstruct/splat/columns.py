@@ -45,12 +45,15 @@ class LatticeProjector:
         kernels.forward(self._runs, values, self._scale, self._projector.cameras[views], images)
         return images.reshape(len(views), 2, n_u, -1)
 
-    def adjoint(self, images: Image, views: NDArray[np.int64]) -> Image:
-        """Sum images, zero in their scratch columns, times line integrals (mm) over the pixels: [splat, 2]."""
+    def adjoint(self, images: Image, views: NDArray[np.int64], out: Image | None = None) -> Image:
+        """Sum images, zero in their scratch columns, times line integrals (mm) over the pixels: [splat, 2].
+
+        By columns the result is in `out` where that is given.
+        """
         if not self.by_columns:
             return self._projector.adjoint(self._shapes, images, views)
         stack = images.reshape(len(views), -1, images.shape[-1])
-        sums = np.zeros((self._shapes.shape[1], 2), np.float32)
+        sums = np.empty((self._shapes.shape[1], 2), np.float32) if out is None else out
         kernels.backward(self._runs, self._scale, self._projector.cameras[views], stack, sums)
         return sums
 

@@ -20,6 +20,8 @@ DEEPEST = 8.0  # of P, to which a material's own hardening is fitted
 STRONGEST = 10.0  # times iron, where the curve ends
 METAL = 6.0  # times water: above it a splat is metal to the fit's preconditioner (bone 5.3, aluminium 6.4 at 90 kVp)
 
+Image = NDArray[np.float32]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MaterialCurve:
@@ -59,16 +61,16 @@ class MaterialCurve:
         """ρa and ρb of water, 1/mm."""
         return float(self.densities[1, 0]), float(self.densities[1, 1])
 
-    def densities_of(self, u: NDArray[np.float32], unit: float = 1.0) -> NDArray[np.float32]:
-        """Return (ρa, ρb) over `unit`, float32 [splat, 2]."""
-        out = np.empty((u.size, 2), np.float32)
+    def densities_of(self, u: Image, unit: float = 1.0, out: Image | None = None) -> Image:
+        """Return (ρa, ρb) over `unit`, float32 [splat, 2], in `out` where that is given."""
+        out = np.empty((u.size, 2), np.float32) if out is None else out
         curve_cpu.evaluate(u, self.knots, self.densities, self.slopes, unit, out)
         return out
 
-    def transpose(self, u: NDArray[np.float32], sums: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return how sums by (ρa, ρb), float32 [splat, 2], change with each unknown: [splat]."""
-        out = np.empty_like(u)
-        curve_cpu.transpose(u, self.knots, self.slopes, sums, out)
+    def transpose(self, u: Image, sums: Image, factor: float = 1.0, out: Image | None = None) -> Image:
+        """Return how sums by (ρa, ρb), float32 [splat, 2], change with each unknown, times a factor: [splat]."""
+        out = np.empty_like(u) if out is None else out
+        curve_cpu.transpose(u, self.knots, self.slopes * factor, sums, out)
         return out
 
 

@@ -39,6 +39,7 @@ VIEWS, SHORTEST = 12, 0.5  # views whose pixels stand for all, and the least pat
 DENSEST = 15.0  # times water, that is no metal: enamel 9, titanium 43
 SMALLEST = 24  # voxels along an axis below which there is no coarser level
 RESPONSES = ("tube", "known")
+Image = NDArray[np.float32]
 PASSES, STEPS = (3, 4), 96
 """Passes over each coarser grid and the finest; fewer where that many steps, one a subset of views, take fewer."""
 
@@ -119,9 +120,8 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         blind = bool(clamped.all())
         details["limitation"] = f"{'no reading is of use' if blind else 'no ray met anything'}: the volume is empty"
         return Volume(values=torch.zeros(scan.geometry.n_voxel), details=details)
-    values, how = _read(fit, settings, scan.geometry)
+    values, (rho_a, rho_b), how = _read(fit, settings, scan.geometry)
     finite = bool(np.isfinite(values).all())
-    rho_a, rho_b = voxelise(fit.lattice.splats(fit.curve.densities_of(fit.u)), scan.geometry)
     details |= {
         "read-out": how,
         "misfit": fit.misfit if math.isfinite(fit.misfit) else None,
@@ -148,16 +148,16 @@ def finer(geometry: Geometry, fineness: float) -> Geometry:
     return msgspec.structs.replace(geometry, n_voxel=tuple(n), d_voxel=d_voxel)
 
 
-def _read(fit: Fit, settings: Settings, geometry: Geometry) -> tuple[NDArray[np.float32], str]:
-    """Return the volume as settings want it read, [z, y, x], and in words how."""
+def _read(fit: Fit, settings: Settings, geometry: Geometry) -> tuple[Image, Image, str]:
+    """Return the volume as settings want it read, [z, y, x], ρa and ρb [2, z, y, x], and in words how it was read."""
     if settings.readout == "hardened":
         length = typical_length(fit)
         weights, how = tangent(fit.response, fit.curve.of_water, length), f"hardened by {length:.1f} mm of water"
     else:
         a, b = basis_functions(np.array([settings.readout]), fit.response.basis, fit.response.e_max)
         weights, how = (float(a[0]), float(b[0])), f"at {settings.readout:g} keV"
-    values = fit.curve.densities_of(fit.u) @ np.array(weights, np.float32)[:, None]
-    return voxelise(fit.lattice.splats(values), geometry)[0], how
+    rho = voxelise(fit.lattice.splats(fit.curve.densities_of(fit.u)), geometry)
+    return np.float32(weights[0]) * rho[0] + np.float32(weights[1]) * rho[1], rho, how
 
 
 def _coarse_to_fine(
@@ -212,7 +212,7 @@ def _open_photons(data: Data) -> float:
     return float(1 / max(np.mean(below**2), 1e-12)) if below.size else 1e12
 
 
-def _readings(data: Data) -> NDArray[np.float32]:
+def _readings(data: Data) -> Image:
     """Return the line integrals of a few views' pixels that count."""
     views = _few_views(data.geometry)
     return data.p[views][data.weights[views] > 0]

@@ -29,7 +29,9 @@ class Data:
 
 def weighted(geometry: Geometry, p: NDArray[np.float32], valid: NDArray[np.bool_], scatter: float = 0.0) -> Data:
     """Weight line integrals [view, v, u] by the photons that came through, exp(−p), and 0 where not `valid`."""
-    weights = np.where(valid, np.exp(-np.maximum(p, 0)), 0).astype(np.float32)
+    weights = np.empty(p.shape, np.float32)
+    for reading, seen, weight in zip(p, valid, weights, strict=True):  # a view at a time stays in the cache
+        weight[...] = np.where(seen, np.exp(-np.maximum(reading, 0)), 0)
     return Data(geometry=geometry, p=p, weights=weights, scatter=scatter)
 
 
@@ -60,13 +62,16 @@ def coarser(data: Data) -> Data:
         angles_deg=None,
         poses=tuple(tuple(row) for row in poses.tolist()),
     )
-    shape = (views.size, n_v, step[0], n_u, step[1])
-    p, weights = (a[views, : n_v * step[0], : n_u * step[1]].reshape(shape) for a in (data.p, data.weights))
-    valid = weights > 0
-    n = np.maximum(valid.sum((2, 4)), 1)
-    mean = np.where(valid, np.exp(-p), 0).sum((2, 4)) / n
-    seen = np.asarray(valid.any((2, 4)), np.bool_)
-    return weighted(geometry, -np.log(np.where(seen, mean, 1)).astype(np.float32), seen, data.scatter)
+    p, seen = np.empty(geometry.shape, np.float32), np.empty(geometry.shape, np.bool_)
+    for k, view in enumerate(views):
+        shape = (n_v, step[0], n_u, step[1])
+        of_four, weights = (a[view, : n_v * step[0], : n_u * step[1]].reshape(shape) for a in (data.p, data.weights))
+        valid = weights > 0
+        n = valid.sum((1, 3))
+        mean = np.where(valid, np.exp(-of_four), 0).sum((1, 3)) / np.maximum(n, 1)
+        seen[k] = n > 0
+        p[k] = -np.log(np.where(seen[k], mean, 1))
+    return weighted(geometry, p, seen, data.scatter)
 
 
 def refined(values: NDArray[np.float32], fine: Geometry) -> NDArray[np.float32]:

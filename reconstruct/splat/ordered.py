@@ -57,10 +57,15 @@ class Fit:
     projector: LatticeProjector = field(init=False)
     _curvature: Image = field(init=False)  # by both densities, summed over the views that it was measured in
     _measured: int = 0
+    _pair: Image = field(init=False)  # densities, then sums by them: memory that is used again costs less than new
+    _gradient: Image = field(init=False)
+    _roots: Image = field(init=False)
 
     def __post_init__(self) -> None:
         self.projector = LatticeProjector(self.data.geometry, self.lattice)
-        self._curvature = np.zeros((len(self.lattice), 2), np.float32)
+        n = len(self.lattice)
+        self._curvature, self._pair = np.zeros((n, 2), np.float32), np.empty((n, 2), np.float32)
+        self._gradient, self._roots = np.empty(n, np.float32), np.empty(n, np.float32)
 
     def run(self, passes: int, proceed: Callable[["Fit", bool], bool]) -> bool:
         """Go through all views `passes` times; stop and return False when `proceed(fit, whole)` says so.
@@ -96,7 +101,7 @@ class Fit:
 
         The curvature is that of all views in which it was measured: it changes little from subset to subset.
         """
-        values = self.curve.densities_of(self.u, self.lattice.unit)
+        values = self.curve.densities_of(self.u, self.lattice.unit, self._pair)
         paths = self.projector.forward(values, views)
         la, lb = (np.ascontiguousarray(paths[:, c]) for c in (0, 1))
         p, by_a, by_b = evaluate(self.response, la, lb)
@@ -112,16 +117,14 @@ class Fit:
             self._measured += len(views)
         lacking = measured - p
         lacking *= weights > 0
-        gradient = self.curve.transpose(self.u, self._back(slopes, lacking, views))
-        gradient *= np.float32(length)
-        curvature = self.curve.transpose(self.u, self._curvature)
-        curvature *= np.float32(len(views) / self._measured)
+        gradient = self.curve.transpose(self.u, self._back(slopes, lacking, views), length, self._gradient)
+        curvature = self.curve.transpose(self.u, self._curvature, len(views) / self._measured, self._roots)
         self._move(gradient, curvature, len(views))
         self.view_updates += len(views)
         return float(np.abs(lacking).sum(dtype=np.float64)) / (len(views) * math.prod(self.data.geometry.n_detector))
 
     def _back(self, slopes: Image, images: Image, views: NDArray[np.int64]) -> Image:
-        return self.projector.adjoint(slopes * images[:, None], views)
+        return self.projector.adjoint(slopes * images[:, None], views, self._pair)
 
     def _move(self, gradient: Image, curvature: Image, n_views: int) -> None:
         """Step; gradient and curvature are overwritten."""

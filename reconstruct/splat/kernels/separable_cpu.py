@@ -238,9 +238,11 @@ def _backward_runs(chosen, runs, scale, camera, image, sums):
 
 @njit(cache=True, error_model="numpy", parallel=True)
 def backward(runs, scale, cameras, images, sums):
-    """Apply the transpose: sums [splat, 2] += Σ w·images over all pixels of images [view, 2 · u, v + 8]."""
-    n = runs[0].shape[0]
+    """Apply the transpose: write to sums [splat, 2] Σ w·images over all pixels of images [view, 2 · u, v + 8]."""
+    n, starts = runs[0].shape[0], runs[1]
     for task in prange((n + RUNS - 1) // RUNS):
         chosen = (task * RUNS, min((task + 1) * RUNS, n))
+        for i in range(starts[chosen[0]], starts[chosen[1]]):
+            sums[i, 0] = sums[i, 1] = 0
         for view in range(cameras.shape[0]):
             _backward_runs(chosen, runs, scale, cameras[view], images[view], sums)
