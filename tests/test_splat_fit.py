@@ -15,8 +15,9 @@ from ctsim.materials import attenuation
 from ctsim.store import list_scans, open_scan
 from ctsim.types import Status
 from reconstruct.fdk import reconstruct as fdk
+from reconstruct.splat import fast
 from reconstruct.splat.curve import MATERIALS, MaterialCurve
-from reconstruct.splat.level import carve, coarser, refined, weighted
+from reconstruct.splat.level import Data, carve, coarser, refined, weighted
 from reconstruct.splat.method import reconstruct
 from reconstruct.splat.ordered import Fit, bit_reversed
 from reconstruct.splat.response import evaluate, make_response
@@ -225,6 +226,23 @@ def test_poses_need_no_circle(stored):
     posed = msgspec.structs.replace(geometry, poses=poses)
     found = reconstruct(dataclasses.replace(stored.scan, geometry=posed), passes=(1, 1)).values
     assert torch.equal(found, reconstruct(stored.scan, passes=(1, 1)).values)
+
+
+@pytest.mark.parametrize(
+    "views, given, expected",
+    [
+        ((60, 120, 240), None, [3, 3, 4]),
+        ((90, 180, 360, 720), None, [3, 3, 2, 1]),
+        ((90, 180, 360, 720), (3, 4), [3, 3, 3, 4]),
+        ((24,), None, [7]),
+        ((2000,), None, [1]),
+        ((30, 60), (1, 0), [1, 0]),
+    ],
+)
+def test_where_a_pass_makes_many_steps_fewer_are_taken(views, given, expected):
+    nothing = np.empty((0, 0, 0), np.float32)
+    levels = [Data(geometry=msgspec.structs.replace(GEOMETRY, n_views=n), p=nothing, weights=nothing) for n in views]
+    assert fast._passes(levels, given) == expected
 
 
 def test_values_without_sense_are_refused_by_name(stored):

@@ -41,17 +41,17 @@ SMALLEST = 24  # voxels along an axis below which there is no coarser level
 RESPONSES = ("tube", "known")
 Image = NDArray[np.float32]
 PASSES, STEPS = (3, 4), 96
-"""Passes over each coarser grid and the finest; fewer where that many steps, one a subset of views, take fewer."""
+"""Passes over each coarser grid and the finest, fewer where they would make more steps, one a subset of views."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """What the preset "fast" may be told.
 
-    `passes` over the views are those of each coarser level and of the finest; None makes them 3 and 4, or as few, but
-    one, as make 96 steps, which is 1 on the finest level from 640 views on. `tv` is the threshold of denoising in units
-    of water a pass. The finest grid is `fineness` times that of the volume, at most as fine as the detector's
-    pixels at the isocentre. `response` "tube" is a tube behind `filtration` mm of aluminium, seen by a scintillator;
+    `passes` over the views are those of each coarser level and of the finest; None makes them 3 and 4, or fewer, but
+    one, so that a level makes no more than 96 steps, one for ten views. `tv` is the threshold of denoising in units of
+    water a pass. The finest grid is `fineness` times that of the volume, at most as fine as the detector's pixels at
+    the isocentre. `response` "tube" is a tube behind `filtration` mm of aluminium, seen by a scintillator;
     "known" takes `tube` and `detector`, tables of a scene file, whole or in part. `readout` is an energy in keV, or
     "hardened": by the object's own water. After `seconds` it returns what there is. `scatter` is what every reading
     holds of it over the open field (S/I0); None has it found in the pixels that no shadow reaches (`open_excess`), 0 is
@@ -60,7 +60,7 @@ class Settings:
     """
 
     passes: tuple[int, int] | None = None
-    tv: float = 0.03
+    tv: float = 0.05
     fineness: float = 1.5
     response: Literal["tube", "known"] = "tube"
     filtration: float = 0.5
@@ -201,7 +201,7 @@ def _passes(levels: list[Data], given: tuple[int, int] | None) -> list[int]:
     most = [(given or PASSES)[level is levels[-1]] for level in levels] if len(levels) > 1 else [sum(given or PASSES)]
     if given is not None:
         return most
-    enough = [max(round(STEPS / n_subsets(level.geometry.n_views)), 1) for level in levels]
+    enough = [max(STEPS // n_subsets(level.geometry.n_views), 1) for level in levels]
     return [min(n, steps) for n, steps in zip(most, enough, strict=True)]
 
 
