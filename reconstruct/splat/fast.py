@@ -38,6 +38,8 @@ EMPTY = 0.05  # times water: a voxel of the coarser volume below that holds no s
 VIEWS, SHORTEST = 12, 0.5  # views whose pixels stand for all, and the least path in voxels that counts as one
 DENSEST = 15.0  # times water, that is no metal: enamel 9, titanium 43
 SMALLEST = 24  # voxels along an axis below which there is no coarser level
+AT_THE_END, FEW = 0.9, 1e-4
+"""Share of the curve's last attenuation, ten times iron's, that no metal has, and share of the splats that may."""
 RESPONSES = ("tube", "known")
 Image = NDArray[np.float32]
 PASSES, STEPS = (3, 4), 96
@@ -121,7 +123,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         details["limitation"] = f"{'no reading is of use' if blind else 'no ray met anything'}: the volume is empty"
         return Volume(values=torch.zeros(scan.geometry.n_voxel), details=details)
     values, (rho_a, rho_b), how = _read(fit, settings, scan.geometry)
-    finite = bool(np.isfinite(values).all())
+    status, reason = _verdict(fit, values)
     details |= {
         "read-out": how,
         "misfit": fit.misfit if math.isfinite(fit.misfit) else None,
@@ -130,9 +132,22 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     }
     return Volume(
         values=torch.from_numpy(values),
-        status=Status.OK if finite else Status.NONFINITE,
-        reason="" if finite else "the reconstruction holds values that are not finite",
+        status=status,
+        reason=reason,
         details=details,
+    )
+
+
+def _verdict(fit: Fit, values: Image) -> tuple[Status, str]:
+    """Say how a fit ended, and why if not well."""
+    if not np.isfinite(values).all():
+        return Status.NONFINITE, "the reconstruction holds values that are not finite"
+    runaway = int((fit.u >= AT_THE_END * fit.curve.knots[-1]).sum())
+    if runaway <= FEW * len(fit.u):
+        return Status.OK, ""
+    return Status.DIVERGED, (
+        f"{runaway} of {len(fit.u)} splats went to ten times the attenuation of iron: "
+        "readings are darker than any metal makes them; are the scan's dark and open field right?"
     )
 
 
