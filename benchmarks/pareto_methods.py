@@ -86,10 +86,10 @@ def efforts(name: str) -> list[Effort]:
     usual = find(name)
     if name in BY_VALUE:
         key, values = BY_VALUE[name]
-        usually = usual.params[key]
-        runs = {"defaults": usual} if usually is None else {}
-        runs |= {f"{key} {_words(v)}": find(name, {key: v}) for v in dict.fromkeys((*values, usually)) if v is not None}
-        usually = "defaults" if usually is None else f"{key} {_words(usually)}"
+        default = usual.params[key]
+        runs = {f"{key} {_words(v)}": find(name, {key: v}) for v in values}
+        usually = "defaults" if default is None else f"{key} {_words(default)}"
+        runs = {usually: usual} | runs
         found = [Effort(method=m, label=label, curve=name, default=label == usually) for label, m in runs.items()]
         return found + [_published(preset) for preset in PUBLISHED if name == "splat"]
     count = usual.params.get("iterations")

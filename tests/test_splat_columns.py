@@ -7,6 +7,7 @@ import pytest
 
 from ctsim.geometry import Geometry
 from reconstruct.splat.columns import LatticeProjector
+from reconstruct.splat.kernels import separable_cpu as kernels
 from reconstruct.splat.kernels import splat_reference as reference
 from reconstruct.splat.lattice import Lattice
 from reconstruct.splat.project import CUTOFF, Projector
@@ -82,6 +83,56 @@ def test_each_column_is_its_product_of_gaussians_to_float32():
         beyond = found[0][~inside]
         assert np.minimum(abs(beyond), abs(beyond - expected[~inside])).max() < 1e-5 * peak  # cut off, or right
         np.testing.assert_allclose(found[1], -2 * found[0], rtol=1e-6)
+
+
+def on_the_rim(geometry, lattice):
+    """Shift the detector so that the cutoff of the first splat in view 0 is a millionth of a row below a row."""
+
+    def rim(geometry):
+        projector, place = LatticeProjector(geometry, lattice), np.empty(kernels.PLACE)
+        x, y, z = map(float, lattice.positions[0])
+        camera = projector._projector.cameras[0]
+        assert kernels._place(camera, x, y, lattice.scale, place)
+        return kernels._row(camera, place, z) + kernels._reach_v(camera, place, z, z)
+
+    v, u = geometry.off_detector
+    per_mm = rim(shifted(geometry, off_detector=(v + 1, u))) - rim(geometry)
+    lacking = np.ceil(rim(geometry)) - 1e-6 - rim(geometry)
+    return shifted(geometry, off_detector=(v + lacking / per_mm, u))
+
+
+@pytest.mark.parametrize("case", ["up", "down", "coarse", "rim"])
+def test_both_directions_take_the_same_pairs(case):
+    geometry = shifted(GEOMETRY, n_detector=(13, 11))
+    if case == "coarse":
+        geometry = shifted(geometry, n_detector=(3, 2), d_detector=(8.0, 8.0))
+    if case == "down":
+        poses = geometry.pose_array()
+        poses[:, 9:12] *= -1
+        geometry = shifted(geometry, poses=tuple(tuple(row) for row in poses.tolist()))
+    support = np.zeros(geometry.n_voxel, bool)
+    support[1:10, 6, 5], support[[0, 2, 3, 7], 7, 7] = True, True
+    lattice, view = Lattice(geometry=geometry, support=support), np.array([0])
+    if case == "rim":
+        geometry = on_the_rim(geometry, lattice)
+    projector = LatticeProjector(geometry, lattice)
+    splats = np.eye(len(lattice), dtype=np.float32)[:, :, None].repeat(2, 2)
+    forward = np.stack([projector.pictures(projector.forward(one, view))[0, 0].ravel() for one in splats])
+    pixels = np.eye(forward.shape[1], dtype=np.float32).reshape(-1, 1, 1, *geometry.n_detector).repeat(2, 2)
+    back = np.stack([projector.adjoint(projector.arranged(one), view)[:, 0] for one in pixels], 1)
+    assert np.array_equal(forward > 0, back > 0) and np.count_nonzero(forward) > len(lattice)
+    np.testing.assert_allclose(forward, back, rtol=1e-5)
+
+
+def test_no_splats_and_no_views_are_none():
+    lattice = Lattice(geometry=GEOMETRY, support=np.zeros(GEOMETRY.n_voxel, bool))
+    projector = LatticeProjector(GEOMETRY, lattice)
+    images = projector.forward(np.zeros((0, 2), np.float32), VIEWS)
+    assert not images.any() and projector.adjoint(images, VIEWS).shape == (0, 2)
+    some, none = lattice_of(GEOMETRY), np.array([], np.int64)
+    projector = LatticeProjector(GEOMETRY, some)
+    images = projector.forward(np.ones((len(some), 2), np.float32), none)
+    assert images.shape[0] == 0 and not projector.adjoint(images, none).any()
 
 
 def test_a_tilted_detector_goes_splat_by_splat():

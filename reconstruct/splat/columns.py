@@ -32,7 +32,7 @@ class LatticeProjector:
         if self.by_columns:
             places = lattice.positions[:, :2]
             apart = np.any(places[1:] != places[:-1], axis=1) | (np.diff(lattice.index) != 1)
-            starts = np.concatenate([[0], np.flatnonzero(apart) + 1, [len(lattice)]]).astype(np.int64)
+            starts = np.unique(np.concatenate([[0], np.flatnonzero(apart) + 1, [len(lattice)]])).astype(np.int64)
             z = np.pad(lattice.positions[None, :, 2], [(0, 0), (0, WIDTH)])
             self._runs = (places[starts[:-1]].astype(np.float64), starts, z, int(np.diff(starts).max(initial=0)))
 
@@ -43,7 +43,7 @@ class LatticeProjector:
         n_v, n_u = self._n_detector
         images = np.zeros((len(views), 2 * n_u, n_v + WIDTH), np.float32)
         kernels.forward(self._runs, values, self._scale, self._projector.cameras[views], images)
-        return images.reshape(len(views), 2, n_u, -1)
+        return images.reshape(len(views), 2, n_u, n_v + WIDTH)
 
     def adjoint(self, images: Image, views: NDArray[np.int64], out: Image | None = None) -> Image:
         """Sum images, zero in their scratch columns, times line integrals (mm) over the pixels: [splat, 2].
@@ -52,7 +52,7 @@ class LatticeProjector:
         """
         if not self.by_columns:
             return self._projector.adjoint(self._shapes, images, views)
-        stack = images.reshape(len(views), -1, images.shape[-1])
+        stack = images.reshape(len(views), 2 * self._n_detector[1], images.shape[-1])
         sums = np.empty((self._shapes.shape[1], 2), np.float32) if out is None else out
         kernels.backward(self._runs, self._scale, self._projector.cameras[views], stack, sums)
         return sums

@@ -24,7 +24,7 @@ from ctsim.types import Scan, Status, Volume
 from reconstruct.beam import Given, known_detector, known_tube
 from reconstruct.log import line_integrals
 from reconstruct.scatter import open_excess
-from reconstruct.splat.curve import MaterialCurve
+from reconstruct.splat.curve import STRONGEST, MaterialCurve
 from reconstruct.splat.lattice import Lattice
 from reconstruct.splat.level import Data, carve, coarser, refined, weighted
 from reconstruct.splat.ordered import Fit, n_subsets
@@ -38,21 +38,21 @@ EMPTY = 0.05  # times water: a voxel of the coarser volume below that holds no s
 VIEWS, SHORTEST = 12, 0.5  # views whose pixels stand for all, and the least path in voxels that counts as one
 DENSEST = 15.0  # times water, that is no metal: enamel 9, titanium 43
 SMALLEST = 24  # voxels along an axis below which there is no coarser level
-AT_THE_END, FEW = 0.9, 1e-4
-"""Share of the curve's last attenuation, ten times iron's, that no metal has, and share of the splats that may."""
+AT_THE_END, FEW, FEWEST = 0.9, 1e-4, 10
+"""Share of the curve's last attenuation, which no metal has; the share of the splats, or how many, that may have it."""
 RESPONSES = ("tube", "known")
-Image = NDArray[np.float32]
 PASSES, STEPS = (3, 4), 96
 """Passes over each coarser grid and the finest, fewer where they would make more steps, one a subset of views."""
+Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """What the preset "fast" may be told.
 
-    `passes` over the views are those of each coarser level and of the finest; None makes them 3 and 4, or fewer, but
-    one, so that a level makes no more than 96 steps, one for ten views. `tv` is the threshold of denoising in units of
-    water a pass. The finest grid is `fineness` times that of the volume, at most as fine as the detector's pixels at
+    `passes` over the views are those of each coarser level and of the finest; None makes them 3 and 4, or fewer, at
+    least one, where they would make more than 96 steps, one for ten views. `tv` is the threshold of denoising in units
+    of water a pass. The finest grid is `fineness` times that of the volume, at most as fine as the detector's pixels at
     the isocentre. `response` "tube" is a tube behind `filtration` mm of aluminium, seen by a scintillator;
     "known" takes `tube` and `detector`, tables of a scene file, whole or in part. `readout` is an energy in keV, or
     "hardened": by the object's own water. After `seconds` it returns what there is. `scatter` is what every reading
@@ -143,10 +143,10 @@ def _verdict(fit: Fit, values: Image) -> tuple[Status, str]:
     if not np.isfinite(values).all():
         return Status.NONFINITE, "the reconstruction holds values that are not finite"
     runaway = int((fit.u >= AT_THE_END * fit.curve.knots[-1]).sum())
-    if runaway <= FEW * len(fit.u):
+    if runaway <= max(FEW * len(fit.u), FEWEST):
         return Status.OK, ""
     return Status.DIVERGED, (
-        f"{runaway} of {len(fit.u)} splats went to ten times the attenuation of iron: "
+        f"{runaway} of {len(fit.u)} splats went to {AT_THE_END * STRONGEST:g} times the attenuation of iron: "
         "readings are darker than any metal makes them; are the scan's dark and open field right?"
     )
 

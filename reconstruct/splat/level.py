@@ -63,8 +63,8 @@ def coarser(data: Data) -> Data:
         poses=tuple(tuple(row) for row in poses.tolist()),
     )
     p, seen = np.empty(geometry.shape, np.float32), np.empty(geometry.shape, np.bool_)
+    shape = (n_v, step[0], n_u, step[1])
     for k, view in enumerate(views):
-        shape = (n_v, step[0], n_u, step[1])
         of_four, weights = (a[view, : n_v * step[0], : n_u * step[1]].reshape(shape) for a in (data.p, data.weights))
         valid = weights > 0
         n = valid.sum((1, 3))

@@ -179,7 +179,7 @@ def sqrt(typingctx, a):
 
 
 def _power_of_two(builder, y):
-    """2^y for |y| below 126, anything beyond."""
+    """Return 2^y for |y| below 126, anything beyond."""
     shifted = builder.fadd(y, _same(_MAGIC))
     f = builder.fsub(y, builder.fsub(shifted, _same(_MAGIC)))
     power = _same(_POWERS[-1])
@@ -220,8 +220,8 @@ def total(typingctx, a):
         value, n = args[0], WIDTH
         while n > 1:
             n //= 2
-            pick = ir.VectorType(ir.IntType(32), n)
-            low, high = (ir.Constant(pick, list(range(k, k + n))) for k in (0, n))
+            kind = ir.VectorType(ir.IntType(32), n)
+            low, high = (ir.Constant(kind, list(range(k, k + n))) for k in (0, n))
             halves = [builder.shuffle_vector(value, value, which) for which in (low, high)]
             value = builder.fadd(*halves)
         return builder.extract_element(value, ir.Constant(ir.IntType(32), 0))

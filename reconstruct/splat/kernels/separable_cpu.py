@@ -49,7 +49,7 @@ from reconstruct.splat.kernels.splat_cpu import (
 )
 
 RUNS = 256  # in a task of the transpose
-SLACK = 1e-3  # of a splat or row: ranges are wider by that, so that rounding leaves nothing out
+SLACK = 1e-3  # of a splat and of a row: ranges are wider by that, so that the cutoff alone decides, not rounding
 ROW, FALLING, PEAKS, FIRST, SECOND = range(5)  # of a run's table [5, splat]: row, −1/(2 S_vv), peak, two channels
 # what a run has in common: u, S_uu, v per mm of z, S_vv's two parts, |ray|²'s two, and the peak over √S_vv
 U0, S_UU, PER_Z, S_VV, S_VV_2, RAY, RAY_2, W0 = range(8)
@@ -140,8 +140,8 @@ def _window(at, scale, camera, z, bounds, size, place):
     ends = z[0, bounds[0]], z[0, bounds[1] - 1]
     reach = _reach_v(camera, place, ends[0], ends[1])
     a, b = _row(camera, place, ends[0]), _row(camera, place, ends[1])
-    low = min(max(min(a, b) - reach, -1e9), 1e9)
-    high = min(max(max(a, b) + reach, -1e9), 1e9)
+    low = min(max(min(a, b) - reach - SLACK, -1e9), 1e9)
+    high = min(max(max(a, b) + reach + SLACK, -1e9), 1e9)
     first, last = max(0, int(math.ceil(low))), min(n_v, int(math.floor(high)) + 1)
     if left >= right or first >= last:
         return 0, 0, 0, 0, 0.0
@@ -172,8 +172,8 @@ def _forward_view(runs, values, scale, camera, image):
         _gains(camera, place, left, right, gains)
         n, lowest = bounds[1] - bounds[0], _row(camera, place, z[0, bounds[0]])
         highest = _row(camera, place, z[0, bounds[1] - 1])
-        a_row = (n - 1) / (highest - lowest) if n > 1 else 0.0  # splats, of either sign
-        wide = abs(a_row) * (0.5 * (WIDTH - 1) + reach) + SLACK
+        a_row = (n - 1) / (highest - lowest) if highest != lowest else 0.0  # splats, of either sign
+        wide = abs(a_row) * (0.5 * (WIDTH - 1) + reach + SLACK) + SLACK
         for v in range(low, high, WIDTH):
             middle = (v + 0.5 * (WIDTH - 1) - lowest) * a_row
             first, last = max(0, int(math.ceil(middle - wide))), min(n, int(math.floor(middle + wide)) + 1)
