@@ -85,8 +85,8 @@ def test_each_column_is_its_product_of_gaussians_to_float32():
         np.testing.assert_allclose(found[1], -2 * found[0], rtol=1e-6)
 
 
-def on_the_rim(geometry, lattice):
-    """Shift the detector so that the cutoff of the first splat in view 0 is a millionth of a row below a row."""
+def on_the_rim(geometry, lattice, below):
+    """Shift the detector so that the cutoff of the only splat in view 0 is so many rows below a row."""
 
     def rim(geometry):
         projector, place = LatticeProjector(geometry, lattice), np.empty(kernels.PLACE)
@@ -97,11 +97,32 @@ def on_the_rim(geometry, lattice):
 
     v, u = geometry.off_detector
     per_mm = rim(shifted(geometry, off_detector=(v + 1, u))) - rim(geometry)
-    lacking = np.ceil(rim(geometry)) - 1e-6 - rim(geometry)
+    lacking = np.ceil(rim(geometry)) - below - rim(geometry)
     return shifted(geometry, off_detector=(v + lacking / per_mm, u))
 
 
-@pytest.mark.parametrize("case", ["up", "down", "coarse", "rim"])
+def matrices(geometry, lattice):
+    """Weights of view 0 as projecting and its transpose have them, [splat, pixel]."""
+    projector, view = LatticeProjector(geometry, lattice), np.array([0])
+    splats = np.eye(len(lattice), dtype=np.float32)[:, :, None].repeat(2, 2)
+    forward = np.stack([projector.pictures(projector.forward(one, view))[0, 0].ravel() for one in splats])
+    pixels = np.eye(forward.shape[1], dtype=np.float32).reshape(-1, 1, 1, *geometry.n_detector).repeat(2, 2)
+    return forward, np.stack([projector.adjoint(projector.arranged(one), view)[:, 0] for one in pixels], 1)
+
+
+@pytest.mark.parametrize("z", range(2, 8))
+def test_rounding_at_the_cutoff_is_the_same_in_both_directions(z):
+    geometry, support = shifted(GEOMETRY, n_detector=(13, 11)), np.zeros(GEOMETRY.n_voxel, bool)
+    support[z, 7, 7] = True
+    lattice, taken = Lattice(geometry=geometry, support=support), set()
+    for below in np.linspace(-2e-6, 2e-6, 21):
+        forward, back = matrices(on_the_rim(geometry, lattice, below), lattice)
+        assert np.array_equal(forward > 0, back > 0)
+        taken.add(np.count_nonzero(forward.reshape(13, 11).any(1)))
+    assert len(taken) > 1  # the row at the rim was in and out
+
+
+@pytest.mark.parametrize("case", ["up", "down", "coarse"])
 def test_both_directions_take_the_same_pairs(case):
     geometry = shifted(GEOMETRY, n_detector=(13, 11))
     if case == "coarse":
@@ -112,14 +133,8 @@ def test_both_directions_take_the_same_pairs(case):
         geometry = shifted(geometry, poses=tuple(tuple(row) for row in poses.tolist()))
     support = np.zeros(geometry.n_voxel, bool)
     support[1:10, 6, 5], support[[0, 2, 3, 7], 7, 7] = True, True
-    lattice, view = Lattice(geometry=geometry, support=support), np.array([0])
-    if case == "rim":
-        geometry = on_the_rim(geometry, lattice)
-    projector = LatticeProjector(geometry, lattice)
-    splats = np.eye(len(lattice), dtype=np.float32)[:, :, None].repeat(2, 2)
-    forward = np.stack([projector.pictures(projector.forward(one, view))[0, 0].ravel() for one in splats])
-    pixels = np.eye(forward.shape[1], dtype=np.float32).reshape(-1, 1, 1, *geometry.n_detector).repeat(2, 2)
-    back = np.stack([projector.adjoint(projector.arranged(one), view)[:, 0] for one in pixels], 1)
+    lattice = Lattice(geometry=geometry, support=support)
+    forward, back = matrices(geometry, lattice)
     assert np.array_equal(forward > 0, back > 0) and np.count_nonzero(forward) > len(lattice)
     np.testing.assert_allclose(forward, back, rtol=1e-5)
 
