@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import TABLEAU_COLORS
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator
 
 from benchmarks.pareto_front import front
 from benchmarks.pareto_records import Part, Point, at_knee
@@ -38,7 +39,7 @@ def _scene(axes: Axes, every: Sequence[Point]) -> None:
     known = list(dict.fromkeys(p.setting.curve for p in every))
     for k, group in enumerate(groups(every)):
         for curve, mine in curves(group).items():
-            x, y = zip(*(p.pair for p in mine), strict=True)
+            x, y = zip(*sorted(p.pair for p in mine), strict=True)  # a default may stand anywhere on its curve
             colour = COLOURS[known.index(curve) % len(COLOURS)]
             marker = MARKERS[k % len(MARKERS)]
             handles += axes.plot(x, y, marker=marker, markersize=5, linewidth=0.8, color=colour, label=curve)
@@ -63,4 +64,6 @@ def _scene(axes: Axes, every: Sequence[Point]) -> None:
     axes.grid(which="both", alpha=0.2)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter("{x:g}")
+        axis.set_minor_locator(LogLocator(subs=(2, 5)))
+        axis.set_minor_formatter("{x:g}")
     axes.legend(handles=handles, loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=8, frameon=False)

@@ -50,9 +50,9 @@ FDKS = {
     "fista-tv": 1.5,
     "asd-pocs": 2.3,
     "awpcsd": 3.7,
-    "splat": 18.0,
-    "splat paper": 5400.0,
-    "splat r2": 12400.0,
+    "splat": 3.4,
+    "splat paper": 2950.0,
+    "splat r2": 7590.0,
 }
 """Cost in FDKs, for estimates, as measured on lung-Fe of `quick`: of an iteration or a pass where those are given."""
 UNKNOWN = 5.0
