@@ -31,7 +31,7 @@ def open_excess(p: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
     mean = np.where(count == len(p), total / len(p), 0)
     around = ndimage.uniform_filter(mean, NEAR, mode="nearest")
     brightest = float(around.max(initial=0)) - 1
-    if brightest <= 0:
+    if brightest <= 0 or not (mean > 1).any():  # a filter of ones may round to more
         return 0.0
     # a median: at the object's outline a pixel is far from the mean around it
     noise = NORMAL * float(np.median(np.abs(mean - around)[mean > 1])) / NEAR

@@ -1,5 +1,7 @@
 """Scatter found in the open field, and what the splat fit makes of it."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -84,3 +86,11 @@ def test_the_fit_undoes_scatter_that_it_finds_itself(stored):
 def test_scatter_that_makes_no_sense_is_refused(stored, scatter):
     with pytest.raises(InputError, match="scatter must be at least 0 times the open field, got"):
         reconstruct(stored.scan, device="cpu", scatter=scatter)
+
+
+def test_an_open_field_without_noise_has_none_and_warns_of_nothing():
+    readings = np.zeros((3, 40, 37), np.float32)
+    readings[:, 10:20, 10:20] = np.random.default_rng(0).uniform(0, 0.5, (10, 10))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert open_excess(readings, np.ones(readings.shape, bool)) == 0
