@@ -5,12 +5,16 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from ctsim.detector import Detector
 from ctsim.errors import InputError
 from ctsim.materials import E_MIN
-from ctsim.spectrum import Tube
+from ctsim.quadrature import full_rule
+from ctsim.spectrum import Tube, spectrum
 
+ROUNDED = 1e-6  # keV
 Given = Mapping[str, Any] | None
 Kind = TypeVar("Kind", Tube, Detector)
 
@@ -30,6 +34,24 @@ def known_tube(given: Given | Tube, e_max: float) -> Tube:
 def known_detector(given: Given | Detector) -> Detector:
     """Return a detector from a scene file's table; raises InputError for keys and values that Detector refuses."""
     return _of("detector", given, Detector, {})
+
+
+def detected(
+    tube: Given | Tube, detector: Given | Detector, e_max: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the energies (keV) of a tube's spectrum and the share of the detected signal at each.
+
+    Raises InputError as `known_tube` and `known_detector` do.
+    """
+    seen = full_rule(spectrum(known_tube(tube, e_max)), known_detector(detector))
+    # a kVp found for e_max is rounded, which may leave its highest bin above it in the seventh decimal
+    return np.where(np.abs(seen.energies - e_max) < ROUNDED, e_max, seen.energies), seen.w1
+
+
+def refuse_beam(response: str | None, tube: Given | Tube, detector: Given | Detector) -> None:
+    """Raise InputError for a tube or a detector that comes with a response which does not read them."""
+    if response != "known" and not (tube is None and detector is None):
+        raise InputError(f"tube and detector are for response 'known', got them with response {response!r}")
 
 
 def _of(name: str, given: "Given | Kind", kind: type[Kind], defaults: dict[str, Any]) -> Kind:

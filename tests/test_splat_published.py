@@ -13,11 +13,13 @@ import torch
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.types import Scan, Status
+from reconstruct.beam import detected
 from reconstruct.splat import adam, densify
 from reconstruct.splat.learner import LEAST_VALUE, Learner, seed_splats
 from reconstruct.splat.objective import Objective
 from reconstruct.splat.published import fit_published, read_out, reconstruct
 from reconstruct.splat.published_settings import PRESETS, Settings, changed
+from reconstruct.splat.response import evaluate
 from reconstruct.splat.volume import voxelise
 from reconstruct.watch import Progress, listen, watch
 
@@ -99,7 +101,7 @@ def test_the_response_is_learned_only_where_it_is_to_be():
     assert theta(theta=[0.5, 0.9]) != [0.5, 0.9]
     assert theta(response="flat") == [1.0, 1.0]
     assert theta(basis="constant") == [0.2, 1.0]
-    assert theta(preset="r2") == []
+    assert theta(preset="r2") == [] == theta(response="known")
     volumes = [reconstruct(sphere(), steps=2, n_splats=200, e_max=e_max).values for e_max in (60.0, None)]
     assert not torch.equal(*volumes)
 
@@ -113,6 +115,20 @@ def test_a_response_matters_only_where_attenuation_depends_on_energy():
     assert torch.equal(run(basis="constant", response="mono"), run(basis="constant", response="paper"))
     for basis in ("paper", "klein-nishina", "photoelectric"):
         assert not torch.equal(run(basis=basis, response="flat"), run(basis=basis, response="paper")), basis
+
+
+def test_a_known_spectrum_is_the_one_that_is_told():
+    def run(**changes):
+        return reconstruct(sphere(), steps=3, n_splats=200, response="known", **changes).values
+
+    copper = {"filters": [{"material": "Cu", "thickness": 2.0}]}
+    assert not torch.equal(run(), run(tube=copper)) and not torch.equal(run(), run(detector={"kind": "csi"}))
+    energies, shares = detected(copper, None, 90.0)
+    told = Settings(response="known", tube=copper).make_response(90.0)
+    length = 40.0
+    exact = -np.log(shares @ np.exp(-0.02 * length * (energies / 50.0) ** -3) / shares.sum())
+    found, _, _ = evaluate(told, np.zeros((1, 1), np.float32), np.full((1, 1), 0.02 * length, np.float32))
+    assert found.item() == pytest.approx(exact, abs=1e-4)  # to which a spectrum is reduced
 
 
 def test_nothing_seen_and_no_time_give_what_there_is():
@@ -370,6 +386,8 @@ def test_presets_change_as_told_and_none_leaves_them():
         ({"response": "tubes"}, "response must be one of"),
         ({"response": "mono"}, "basis must be 'constant'"),
         ({"response": "flat", "theta": (1.0, 1.0)}, "no theta"),
+        ({"tube": {"kvp": 60.0}}, "for response 'known'"),
+        ({"response": "known", "tube": {"kvpp": 60.0}}, "tube: "),
         ({"readout": "soft"}, "hardened"),
         ({"readout": 0.0}, "positive energy"),
         ({"held_out": 20}, "below the 20 views"),

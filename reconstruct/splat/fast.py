@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from ctsim.detector import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.quadrature import full_rule
-from ctsim.spectrum import Tube, spectrum
+from ctsim.spectrum import Tube
 from ctsim.types import Scan, Status, Volume
-from reconstruct.beam import Given, known_detector, known_tube
+from reconstruct.beam import Given, detected, refuse_beam
 from reconstruct.log import line_integrals
 from reconstruct.scatter import open_excess
 from reconstruct.splat.curve import STRONGEST, MaterialCurve
@@ -83,8 +82,7 @@ class Settings:
             raise InputError(f"scatter must be at least 0 times the open field, got {self.scatter}")
         if self.response not in RESPONSES:
             raise InputError(f"response of preset 'fast' must be one of {', '.join(RESPONSES)}, got {self.response!r}")
-        if self.response == "tube" and not (self.tube is None and self.detector is None):
-            raise InputError("tube and detector are for response 'known', got them with response 'tube'")
+        refuse_beam(self.response, self.tube, self.detector)
         at_energy = isinstance(self.readout, int | float) and math.isfinite(self.readout) and self.readout > 0
         if self.readout != "hardened" and not at_energy:
             raise InputError(f"readout must be 'hardened' or a positive energy in keV, got {self.readout!r}")
@@ -93,8 +91,8 @@ class Settings:
         """Build the response for a scan of greatest energy `e_max` (keV)."""
         if self.response == "tube":
             return make_response("tube", e_max=e_max, basis="klein-nishina", theta=(self.filtration,))
-        seen = full_rule(spectrum(known_tube(self.tube, e_max)), known_detector(self.detector))
-        return make_response("known", e_max=e_max, basis="klein-nishina", spectrum=(seen.energies, seen.w1))
+        seen = detected(self.tube, self.detector, e_max)
+        return make_response("known", e_max=e_max, basis="klein-nishina", spectrum=seen)
 
 
 def reconstruct(scan: Scan, settings: Settings) -> Volume:

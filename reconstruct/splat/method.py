@@ -21,7 +21,7 @@ class Options:
     """What any preset may be told; None leaves what the preset says.
 
     The first ones are those of `reconstruct.splat.fast.Settings`, of `published_settings.Settings` those from `basis`
-    on; `response` and `readout` belong to both.
+    on; `response`, `readout`, `tube` and `detector` belong to both.
     """
 
     preset: str = "fast"

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypedDict, get_args
 
 from ctsim.errors import InputError
+from reconstruct.beam import Given, detected, refuse_beam
 from reconstruct.splat import response as responses
 from reconstruct.splat.densify import Schedule
 from reconstruct.splat.loss import TV_SHARE
@@ -52,6 +53,8 @@ class Settings:
     theta: tuple[float, ...] | None = None
     learn_response: bool = True
     e_max: float | None = None
+    tube: Given = None
+    detector: Given = None
     readout: float | Literal["hardened"] | None = None
     held_out: int = 0
     patience: int = 5
@@ -74,6 +77,7 @@ class Settings:
             raise InputError(f"response 'mono' knows one energy: basis must be 'constant', got {self.basis!r}")
         if self.response == "flat" and self.theta is not None:
             raise InputError(f"response 'flat' has no theta, got {self.theta}")
+        refuse_beam(self.response, self.tube, self.detector)
         if isinstance(self.readout, str) and self.readout != "hardened":
             raise InputError(f"readout must be 'hardened' or an energy in keV, got {self.readout!r}")
         if isinstance(self.readout, int | float) and not (math.isfinite(self.readout) and self.readout > 0):
@@ -96,13 +100,14 @@ class Settings:
 
     def make_response(self, e_max: float) -> Response:
         """Build the response for a scan of greatest energy `e_max` (keV)."""
-        flat = self.response == "flat"
+        flat, e_max = self.response == "flat", e_max if self.e_max is None else self.e_max
         return make_response(
             "paper" if self.response == "flat" else self.response,
-            e_max=e_max if self.e_max is None else self.e_max,
+            e_max=e_max,
             basis="klein-nishina" if self.basis == "klein-nishina" else "paper",
             nodes=self.nodes,
             theta=FLAT if flat else self.theta,
+            spectrum=detected(self.tube, self.detector, e_max) if self.response == "known" else None,
         )
 
     @property
@@ -126,6 +131,8 @@ class Changes(TypedDict, total=False):
     theta: tuple[float, ...] | None
     learn_response: bool | None
     e_max: float | None
+    tube: Given
+    detector: Given
     steps: int | None
     seconds: float | None
     seed: int | None
