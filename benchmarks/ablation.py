@@ -7,6 +7,7 @@ share is run once. Steps are a tenth of the published; so the rows compare with 
 
 import statistics
 import sys
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from benchmarks.methods import Method
     from benchmarks.records import Record
     from benchmarks.run import Options, Task
+    from benchmarks.workers import Pool
 
 NAME = "ablation.md"
 # CPU seconds of a step of each preset on this suite, which ends with 65 536 splats, and its share of the warm-up, which
@@ -44,6 +46,8 @@ class Arguments:
     """Only the rows of this table of the paper; may be given several times (default: all)."""
     seconds: float | None = None
     """Time limit of one run, its start included; each run then has a process of its own."""
+    workers: int = 1
+    """Do so many runs at once, each with its share of the cores: these are too small to gain much by threads."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the rows and what they will cost; run nothing."""
 
@@ -68,12 +72,14 @@ def main(arguments: list[str]) -> int:
         return 0
     from benchmarks import make_dataset
     from benchmarks.run import Options
+    from benchmarks.workers import open_pool
 
-    options = Options(seconds=given.seconds, anchor=False)
-    methods_of(listed)  # what cannot run shows before scans are made
+    # what cannot run shows before scans are made
+    options, pool = Options(seconds=given.seconds, anchor=False), open_pool(given.workers, None)
+    methods_of(listed)
     scenes = list(dict.fromkeys(v.scene for v in listed))
-    code = make_dataset.main([ABLATION, str(given.data), "--only", *scenes])
-    return code or _run(given, listed, options)
+    code = make_dataset.main([ABLATION, str(given.data), "--only", *scenes, "--workers", str(given.workers)])
+    return code or _run(given, listed, options, pool)
 
 
 def variants(numbers: tuple[int, ...] = ()) -> list[Variant]:
@@ -104,22 +110,19 @@ def ablations() -> tuple[int, ...]:
     return tuple(table.number for table in load().table if table.suite == ABLATION)
 
 
-def _run(given: Arguments, listed: list[Variant], options: "Options") -> int:
+def _run(
+    given: Arguments, listed: list[Variant], options: "Options", workers: AbstractContextManager["Pool | None"]
+) -> int:
     """Run what has no record, then render tables from all records, also after Ctrl-C."""
-    from tqdm import tqdm
-
     from benchmarks import paper_tables, records, run, tables
+    from benchmarks.cli_run import work
 
     given.results.mkdir(parents=True, exist_ok=True)
     records.repair(given.results / records.NAME)
-    left = run.pending(tasks(listed, given.data), given.results, force=False)
-    ended = []
+    groups = [(task,) for task in run.pending(tasks(listed, given.data), given.results, force=False)]
     try:
-        with tqdm(total=len(left), unit="run", disable=not left) as bar:
-            for record in run.run_all(left, given.results, options):
-                bar.set_postfix_str(f"{record.run.scene} {record.label}: {record.status}")
-                bar.update()
-                ended.append(record.status)
+        with workers as pool:
+            failed = work(groups, given.results, options, pool)
     finally:
         found, _ = records.read_all(given.results)
         if found:
@@ -127,7 +130,7 @@ def _run(given: Arguments, listed: list[Variant], options: "Options") -> int:
     text = paper_tables.text_of(found, "md", "paper", given.table or ablations())
     (given.results / NAME).write_text(text, encoding="utf-8")
     sys.stdout.write(f"{text}\nWritten: {given.results / NAME}; under all protocols table.md\n")
-    return 0 if set(ended) <= {records.OK} else 1
+    return 1 if failed else 0
 
 
 def methods_of(listed: list[Variant]) -> "dict[str, Method]":

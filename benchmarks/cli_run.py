@@ -127,7 +127,7 @@ def _compute(given: Arguments) -> int:
     failed: list[Record] = []
     try:
         with workers as pool:
-            failed = _work(groups, given.results, options, pool)
+            failed = work(groups, given.results, options, pool)
     finally:
         found, _ = records.read_all(given.results)
         if found:
@@ -136,7 +136,7 @@ def _compute(given: Arguments) -> int:
     return 1 if failed else 0
 
 
-def _work(groups: "list[Group]", results: Path, options: "Options", pool: "Pool | None") -> "list[Record]":
+def work(groups: "list[Group]", results: Path, options: "Options", pool: "Pool | None") -> "list[Record]":
     """Do the runs behind a progress bar, the tables following them; return the records of those that failed.
 
     Beside the last run that ended it says how far the fit is that runs in this process, where a method tells.
