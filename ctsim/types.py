@@ -1,6 +1,7 @@
 """The values that travel down the street: Phantom, Scanner, Scan, Volume, Status."""
 
 import enum
+import math
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -112,6 +113,21 @@ class Scan:
             raise InputError(f"flat has shape {tuple(self.flat.shape)}, the detector {self.geometry.n_detector}")
         if self.metal is not None and tuple(self.metal.shape) != self.geometry.n_voxel:
             raise InputError(f"metal has shape {tuple(self.metal.shape)}, the volume {self.geometry.n_voxel}")
+
+    @classmethod
+    def from_line_integrals(
+        cls, p: torch.Tensor | NDArray[np.floating], geometry: Geometry, *, e_max: float, i0: float = 1e5
+    ) -> "Scan":
+        """Return the scan whose −log projections are `p` [view, v, u], for measurements that are no longer counts.
+
+        `i0` is how many photons an open pixel saw: readings below half a photon, p above ln(2 i0), count as nothing
+        seen, as do those that are not finite. Raises InputError where shapes disagree or `i0` is not positive.
+        """
+        if not (math.isfinite(i0) and i0 > 0):
+            raise InputError(f"i0 must be photons above 0, got {i0}")
+        counts = i0 * torch.exp(-torch.as_tensor(p, dtype=torch.float64))
+        flat = torch.full(geometry.n_detector, i0, dtype=torch.float32)
+        return cls(geometry=geometry, counts=counts.float(), flat=flat, i0=i0, e_max=e_max)
 
 
 class Status(enum.StrEnum):

@@ -200,6 +200,20 @@ def test_line_integrals_undo_the_exponential():
     assert torch.equal(one, q[1])
 
 
+def test_line_integrals_of_one_s_own_come_back():
+    p = torch.linspace(-0.02, 11, 3 * 5 * 7).reshape(SMALL.shape)  # open pixels lie on both sides of 0
+    p[0, 0, :2] = torch.tensor([13.0, torch.nan])  # beyond ln(2e5) = 12.2, and none at all
+    scan = Scan.from_line_integrals(p.numpy(), SMALL, e_max=80.0)
+    q, clamped = line_integrals(scan, slice(None))
+    # counts are rounded to 2⁻²⁴ of themselves, their logarithm and that of the open field, up to 11.5, to 2⁻²¹
+    torch.testing.assert_close(q[~clamped], p[~clamped], rtol=0, atol=2**-24 + 3 * 2**-21)
+    assert clamped.sum() == 2 and clamped[0, 0, :2].all() and (scan.e_max, scan.i0) == (80.0, 1e5)
+    with pytest.raises(InputError, match="counts have shape"):
+        Scan.from_line_integrals(p[0], SMALL, e_max=80.0)
+    with pytest.raises(InputError, match="i0 must be photons above 0, got 0"):
+        Scan.from_line_integrals(p, SMALL, e_max=80.0, i0=0.0)
+
+
 def test_integer_counts_give_the_same_logarithms():
     counts = torch.arange(3 * 5 * 7).reshape(SMALL.shape) * 90 + 20
     whole, low = line_integrals(make_scan(SMALL, counts.to(torch.uint16), dark=200.0), slice(None))

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks import cli, cli_run, host, stress_records, tables
+from benchmarks import cli, cli_run, host, make_dataset, stress_records, tables
 from ctsim.errors import InputError
 from reports import figures, kept, markdown, report, slices, view
 
@@ -32,6 +32,15 @@ def results(smallest, tmp_path_factory):
     folder = tmp_path_factory.mktemp("reports") / "tiny"
     assert cli_run.main([str(smallest), str(folder), *(w for m in METHODS for w in ("--method", m))]) == 0
     return folder
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory):
+    """The suite `quick` and its results, as a new user has them: two folders."""
+    data, found = (tmp_path_factory.mktemp("quick") / name for name in ("data", "results"))
+    assert make_dataset.main(["quick", str(data)]) == 0
+    assert cli_run.main([str(data), str(found), *(w for m in METHODS for w in ("--method", m))]) == 0
+    return data, found
 
 
 @pytest.fixture(scope="module")
@@ -385,7 +394,6 @@ def test_a_state_that_cannot_be_shown_is_refused(case, change, words):
 
 
 def test_the_viewers_controls_redraw(case):
-    pytest.importorskip("ipywidgets", reason="the viewer needs the extra notebook")
     box = view.viewer(case)
     *controls, screen = box.children
     named = {control.description: control for control in controls}
@@ -422,13 +430,13 @@ def notebook(name, data, results, figures_folder):
 @pytest.mark.parametrize(
     ("name", "n_figures", "words"),
     [
-        ("results", 4, "## anchored"),
+        ("results", 6, "## anchored"),
         ("metrics", 1, "| protocol paper |"),
         ("physics", 5, "Measured over predicted standard deviation"),
     ],
 )
-def test_a_notebook_runs_as_a_script(name, n_figures, words, smallest, results, tmp_path):
-    said = notebook(name, smallest, results, tmp_path)
+def test_a_notebook_runs_as_a_script(name, n_figures, words, quick, tmp_path):
+    said = notebook(name, *quick, tmp_path)
     assert words in said and len(list(tmp_path.glob(f"{name}-*.png"))) == n_figures
 
 
