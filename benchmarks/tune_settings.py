@@ -1,13 +1,15 @@
-"""What the settings of the total-variation methods are worth, one changed at a time from the defaults.
+"""What the settings of methods are worth, one changed at a time from the defaults.
 
-    python -m benchmarks.tune_tv DATA OUT [METHOD …]
+    python -m benchmarks.tune_settings DATA OUT [METHOD …]
 
-DATA is a dataset of scenes that stand in no table (`make-dataset tune DATA`). A line of OUT/tv.csv holds a method, its
-settings, the iterations done, and by scene PSNR3D in dB under the protocols `tissue` and `aligned` (effective
-spectrum). Iterations need no runs of their own: the volume is scored as it passes each number.
+DATA is a dataset of scenes that stand in no table (`make-dataset tune DATA`). A line of OUT/settings.csv holds a
+method, its settings, the iterations done, and by scene PSNR3D in dB under the protocols `tissue` and `aligned`
+(effective spectrum). Iterations need no runs of their own: the volume is scored as it passes each number. The passes of
+`splat` are a setting, since the last one differs from the others.
 """
 
 import csv
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,19 +17,25 @@ from typing import Any
 import numpy as np
 import torch
 
-from baselines.iterative import watch
 from benchmarks import metrics
 from benchmarks.cli import guarded
 from benchmarks.methods import Method, find
 from benchmarks.protocol import Truth, tissue_range, truth_of
 from ctsim.errors import InputError
 from ctsim.store import StoredScan, list_scans, open_scan
+from reconstruct.watch import watch
 
-STOPS: dict[str, tuple[int, ...]] = {"fista-tv": (25, 50, 100), "asd-pocs": (5, 10, 20), "awpcsd": (5, 10, 20)}
-VALUES: dict[str, dict[str, tuple[float, ...]]] = {
+STOPS: dict[str, tuple[int, ...]] = {
+    "fista-tv": (25, 50, 100),
+    "asd-pocs": (5, 10, 20),
+    "awpcsd": (5, 10, 20),
+    "splat": (),
+}
+VALUES: dict[str, dict[str, tuple[Any, ...]]] = {
     "fista-tv": {"tv": (0.0006, 0.0012, 0.005), "tv_iterations": (10, 40)},
     "asd-pocs": {"alpha": (0.005, 0.01, 0.05), "tv_steps": (10, 40)},
     "awpcsd": {"alpha": (0.01, 0.05), "delta": (0.5, 1.0, 4.0), "tv_steps": (10, 40)},
+    "splat": {"passes": ((3, 2), (3, 8), (8, 4)), "tv": (0.0, 0.03, 0.08, 0.12), "fineness": (1.0, 1.25)},
 }
 PROTOCOLS = ("tissue", "aligned")
 
@@ -41,19 +49,21 @@ def main(arguments: list[str]) -> int:
     out = Path(arguments[1])
     out.mkdir(parents=True, exist_ok=True)
     names = [f"{stored.name} {protocol}" for stored in scenes for protocol in PROTOCOLS]
-    with (out / "tv.csv").open("w", encoding="utf-8", newline="") as file:
+    with (out / "settings.csv").open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["method", "setting", "iterations", *names])
         for name in arguments[2:] or STOPS:
             for setting in settings(name):
-                method = find(name, {**setting, "iterations": STOPS[name][-1]})
+                effort = {"iterations": STOPS[name][-1]} if STOPS[name] else {}
+                method = find(name, {**setting, **effort})
                 curves = [curve(method, *scene) for scene in zip(scenes, truths, strict=True)]
-                for stop in STOPS[name]:
+                words = ", ".join(f"{k}={v}" for k, v in setting.items()) or "defaults"
+                for stop in STOPS[name] or (math.inf,):
                     # a method that ended early stays where it was
                     scores = [f"{s:.2f}" for c in curves for s in c[max(k for k in c if k <= stop)]]
-                    words = ", ".join(f"{k}={v:g}" for k, v in setting.items()) or "defaults"
-                    writer.writerow([name, words, stop, *scores])
-                    sys.stdout.write(f"{name} {words} {stop}: {' '.join(scores)}\n")
+                    done = stop if STOPS[name] else ""
+                    writer.writerow([name, words, done, *scores])
+                    sys.stdout.write(f"{name} {words} {done}: {' '.join(scores)}\n")
                 file.flush()
     return 0
 
@@ -89,4 +99,4 @@ def psnrs(values: np.ndarray, truth: Truth) -> list[float]:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded("tune_tv", "benchmarks.tune_tv", sys.argv[1:]))
+    sys.exit(guarded("tune_settings", "benchmarks.tune_settings", sys.argv[1:]))
