@@ -27,7 +27,8 @@ _RESULT, _VALUES, _SHOWN = "outcome.json", "values.npy", "intermediates.npz"
 class Outcome:
     """How a run ended: its status and reason, the volume [z, y, x] float32 in 1/mm if any, and its cost.
 
-    `intermediates` are what the method worked with, for pictures (`benchmarks.intermediates`).
+    `intermediates` are what the method worked with, for pictures (`benchmarks.intermediates`); `details` what it says
+    of its result, for the record (`benchmarks.details`).
     """
 
     status: str
@@ -35,6 +36,7 @@ class Outcome:
     values: NDArray[np.float32] | None = None
     cost: Cost | None = None
     intermediates: Intermediates = field(default_factory=dict)
+    details: dict[str, Any] = field(default_factory=dict)
 
 
 class _Ended(msgspec.Struct, frozen=True, kw_only=True):
@@ -43,6 +45,7 @@ class _Ended(msgspec.Struct, frozen=True, kw_only=True):
     status: str
     reason: str
     cost: Cost | None
+    details: dict[str, Any]
 
 
 def _work(store: str, folder: str, variant: str, method: "Method", device: str, out: str) -> None:
@@ -58,7 +61,7 @@ def _work(store: str, folder: str, variant: str, method: "Method", device: str, 
     if outcome.intermediates:
         intermediates.write(Path(out) / _SHOWN, outcome.intermediates, "")
     cost = None if outcome.cost is None else msgspec.structs.replace(outcome.cost, isolated=True)
-    ended = _Ended(status=outcome.status, reason=outcome.reason, cost=cost)
+    ended = _Ended(status=outcome.status, reason=outcome.reason, cost=cost, details=outcome.details)
     (Path(out) / _RESULT).write_bytes(msgspec.json.encode(ended))
 
 
@@ -99,4 +102,11 @@ def _collect(out: Path, exit_code: int) -> Outcome:
     ended = msgspec.json.decode((out / _RESULT).read_bytes(), type=_Ended)
     values = np.load(out / _VALUES) if (out / _VALUES).exists() else None
     shown = intermediates.read(out / _SHOWN, "")
-    return Outcome(status=ended.status, reason=ended.reason, values=values, cost=ended.cost, intermediates=shown)
+    return Outcome(
+        status=ended.status,
+        reason=ended.reason,
+        values=values,
+        cost=ended.cost,
+        intermediates=shown,
+        details=ended.details,
+    )

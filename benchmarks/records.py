@@ -65,7 +65,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     `label` is the method with the parameters that differ from its defaults; `inputs` what the method
     needs beside the counts; `volume` the path of the kept volume relative to the results folder; `place`
-    the numbers of the scan in its dataset and of the method in its command, by which tables are ordered.
+    the numbers of the scan in its dataset and of the method in its command, by which tables are ordered;
+    `details` what the method says of its result (`benchmarks.details`).
     """
 
     identity: str
@@ -81,6 +82,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     host: Host | None = None
     commit: str = "unknown"
     time: str = ""
+    details: dict[str, Any] = {}
 
 
 class Torn(msgspec.Struct, frozen=True, kw_only=True):

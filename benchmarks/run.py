@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from benchmarks import artefact, intermediates, records
+from benchmarks import artefact, details, intermediates, records
 from benchmarks.host import commit, host, measured
 from benchmarks.isolate import Outcome, run_apart
 from benchmarks.judge import Judge, Twin
@@ -248,7 +248,7 @@ def describe(error: BaseException) -> str:
 def attempt(method: Method, scan: "Scan", device: str, warm_up_seconds: float) -> Outcome:
     """Run a method in this process and turn whatever happens into an outcome."""
     cost: dict[str, Any] = {"device": device, "warm_up": warm_up_seconds}
-    values, shown = None, {}
+    values, shown, said = None, {}, {}
     with measured() as usage:
         try:
             volume = method.reconstruct(scan, device)
@@ -256,13 +256,14 @@ def attempt(method: Method, scan: "Scan", device: str, warm_up_seconds: float) -
             values = np.asarray(volume.values.detach().cpu().numpy(), np.float32)
             cost["view_updates"] = int(volume.details.get("view_updates", scan.geometry.n_views))
             shown = intermediates.taken(volume.details, scan.geometry)
+            said = details.kept(volume.details)
         except MemoryError as error:
             status, reason = "out_of_memory", describe(error)
         except Exception as error:  # a method's failure is a result
             log.debug("method %s failed", method.name, exc_info=True)
             out_of_memory = type(error).__name__ == "OutOfMemoryError"  # torch's, for devices
             status, reason = "out_of_memory" if out_of_memory else "error", describe(error)
-    outcome = Outcome(status=status, reason=reason, values=values, intermediates=shown)
+    outcome = Outcome(status=status, reason=reason, values=values, intermediates=shown, details=said)
     outcome.cost = Cost(wall=usage.wall, cpu=usage.cpu, peak_bytes=usage.peak_bytes, **{"view_updates": 0, **cost})
     return checked(outcome, scan.geometry.n_voxel)
 
@@ -352,4 +353,5 @@ def describe_run(task: Task, outcome: Outcome, scores: dict[str, Score], kept: s
         host=host(),
         commit=commit(),
         time=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        details=outcome.details,
     )

@@ -33,6 +33,13 @@ def test_append_and_read_give_the_same_records(tmp_path):
     assert path.read_bytes().count(b"\n") == 2
 
 
+def test_records_of_before_there_were_details_are_read(tmp_path):
+    path = tmp_path / records.NAME
+    records.append(path, record())
+    path.write_bytes(path.read_bytes().replace(b',"details":{}', b""))
+    assert b"details" not in path.read_bytes() and records.read(path) == ([record()], None)
+
+
 def test_every_field_of_a_run_changes_its_identity():
     changes = {
         "scene": "teeth", "scene_id": "x", "scan": "x", "seed": 1, "method": "nmar", "params": {"a": 2, "b": 2.5},

@@ -200,6 +200,21 @@ def shows(scan, *, device, entries=("view", "trace", "projection", "prior")):
     return Volume(values=good(scan, device=device).values, details={"intermediates": {k: found[k] for k in entries}})
 
 
+class Odd:
+    pass
+
+
+def talks(scan, *, device):
+    details = {
+        "read-out": np.str_("at Ē = 1"), "misfit": np.float32(0.5), "loss": float("nan"), "on": np.bool_(True),
+        "course": (1.0, float("inf"), np.int64(3)), "nothing": None, "empty": {},
+        "response": {"eta": [0.25, 0.75], "table": np.ones(3), 7: "no word", "theta": []},
+        "densities": {"rho_a": torch.ones(2, 3), "rho_b": np.ones((2, 3))}, "lists": [1, np.ones(3)],
+        "object": Odd(), "complex": 1j, "long": "x" * 10_000, "half": "\ud800", "huge": 10**5000, "view_updates": 12,
+    }  # fmt: skip
+    return Volume(values=good(scan, device=device).values, details=details)
+
+
 def kept(results, record):
     return intermediates.read(intermediates.path_of(results / record.volume), record.identity)
 
@@ -229,6 +244,18 @@ def test_what_a_method_worked_with_is_kept_beside_its_volume(tmp_path, isolate):
     (tmp_path / "volumes" / "box__test_run_shows.npz").write_bytes(b"PK damaged")
     with pytest.raises(InputError, match="cannot be read"):
         kept(tmp_path, record)
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_a_record_keeps_what_a_method_says_of_its_result(tmp_path, isolate):
+    record = once("talks", tmp_path, isolate=isolate)
+    assert record.status == "ok" and record.cost.isolated == isolate and record.cost.view_updates == 12
+    assert record.details == {
+        "read-out": "at Ē = 1", "misfit": 0.5, "loss": None, "on": True, "course": [1.0, None, 3], "nothing": None,
+        "empty": {}, "response": {"eta": [0.25, 0.75], "theta": []},
+    }  # fmt: skip
+    assert records.read(tmp_path / records.NAME)[0] == [record]
+    assert once("broken", tmp_path, isolate=isolate).details == {}
 
 
 def test_panels_hold_what_each_method_gave():

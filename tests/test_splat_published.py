@@ -93,7 +93,9 @@ def test_progress_says_where_the_fit_stands():
 
 def test_the_response_is_learned_only_where_it_is_to_be():
     def theta(**changes):
-        return reconstruct(sphere(), steps=20, n_splats=200, **changes).details["response"]["theta"]
+        found = reconstruct(sphere(), steps=20, n_splats=200, **changes).details["response"]
+        assert changes.get("response", found["name"]) == found["name"] and sum(found["eta"]) == pytest.approx(1)
+        return found["theta"]
 
     learned = theta()
     assert learned != [0.2, 1.0] and learned == pytest.approx([0.2, 1.0], abs=0.021)  # 20 steps of at most 1e-3

@@ -1,6 +1,7 @@
 """The splats' polychromatic response against float64, closed forms and its own invariances."""
 
 import dataclasses
+import json
 import math
 from typing import get_args
 
@@ -65,6 +66,23 @@ def test_the_kernel_agrees_with_float64(name, basis):
         np.testing.assert_allclose(p, p64, rtol=NEAR, atol=NEAR)
         np.testing.assert_allclose(dp_da, a64, rtol=NEAR)
         np.testing.assert_allclose(dp_db, b64, rtol=NEAR)
+
+
+@pytest.mark.parametrize("name, basis", CASES)
+def test_p_can_be_computed_from_what_is_told_of_a_response(name, basis):
+    response = build(name, basis)
+    said = json.loads(json.dumps(response.described(), allow_nan=False))
+    assert (said["name"], said["basis"], said["e_max"]) == (name, basis, E_MAX)
+    assert said["theta"] == list(response.trainable)
+    np.testing.assert_array_equal(said["energies_kev"], response.energies_kev)
+    la, lb, _ = pixels((61, 73))
+    by_hand = sum(
+        eta * np.exp(-a * la.astype(np.float64) - b * lb.astype(np.float64))
+        for a, b, eta in zip(said["a"], said["b"], said["eta"], strict=True)
+    )
+    # JSON keeps float64 as it is, so what is left is float32 of `evaluate`: a relative error of the sum, which is an
+    # absolute one of its logarithm, and P's own rounding
+    np.testing.assert_allclose(evaluate(response, la, lb)[0], -np.log(by_hand), rtol=NEAR, atol=NEAR)
 
 
 @pytest.mark.parametrize("name, basis", CASES)

@@ -111,7 +111,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
 
     fit = None if bool(clamped.all()) else _coarse_to_fine(data, response, settings, proceed)
     details: dict[str, Any] = {
-        "response": {"name": response.name, "theta": list(response.trainable)},
+        "response": response.described(),
         "scatter": scatter,
         "clamped_pixels": int(clamped.sum()),
         "splats": 0 if fit is None else len(fit.lattice),

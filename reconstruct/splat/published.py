@@ -160,7 +160,7 @@ class _Run:
             "splats": len(splats),
             "view_updates": self.done,
             "seconds": self.stopwatch.seconds,
-            "response": {"name": self.settings.response, "theta": list(response.trainable)},
+            "response": response.described() | {"name": self.settings.response},
             "densities": {f"rho_{c}": density for c, density in zip(self.settings.channels, densities, strict=True)},
         }
         if self.held_out:

@@ -13,7 +13,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -62,6 +62,12 @@ class Response:
     weights: Array
     eta: Array
     trainable: tuple[float, ...] = ()
+
+    def described(self) -> dict[str, Any]:
+        """Return what P is computed from in the types of JSON: names, θ as "theta", and lists over the nodes."""
+        nodes = {"energies_kev": self.energies_kev, "a": self.a, "b": self.b, "eta": self.eta}
+        head = {"name": self.name, "theta": list(self.trainable), "basis": self.basis, "e_max": self.e_max}
+        return head | {name: values.tolist() for name, values in nodes.items()}
 
     def bounds(self) -> Array:
         """Return the least and the greatest value of every parameter [T, 2]."""
