@@ -86,6 +86,11 @@ def commit() -> str:
         return "unknown"
 
 
+def certain(commit: str) -> bool:
+    """Say whether a commit tells what code ran: it is known, and no file differed from it."""
+    return commit != "unknown" and not commit.endswith("+changes")
+
+
 @dataclass(slots=True)
 class Usage:
     """What a block of code took; filled when the block ends. Seconds and bytes."""

@@ -12,13 +12,13 @@ from typing import Any
 import msgspec
 
 from benchmarks import methods, records
+from benchmarks.costs import listing
 from benchmarks.devices import check_device
 from benchmarks.isolate import Outcome
 from benchmarks.records import OK, Record
 from benchmarks.run import Options, Runner, Task, describe_run, run_all
 from benchmarks.workers import Lost, Pool
 from ctsim.errors import InputError
-from ctsim.human import human_time
 
 Group = tuple[Task, ...]
 """The runs of one method on one scan: on its twin without metal first, which the second is judged by."""
@@ -64,18 +64,8 @@ def text(groups: list[Group], n_listed: int, costs: Costs) -> str:
     """Return what --dry-run prints: the runs in their order with the seconds expected of each, and their sum."""
     left = [task for group in groups for task in group]
     names = [task.stored.name + ("" if task.variant == "metal" else " (metal-free)") for task in left]
-    seconds = [costs.task(task) for task in left]
-    wide, long = (max((len(t) for t in column), default=0) for column in ([t.method.label for t in left], names))
-    lines = [
-        f"{task.method.label:{wide}}  {name:{long}}  {'unknown' if cost is None else human_time(cost)}"
-        for task, name, cost in zip(left, names, seconds, strict=True)
-    ]
-    unknown = dict.fromkeys(t.method.label for t, cost in zip(left, seconds, strict=True) if cost is None)
-    lines.append(
-        f"total: {len(left)} of {n_listed} runs, {human_time(sum(s for s in seconds if s is not None))} by the records "
-        "of earlier runs, without warm-up and scoring" + (f"; never run: {', '.join(unknown)}" if unknown else "")
-    )
-    return "\n".join(lines) + "\n"
+    rows = [(task.method.label, name, costs.task(task)) for task, name in zip(left, names, strict=True)]
+    return listing(rows, n_listed, "runs", "by the records of earlier runs, without warm-up and scoring")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,15 +5,19 @@ that cases can be measured one by one. What this commit recorded on this machine
 """
 
 import dataclasses
+import importlib
 import sys
 import tempfile
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import tyro
 
 from ctsim.errors import InputError
+
+if TYPE_CHECKING:
+    from benchmarks.host import Host
 
 Case = Literal[
     "materials", "bricks", "rays", "energies", "edges", "scatter", "twin", "truth",
@@ -21,6 +25,11 @@ Case = Literal[
 ]  # fmt: skip
 CASES: tuple[Case, ...] = get_args(Case)
 NAME = "skipping.jsonl"
+# seconds of one run both ways at size core, on two idle cores (docs/skipping.md)
+SECONDS: dict[Case, float] = {
+    "materials": 0.45, "bricks": 1.7, "rays": 0.53, "energies": 0.88, "edges": 2.4, "scatter": 0.41, "twin": 0.48,
+    "truth": 0.51, "metal-free": 4.7, "rows": 2.9, "scan": 6.4, "record": 7.8,
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +49,10 @@ class Arguments:
     """The scene lung-Fe of the suite core, or tiny grids that prove the command and say nothing about speed."""
     force: tyro.conf.FlagCreatePairsOff[bool] = False
     """Measure again what is recorded of this commit on this machine."""
+    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print what is left to measure and about how long it takes; measure nothing."""
+    table: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Only render the table from the records, computing nothing."""
 
 
 def main(argv: list[str]) -> int:
@@ -47,38 +60,72 @@ def main(argv: list[str]) -> int:
     given = tyro.cli(Arguments, prog="run-benchmark skipping", args=argv)
     if given.repeats < 1:
         raise InputError(f"--repeats must be at least 1, got {given.repeats}")
-    given.results.mkdir(parents=True, exist_ok=True)
+    wanted = tuple(dict.fromkeys(given.case)) or CASES
+    if given.dry_run:
+        sys.stdout.write(_planned(given, wanted))
+        return 0
+    if not given.table:
+        given.results.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix="ctsim-skipping-") as folder:
+            _measure(given, wanted, Path(folder))
+    return _report(given, wanted)
+
+
+def _report(given: Arguments, wanted: tuple[Case, ...]) -> int:
+    """Write and print the table of all records; return 1 if a wanted case has a difference beyond what is stated."""
     from benchmarks import skipping_tables
 
-    wanted = tuple(dict.fromkeys(given.case)) or CASES
-    with tempfile.TemporaryDirectory(prefix="ctsim-skipping-") as folder:
-        _measure(given, wanted, Path(folder))
-    stored = skipping_tables.latest(skipping_tables.read(given.results / NAME), given.size, CASES)
+    path = given.results / NAME
+    stored = skipping_tables.latest(skipping_tables.read(path), given.size, CASES)
+    if not stored:
+        raise InputError(f"{path}: there are no records of size {given.size}; run without --table first")
     text = skipping_tables.render(stored)
     (given.results / "skipping.md").write_text(text, encoding="utf-8")
     sys.stdout.write(text + f"\nWritten: {given.results}/skipping.md; records in {NAME}\n")
     return 0 if all(r.measured.held for r in stored if r.measured.case in wanted) else 1
 
 
+def _left(given: Arguments, wanted: tuple[Case, ...]) -> "tuple[list[Case], tuple[Host, str]]":
+    """Return the wanted cases that are not recorded, and where and by what code: (host, commit)."""
+    importlib.import_module("numba")  # so that `host` counts the kernels' threads
+    from benchmarks import host, skipping_tables
+
+    at = host.host(), host.commit()  # of the code that is loaded, whatever is committed meanwhile
+    path = given.results / NAME
+    known = set() if given.force else skipping_tables.known(path, given.size, given.repeats, at)
+    return [case for case in wanted if case not in known], at
+
+
+def _planned(given: Arguments, wanted: tuple[Case, ...]) -> str:
+    """Return what --dry-run prints; seconds are from records of this size, else those measured once at core's."""
+    from benchmarks import costs, skipping_tables
+
+    stored = skipping_tables.latest(skipping_tables.read(given.results / NAME), given.size, CASES)
+    usual: dict[Case, float] = SECONDS if given.size == "core" else {}
+    once = usual | skipping_tables.seconds(stored)
+    n_runs = given.repeats + 1  # the first does not count
+    left, _ = _left(given, wanted)
+    rows = [(case, f"{n_runs} runs both ways", n_runs * once[case] if case in once else None) for case in left]
+    return costs.listing(rows, len(wanted), "cases", "without compiling and preparing (a minute for all cases)")
+
+
 def _measure(given: Arguments, wanted: tuple[Case, ...], folder: Path) -> None:
     """Measure the wanted cases that are not recorded; a case is stored as soon as it is measured."""
-    from benchmarks import host, skipping_cases, skipping_methods, skipping_tables
+    from benchmarks import lines, skipping_cases, skipping_methods, skipping_tables
 
-    path = given.results / NAME
-    here, now = host.host(), host.commit()  # of the code that is loaded, whatever is committed meanwhile
-    known = set() if given.force else skipping_tables.known(path, given.size, given.repeats, (here, now))
+    left, (here, now) = _left(given, wanted)
+    for case in wanted:
+        if case not in left:
+            sys.stderr.write(f"{case}: recorded already\n")
     setup = skipping_cases.Setup(size=given.size, repeats=given.repeats, folder=folder)
     cases = skipping_cases.CASES | skipping_methods.CASES
     began = datetime.now(UTC).isoformat(timespec="microseconds")
-    for case in wanted:
-        if case in known:
-            sys.stderr.write(f"{case}: recorded already\n")
-            continue
+    for case in left:
         sys.stderr.write(f"{case} …\n")
         measured = [pair.measure(given.repeats) for pair in cases[case](setup)]
         time = datetime.now(UTC).isoformat(timespec="seconds")
-        for one in measured:
-            record = skipping_tables.SkipRecord(
-                measured=one, size=given.size, host=here, commit=now, time=time, run=began
-            )
-            skipping_tables.append(path, record)
+        records = [
+            skipping_tables.SkipRecord(measured=one, size=given.size, host=here, commit=now, time=time, run=began)
+            for one in measured
+        ]
+        lines.append(given.results / NAME, *records)

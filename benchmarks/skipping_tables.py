@@ -1,14 +1,13 @@
 """Records of `run-benchmark skipping` and their table."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
 import msgspec
 
-from benchmarks.host import Host
-from ctsim.errors import InputError
+from benchmarks import lines
+from benchmarks.host import Host, certain
 
 CORE = "core"
 
@@ -53,28 +52,9 @@ class SkipRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     run: str
 
 
-def append(path: Path, record: SkipRecord) -> None:
-    """Append one JSON line and force it to the disk."""
-    with path.open("ab") as file:
-        file.write(msgspec.json.encode(record) + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
-
-
 def read(path: Path) -> list[SkipRecord]:
-    """Read the records of a skipping file; one that is not there has none.
-
-    Raises InputError where a line is no record.
-    """
-    if not path.exists():
-        return []
-    decoder, found = msgspec.json.Decoder(SkipRecord), []
-    for number, line in enumerate(path.read_bytes().splitlines(), 1):
-        try:
-            found.append(decoder.decode(line))
-        except msgspec.MsgspecError as error:
-            raise InputError(f"{path}, line {number}: expected a record of run-benchmark skipping: {error}") from None
-    return found
+    """Read the records of a skipping file (see `lines.read`)."""
+    return lines.read(path, SkipRecord, "a record of run-benchmark skipping")
 
 
 def known(path: Path, size: str, repeats: int, at: tuple[Host, str]) -> set[str]:
@@ -82,10 +62,18 @@ def known(path: Path, size: str, repeats: int, at: tuple[Host, str]) -> set[str]
 
     Code that differs from its commit, or has none, knows nothing.
     """
-    if at[1] == "unknown" or at[1].endswith("+changes"):
+    if not certain(at[1]):
         return set()
     found = [r for r in read(path) if (r.size, r.host, r.commit) == (size, *at)]
     return {r.measured.case for r in found if len(r.measured.skipping) >= repeats}
+
+
+def seconds(records: Sequence[SkipRecord]) -> dict[str, float]:
+    """Return what one run both ways takes of each case, all of its pairs together, as in the records of `latest`."""
+    found: dict[str, float] = {}
+    for m in (record.measured for record in records):
+        found[m.case] = found.get(m.case, 0.0) + median(m.skipping) + median(m.whole)
+    return found
 
 
 def latest(records: Sequence[SkipRecord], size: str, order: Sequence[str]) -> list[SkipRecord]:

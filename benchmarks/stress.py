@@ -91,7 +91,7 @@ def _work(left: "list[Case]", side: int, given: Arguments) -> None:
     """Carry out the rows that are left; each is stored as it ends."""
     from tqdm import tqdm
 
-    from benchmarks import host, stress_records
+    from benchmarks import host, lines, stress_records
     from benchmarks.stress_worker import Worker
 
     commit, machine = host.commit(), host.host()  # of the code that is loaded, whatever is committed meanwhile
@@ -100,9 +100,7 @@ def _work(left: "list[Case]", side: int, given: Arguments) -> None:
             bar.set_postfix_str(f"{case.name}, {case.subject}")
             outcome = worker.run(case, side)
             by = (machine, commit, datetime.now(UTC).isoformat(timespec="seconds"))
-            stress_records.append(
-                given.results / stress_records.NAME, stress_records.record_of(case, side, outcome, by)
-            )
+            lines.append(given.results / stress_records.NAME, stress_records.record_of(case, side, outcome, by))
             if not outcome.ok:
                 tqdm.write(f"{case.name}, {case.subject}: {outcome.found}", file=sys.stderr)
 

@@ -1,16 +1,15 @@
 """Records of `run-benchmark stress`, one JSON line a row, and the table of them."""
 
 import hashlib
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 
+from benchmarks import lines
 from benchmarks.host import Host
 from benchmarks.stress_cases import Case, Outcome
 from benchmarks.texts import escape
-from ctsim.errors import InputError
 
 NAME, TABLE_NAME = "stress.jsonl", "stress.md"
 
@@ -60,37 +59,9 @@ def record_of(case: Case, side: int, outcome: Outcome, by: tuple[Host, str, str]
     )
 
 
-def append(path: Path, record: StressRecord) -> None:
-    """Append one line and force it to the disk; the rest of a line whose writing was interrupted is cut off first."""
-    if path.exists() and (whole := _whole(data := path.read_bytes())) < len(data):
-        os.truncate(path, whole)
-    with path.open("ab") as file:
-        file.write(msgspec.json.encode(record) + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _whole(data: bytes) -> int:
-    """Return how many bytes are whole lines."""
-    return data.rfind(b"\n") + 1
-
-
 def read(path: Path) -> list[StressRecord]:
-    """Read the records, none where there is no file; the rest of a line that was interrupted is left out.
-
-    Raises InputError where a whole line is no record.
-    """
-    if not path.exists():
-        return []
-    data = path.read_bytes()
-    whole = _whole(data)
-    decoder, found = msgspec.json.Decoder(StressRecord), []
-    for number, line in enumerate(data[:whole].splitlines(), 1):
-        try:
-            found.append(decoder.decode(line))
-        except msgspec.MsgspecError as error:
-            raise InputError(f"{path}, line {number}: expected a row of run-benchmark stress: {error}") from None
-    return found
+    """Read the rows of a stress file (see `lines.read`)."""
+    return lines.read(path, StressRecord, "a row of run-benchmark stress")
 
 
 def latest(records: Sequence[StressRecord], wanted: Sequence[str]) -> list[StressRecord]:
@@ -116,20 +87,20 @@ def render(records: Sequence[StressRecord]) -> str:
 
 def by_case(records: Sequence[StressRecord]) -> list[str]:
     """Return the lines of a table of the cases, with how many of their rows are as expected."""
-    lines = ["| case | what | rows | as expected | s |", "|---|---|--:|--:|--:|"]
+    out = ["| case | what | rows | as expected | s |", "|---|---|--:|--:|--:|"]
     for name in dict.fromkeys(r.case for r in records):
         rows = [r for r in records if r.case == name]
         seconds = sum(r.seconds for r in rows)
-        lines.append(f"| {name} | {rows[-1].what} | {len(rows)} | {sum(r.ok for r in rows)} | {seconds:.1f} |")
-    return lines
+        out.append(f"| {name} | {rows[-1].what} | {len(rows)} | {sum(r.ok for r in rows)} | {seconds:.1f} |")
+    return out
 
 
 def _rows(records: Sequence[StressRecord]) -> list[str]:
-    lines = ["| case | subject | what | expected | found | ok |", "|---|---|---|---|---|---|"]
+    out = ["| case | subject | what | expected | found | ok |", "|---|---|---|---|---|---|"]
     for r in records:
         cells = (r.case, r.subject, r.what, r.expected, r.found)
-        lines.append("| " + " | ".join(escape(c, "md") for c in cells) + f" | {'yes' if r.ok else 'NO'} |")
-    return lines
+        out.append("| " + " | ".join(escape(c, "md") for c in cells) + f" | {'yes' if r.ok else 'NO'} |")
+    return out
 
 
 def _provenance(record: StressRecord) -> str:

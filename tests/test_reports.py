@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks import cli, cli_run, host, make_dataset, stress_records, tables
+from benchmarks import cli, cli_run, host, lines, make_dataset, stress_records, tables
 from ctsim.errors import InputError
 from reports import figures, kept, markdown, report, slices, view
 
@@ -447,7 +447,7 @@ def test_the_stability_notebook_shows_what_the_stress_suite_recorded(smallest, t
             identity=found, case="starved", subject="fdk" if "older" in found or ok else "nmar", ok=ok, found=found,
             host=host.host(), commit="0" * 40, **common,
         )  # fmt: skip
-        stress_records.append(tmp_path / stress_records.NAME, record)
+        lines.append(tmp_path / stress_records.NAME, record)
     said = notebook("stability", smallest, tmp_path, tmp_path)
     assert "1 of 2 rows are as expected" in said and "- starved, nmar: 3 values are not finite" in said
     assert "older" not in said and (tmp_path / "stability-stress.png").exists()

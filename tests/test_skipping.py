@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks import cli, host, make_dataset, skipping, skipping_cases, skipping_methods, skipping_tables
+from benchmarks import cli, host, lines, make_dataset, skipping, skipping_cases, skipping_methods, skipping_tables
 from benchmarks.skipping_cases import Pair, Setup
 from ctsim.bricks import MIXED
 from ctsim.errors import InputError
@@ -101,6 +101,57 @@ def test_an_interrupted_command_goes_on_from_the_case_it_was_in(tmp_path, monkey
     monkeypatch.setattr(host, "commit", lambda: "a" * 40 + "+changes")
     before = len(done)
     assert [skipping.main(words), skipping.main(words)] == [1, 1] and len(done) == before + 2
+
+
+def test_a_dry_run_lists_what_is_left_and_what_it_takes(tmp_path, monkeypatch, capsys):
+    def dry(*words):
+        assert skipping.main([*words, "--dry-run"]) == 0
+        return [line.split() for line in capsys.readouterr().out.splitlines()]
+
+    monkeypatch.setattr(host, "commit", lambda: "a" * 40)
+    out = tmp_path / "out"
+    assert tuple(skipping.SECONDS) == skipping.CASES
+    listed = dry(str(out), "--repeats", "4")
+    assert [line[0] for line in listed[:-1]] == list(skipping.CASES) and not out.exists()
+    assert listed[-2] == ["record", "5", "runs", "both", "ways", "39", "s"]  # 5 × 7.8 s
+    assert listed[-1][:4] == ["total:", "12", "of", "12"]
+    assert dry(str(out), "--size", "small", "--case", "rays")[0][-1] == "unknown"  # of grids that were never timed
+
+    # two pairs of 2 s and 4 s: 12 s a turn, by their records
+    out.mkdir()
+    one = skipping_tables.Measured(
+        case="rays", scene="none", what="nothing", skipping=(2.0,) * 2, whole=(4.0,) * 2, difference=0.0, unit="P",
+        limit=0.0, stated="exact",
+    )  # fmt: skip
+    for code in ("a", "b"):
+        record = skipping_tables.SkipRecord(
+            measured=one, size="core", host=host.host(), commit=code * 40, time="now", run=code
+        )
+        lines.append(out / skipping.NAME, record, record)
+    words = [str(out), "--case", "rays", "--case", "twin"]
+    (twin, total) = dry(*words, "--repeats", "2")
+    assert twin == ["twin", "3", "runs", "both", "ways", "1.4", "s"] and total[1:6] == ["1", "of", "2", "cases,", "1.4"]
+    assert dry(*words, "--repeats", "3")[0] == ["rays", "4", "runs", "both", "ways", "48", "s"]
+    assert dry(*words, "--repeats", "2", "--force")[0][:2] == ["rays", "3"]
+
+
+def test_the_table_is_rendered_from_the_records_alone(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(skipping_cases.CASES, "rays", lambda setup: iter([fake(2.0)]))
+    words = [str(tmp_path), "--case", "rays", "--repeats", "1"]
+    assert skipping.main(words) == 1
+    (tmp_path / "skipping.md").rename(tmp_path / "first.md")
+    monkeypatch.setitem(skipping_cases.CASES, "rays", lambda setup: 1 / 0)
+    with (tmp_path / skipping.NAME).open("ab") as file:
+        file.write(b'{"measured": {')  # as a kill leaves it
+    assert skipping.main([str(tmp_path), "--table"]) == 1
+    assert (tmp_path / "skipping.md").read_bytes() == (tmp_path / "first.md").read_bytes()
+    capsys.readouterr()
+    for none in ([str(tmp_path / "none")], [str(tmp_path), "--size", "small"]):
+        monkeypatch.setattr("sys.argv", ["run-benchmark", "skipping", *none, "--table"])
+        assert cli.run_benchmark() == cli.EXIT_USER
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and "there are no records of size" in said
+    assert not (tmp_path / "none").exists()
 
 
 def test_an_interrupted_make_dataset_interrupts_the_command():
