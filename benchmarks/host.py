@@ -52,6 +52,16 @@ def _version(package: str) -> str:
         return "not installed"
 
 
+def use_threads(threads: int) -> None:
+    """Let the kernels and torch have so many threads, before numba is loaded."""
+    os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
+    import numba
+    import torch
+
+    numba.set_num_threads(min(threads, numba.get_num_threads()))
+    torch.set_num_threads(numba.get_num_threads())
+
+
 def host() -> Host:
     """Describe this machine."""
     return Host(

@@ -7,7 +7,6 @@ Pareto front and its knee.
 
 import datetime
 import functools
-import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from benchmarks.host import commit, host
+from benchmarks.host import commit, host, use_threads
 from benchmarks.pareto_records import NAME, Mark, Part, Setting, Timed, append, latest, read, runs
 from benchmarks.records import OK
 from ctsim.errors import InputError
@@ -79,7 +78,7 @@ def main(argv: list[str]) -> int:
         return _dry_run(given, wanted)
     failed = 0
     if not given.table:
-        _use(given.threads)
+        use_threads(given.threads)
         failed = _measure(given, wanted)
     _report(given.out)
     return 1 if failed else 0
@@ -98,16 +97,6 @@ def _scenes(given: Arguments) -> dict[Part, list[str]]:
             raise InputError(f"--scene {name!r}: there is no such scene, expected one of {expected}")
     chosen = given.scene or (RODS, SMALL if SMALL in known["methods"] else known["methods"][0])
     return {part: [name for name in known[part] if name in chosen] for part in parts}
-
-
-def _use(threads: int) -> None:
-    """Let the kernels have so many threads, before numba is loaded."""
-    os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
-    import numba
-    import torch
-
-    numba.set_num_threads(min(threads, numba.get_num_threads()))
-    torch.set_num_threads(numba.get_num_threads())
 
 
 def machine() -> str:
@@ -230,7 +219,7 @@ def _efforts(given: Arguments) -> "list[Effort]":
 
 def _dry_run(given: Arguments, wanted: dict[Part, list[str]]) -> int:
     """Print the runs that are left and about how long they take, from a plan and an FDK timed here."""
-    _use(given.threads)
+    use_threads(given.threads)
     done, total, lines = runs(read(given.out / NAME)[0]), 0.0, [("part", "scene", "curve", "runs left", "about")]
     for part, scenes in wanted.items():
         for scene in scenes:

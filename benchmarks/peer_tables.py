@@ -1,13 +1,14 @@
 """Records of `run-benchmark peers`, their table, and what they say about the targets."""
 
-import os
 from collections.abc import Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
 from statistics import median
 
 import msgspec
 
-from benchmarks.host import Host
+from benchmarks import lines
+from benchmarks.host import Host, certain
 from benchmarks.peer_cases import FULL, OURS, PEERS, Measurement
 
 MEGA = 1e6
@@ -45,18 +46,46 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
         return self.value <= self.limit
 
 
-def append(path: Path, record: PeerRecord) -> None:
-    """Append one JSON line and force it to the disk."""
-    with path.open("ab") as file:
-        file.write(msgspec.json.encode(record) + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
-
-
 def read(path: Path) -> list[PeerRecord]:
-    """Read the records of a peers file."""
-    decoder = msgspec.json.Decoder(PeerRecord)
-    return [decoder.decode(line) for line in path.read_bytes().splitlines() if line.strip()]
+    """Read the records of a peers file (see `lines.read`)."""
+    return lines.read(path, PeerRecord, "a record of run-benchmark peers")
+
+
+def known(stored: Sequence[PeerRecord], repeats: int, by: tuple[Host, str, str, str]) -> set[str]:
+    """Return the cases, of the records of `latest`, with so many runs, `by` = (host, commit, rtk, xcist).
+
+    A case with an error is not known, and code that differs from its commit, or has none, knows nothing.
+    """
+    if not certain(by[1]):
+        return set()
+    cases = {record.measurement.case for record in stored}
+    return cases - {record.measurement.case for record in stored if not _counts(record, repeats, by)}
+
+
+def _counts(record: PeerRecord, repeats: int, by: tuple[Host, str, str, str]) -> bool:
+    """Say whether a record is what another run `by` the same would measure; the case paper has one run always."""
+    m = record.measurement
+    enough = m.case == "paper" or not m.seconds or len(m.seconds) >= repeats
+    return enough and m.status != "error" and (record.host, record.commit, record.rtk, record.xcist) == by
+
+
+def seconds(records: Sequence[PeerRecord], repeats: int) -> dict[str, float]:
+    """Return what so many runs take of each case, by the clock when it was last recorded, on one size of grids.
+
+    A case began when the one before it was recorded, or the run was started; one that failed tells nothing.
+    """
+    found: dict[str, float] = {}
+    for run in dict.fromkeys(record.run for record in records if record.run):
+        mine, began = [record for record in records if record.run == run], run
+        for case in dict.fromkeys(record.measurement.case for record in mine):
+            rows = [record for record in mine if record.measurement.case == case]
+            took = (datetime.fromisoformat(rows[-1].time) - datetime.fromisoformat(began)).total_seconds()
+            began = rows[-1].time
+            timed = [r.measurement.seconds for r in rows if r.measurement.seconds and case != "paper"]
+            more = sum(median(s) * (repeats - len(s)) for s in timed)
+            if all(record.measurement.status != "error" for record in rows):
+                found[case] = max(took + more, 0.0)
+    return found
 
 
 def latest(records: Sequence[PeerRecord], side: int) -> list[PeerRecord]:

@@ -1,11 +1,11 @@
 """`run-benchmark peers RESULTS`: speed and error side by side with RTK and XCIST, in one process, in turns.
 
 Records go to RESULTS/peers.jsonl, one line per contender and scene; the table, RESULTS/peers.md, shows the
-last of each, so that cases can be measured one by one.
+last of each, so that cases can be measured one by one. What this commit recorded on this machine, beside the same
+versions of the peers, is not measured again.
 """
 
 import dataclasses
-import os
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,12 +16,15 @@ import tyro
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:
-    from benchmarks.peer_cases import Measurement
-    from benchmarks.peer_tables import PeerRecord
+    from benchmarks.host import Host
 
 Case = Literal["paths", "exact", "paper", "fdk", "poly"]
 CASES: tuple[Case, ...] = ("paths", "exact", "paper", "fdk", "poly")
-NAME = "peers.jsonl"
+NAME, ABSENT = "peers.jsonl", "not installed"
+# seconds of each case on full grids beside both peers: those of a turn, and the rest, from the run in docs/speed.md
+SECONDS: dict[Case, tuple[float, float]] = {
+    "paths": (21.0, 22.0), "exact": (0.0, 53.0), "paper": (0.0, 54.0), "fdk": (16.3, 9.0), "poly": (17.6, 138.0),
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +44,12 @@ class Arguments:
     """Threads of every contender; XCIST's voxelised projector has one."""
     small: tyro.conf.FlagCreatePairsOff[bool] = False
     """Tiny grids that prove the command and say nothing about speed; leaves out the case paper."""
+    force: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Measure again what is recorded of this commit on this machine, beside these versions of the peers."""
+    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print what is left to measure and about how long it takes; measure nothing."""
+    table: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Only render the table from the records, computing nothing."""
 
 
 def main(argv: list[str]) -> int:
@@ -49,32 +58,73 @@ def main(argv: list[str]) -> int:
     if given.repeats < 1 or given.threads < 1:
         raise InputError(f"--repeats and --threads must be at least 1, got {given.repeats} and {given.threads}")
     wanted = tuple(dict.fromkeys(given.case)) or tuple(c for c in CASES if not (given.small and c == "paper"))
-    os.environ["NUMBA_NUM_THREADS"] = os.environ.get("NUMBA_NUM_THREADS", str(given.threads))
-    given.results.mkdir(parents=True, exist_ok=True)
-    found = _measure(given, wanted)
+    if given.dry_run:
+        sys.stdout.write(_planned(given, wanted))
+        return 0
+    if not given.table:
+        given.results.mkdir(parents=True, exist_ok=True)
+        _measure(given, wanted)
+    return _report(given, wanted)
+
+
+def _report(given: Arguments, wanted: tuple[Case, ...]) -> int:
+    """Write and print the table of all records; return 1 if a wanted case has an error."""
     from benchmarks import peer_tables
 
-    stored = peer_tables.latest(peer_tables.read(given.results / NAME), found[-1].side)
+    path, side = given.results / NAME, _side(given)
+    stored = peer_tables.latest(peer_tables.read(path), side)
+    if not stored:
+        raise InputError(f"{path}: there are no records of grids of side {side}; run without --table first")
     text = peer_tables.render(stored)
     (given.results / "peers.md").write_text(text, encoding="utf-8")
     sys.stdout.write(text + f"\nWritten: {given.results}/peers.md; records in {NAME}\n")
-    return 1 if any(r.measurement.status == "error" for r in found) else 0
+    return 1 if any(r.measurement.status == "error" for r in stored if r.measurement.case in wanted) else 0
 
 
-def _measure(given: Arguments, wanted: tuple[Case, ...]) -> "list[PeerRecord]":
-    """Measure case by case; what is measured is stored at once."""
-    import numba
-    import torch
+def _side(given: Arguments) -> int:
+    from benchmarks import peer_cases
 
-    from benchmarks import host, peer_cases, peer_poly, peer_tables
+    return peer_cases.SMALL if given.small else peer_cases.FULL
 
-    threads = min(given.threads, numba.get_num_threads())
-    numba.set_num_threads(threads)
-    torch.set_num_threads(threads)
-    versions = {name: module.version() for name, module in peer_cases.PEERS.items()}
-    side = peer_cases.SMALL if given.small else peer_cases.FULL
-    present = frozenset(name for name, version in versions.items() if version)
-    setup = peer_cases.Setup(n=side, repeats=given.repeats, threads=threads, present=present)
+
+def _left(given: Arguments, wanted: tuple[Case, ...]) -> "tuple[list[Case], tuple[Host, str, str, str]]":
+    """Return the wanted cases that are not recorded, and who measures: (host, commit, RTK's and XCIST's version)."""
+    from benchmarks import host
+
+    host.use_threads(given.threads)
+    from benchmarks import peer_cases, peer_tables
+
+    rtk, xcist = (peer_cases.PEERS[name].version() or ABSENT for name in (peer_cases.RTK, peer_cases.XCIST))
+    by = host.host(), host.commit(), rtk, xcist  # of the code that is loaded, whatever is committed meanwhile
+    stored = peer_tables.latest(peer_tables.read(given.results / NAME), _side(given))
+    known = set() if given.force else peer_tables.known(stored, given.repeats, by)
+    return [case for case in wanted if case not in known], by
+
+
+def _planned(given: Arguments, wanted: tuple[Case, ...]) -> str:
+    """Return what --dry-run prints; seconds are from records of these grids, else from one run on full ones."""
+    left, _ = _left(given, wanted)
+    from benchmarks import costs, peer_tables
+
+    once: dict[str, float] = {}
+    if not given.small:
+        once = {case: turn * (given.repeats + 1) + rest for case, (turn, rest) in SECONDS.items()}
+    records = [r for r in peer_tables.read(given.results / NAME) if r.side == _side(given)]
+    once |= peer_tables.seconds(records, given.repeats)
+    turns = f"{given.repeats + 1} runs of each contender"
+    rows = [(case, turns if SECONDS[case][0] else "one run", once.get(case)) for case in left]
+    return costs.listing(rows, len(wanted), "cases", "with what is prepared and checked, beside both peers")
+
+
+def _measure(given: Arguments, wanted: tuple[Case, ...]) -> None:
+    """Measure the wanted cases that are not recorded; a case is stored as soon as it is measured."""
+    left, (here, now, rtk, xcist) = _left(given, wanted)
+    from benchmarks import lines, peer_cases, peer_poly, peer_tables
+
+    present = frozenset(
+        name for name, version in ((peer_cases.RTK, rtk), (peer_cases.XCIST, xcist)) if version != ABSENT
+    )
+    setup = peer_cases.Setup(n=_side(given), repeats=given.repeats, threads=here.threads, present=present)
     cases = {
         "paths": peer_cases.paths,
         "exact": peer_cases.exact,
@@ -82,23 +132,18 @@ def _measure(given: Arguments, wanted: tuple[Case, ...]) -> "list[PeerRecord]":
         "fdk": peer_cases.fdk,
         "poly": peer_poly.poly,
     }
-    found = []
-    host.commit()  # remembered: the code that is loaded, whatever is committed meanwhile
     began = datetime.now(UTC).isoformat(timespec="microseconds")
     for case in wanted:
+        if case not in left:
+            sys.stderr.write(f"{case}: recorded already\n")
+            continue
         sys.stderr.write(f"{case} …\n")
-        measured: list[Measurement] = cases[case](setup)
-        for measurement in measured:
-            record = peer_tables.PeerRecord(
-                measurement=measurement,
-                side=side,
-                rtk=versions[peer_cases.RTK] or "not installed",
-                xcist=versions[peer_cases.XCIST] or "not installed",
-                host=host.host(),
-                commit=host.commit(),
-                time=datetime.now(UTC).isoformat(timespec="seconds"),
-                run=began,
+        measured = cases[case](setup)
+        time = datetime.now(UTC).isoformat(timespec="seconds")
+        records = [
+            peer_tables.PeerRecord(
+                measurement=one, side=setup.n, rtk=rtk, xcist=xcist, host=here, commit=now, time=time, run=began
             )
-            peer_tables.append(given.results / NAME, record)
-            found.append(record)
-    return found
+            for one in measured
+        ]
+        lines.append(given.results / NAME, *records)

@@ -114,13 +114,13 @@ def _measure(given: Arguments, wanted: tuple[Case, ...], folder: Path) -> None:
     from benchmarks import lines, skipping_cases, skipping_methods, skipping_tables
 
     left, (here, now) = _left(given, wanted)
-    for case in wanted:
-        if case not in left:
-            sys.stderr.write(f"{case}: recorded already\n")
     setup = skipping_cases.Setup(size=given.size, repeats=given.repeats, folder=folder)
     cases = skipping_cases.CASES | skipping_methods.CASES
     began = datetime.now(UTC).isoformat(timespec="microseconds")
-    for case in left:
+    for case in wanted:
+        if case not in left:
+            sys.stderr.write(f"{case}: recorded already\n")
+            continue
         sys.stderr.write(f"{case} …\n")
         measured = [pair.measure(given.repeats) for pair in cases[case](setup)]
         time = datetime.now(UTC).isoformat(timespec="seconds")

@@ -228,7 +228,7 @@ def test_the_clock_leaves_out_scoring_and_counts_what_begins_and_ends_a_run(smal
 
 
 def test_methods_end_to_end(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(pareto, "_use", lambda threads: None)  # the threads of this process are not ours to set
+    monkeypatch.setattr(pareto, "use_threads", lambda threads: None)  # the threads of this process are not ours to set
     (tmp_path / "small.toml").write_text(SMALLEST, encoding="utf-8")
     out = tmp_path / "out"
     common = [str(out), "--suite", str(tmp_path / "small.toml"), "--part", "methods", "--repeats", "2"]
@@ -254,7 +254,7 @@ def test_methods_end_to_end(tmp_path, monkeypatch, capsys):
 
 
 def test_a_method_that_fails_is_a_row_with_its_reason_and_is_tried_again(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(pareto, "_use", lambda threads: None)
+    monkeypatch.setattr(pareto, "use_threads", lambda threads: None)
     (tmp_path / "small.toml").write_text(SMALLEST, encoding="utf-8")
     command = [str(tmp_path), "--suite", str(tmp_path / "small.toml"), "--part", "methods", "--repeats", "2"]
     for _ in range(2):
@@ -322,7 +322,7 @@ def test_scatter_is_judged_with_scatter(bench):
 
 
 def test_simulator_end_to_end(tmp_path, monkeypatch, capsys, bench):
-    monkeypatch.setattr(pareto, "_use", lambda threads: None)
+    monkeypatch.setattr(pareto, "use_threads", lambda threads: None)
     few = [c for c in pareto_simulator.choices() if c.default or c.label == "4 sub-rays"]
     monkeypatch.setattr(pareto_simulator, "choices", lambda: few)
     monkeypatch.setattr(pareto_simulator, "Bench", lambda: bench)

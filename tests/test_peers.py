@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks import host, peer_cases, peer_poly, peer_rtk, peer_tables, peer_xcist, peers
+from benchmarks import cli, host, lines, peer_cases, peer_poly, peer_rtk, peer_tables, peer_xcist, peers
 from benchmarks.peer_cases import OURS, PEERS, RTK, XCIST, Measurement
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -277,6 +277,104 @@ def test_the_command_without_peers_says_so_and_stores_records(tmp_path, monkeypa
     assert exact.error is not None and exact.error < 1e-6
     assert records[0].host.cores > 0 and records[0].commit
     assert (tmp_path / "new" / "peers.md").read_text() in table
+
+
+def no_peers(monkeypatch, *, case="fdk", fails=False):
+    """Let a case be measured at once, without peers, by the code of a commit; return the list that counts it."""
+    done = []
+
+    def once(setup):
+        done.append(case)
+        status = {"status": "error", "reason": "it failed"} if fails else {"seconds": (2.0,) * setup.repeats}
+        return [peer_cases.Measurement(case=case, scene="s", contender=OURS, **status)]
+
+    for module in PEERS.values():
+        monkeypatch.setattr(module, "version", lambda: None)
+    monkeypatch.setattr(host, "use_threads", lambda threads: None)  # those of this process are not ours to set
+    monkeypatch.setattr(host, "commit", lambda: "a" * 40)
+    monkeypatch.setattr(peer_cases, case, once)
+    return done
+
+
+def test_an_interrupted_command_goes_on_from_the_case_it_was_in(tmp_path, monkeypatch, capsys):
+    def interrupted(setup):
+        raise KeyboardInterrupt
+
+    done = no_peers(monkeypatch)
+    monkeypatch.setattr(peer_cases, "exact", interrupted)
+    words = [str(tmp_path), "--repeats", "2", "--case", "fdk", "--case", "exact"]
+    monkeypatch.setattr("sys.argv", ["run-benchmark", "peers", *words])
+    assert cli.run_benchmark() == cli.EXIT_INTERRUPTED and done == ["fdk"]
+    with (tmp_path / peers.NAME).open("ab") as file:
+        file.write(b'{"measurement": {')  # as a kill leaves it
+    no_peers(monkeypatch, case="exact")
+    assert cli.run_benchmark() == 0 and done == ["fdk"]
+    assert "fdk: recorded already" in capsys.readouterr().err
+    assert [r.measurement.case for r in peer_tables.read(tmp_path / peers.NAME)] == ["fdk", "exact"]
+    for change in (["--force"], ["--small"], ["--repeats", "3"]):
+        before = len(done)
+        peers.main([*words, *change])
+        assert len(done) == before + 1, change
+    for name, value in (("version", "2.7"), ("version", None)):  # beside another peer nothing is known
+        before = len(done)
+        monkeypatch.setattr(PEERS[RTK], name, lambda value=value: value)
+        peers.main(words)
+        assert len(done) == before + 1, value
+    monkeypatch.setattr(host, "commit", lambda: "a" * 40 + "+changes")
+    before = len(done)
+    assert [peers.main(words), peers.main(words)] == [0, 0] and len(done) == before + 2
+
+
+def test_what_failed_is_measured_again(tmp_path, monkeypatch, capsys):
+    done = no_peers(monkeypatch, case="paper", fails=True)
+    words = [str(tmp_path), "--case", "paper"]
+    assert [peers.main(words), peers.main(words)] == [1, 1] and len(done) == 2
+    assert peers.main([*words, "--table"]) == 1 and len(done) == 2
+    assert "| paper | s | ctsim | error |" in capsys.readouterr().out
+
+
+def test_the_table_is_rendered_from_the_records_alone(tmp_path, monkeypatch, capsys):
+    done = no_peers(monkeypatch)
+    assert peers.main([str(tmp_path), "--case", "fdk"]) == 0
+    (tmp_path / "peers.md").rename(tmp_path / "first.md")
+    assert peers.main([str(tmp_path), "--table"]) == 0 and len(done) == 1
+    assert (tmp_path / "peers.md").read_bytes() == (tmp_path / "first.md").read_bytes()
+    capsys.readouterr()
+    for none in ([str(tmp_path / "none")], [str(tmp_path), "--small"]):
+        monkeypatch.setattr("sys.argv", ["run-benchmark", "peers", *none, "--table"])
+        assert cli.run_benchmark() == cli.EXIT_USER
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and "there are no records of grids of side" in said
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_dry_run_lists_what_is_left_and_what_it_takes(tmp_path, monkeypatch, capsys):
+    def dry(*words):
+        assert peers.main([*words, "--dry-run"]) == 0
+        return capsys.readouterr().out.splitlines()
+
+    done = no_peers(monkeypatch)
+    out = tmp_path / "out"
+    listed = dry(str(out), "--repeats", "2")
+    assert tuple(peers.SECONDS) == peers.CASES and not out.exists()
+    assert [line.split()[0] for line in listed[:-1]] == list(peers.CASES)
+    assert listed[3].split() == ["fdk", "3", "runs", "of", "each", "contender", "58", "s"]  # 3 × 16.3 s + 9 s
+    assert listed[-1].startswith("total: 5 of 5 cases, ")
+    assert dry(str(out), "--small", "--case", "fdk")[0].endswith("unknown") and not done
+
+    def record(case, seconds, minute, side=256):
+        return peer_tables.PeerRecord(
+            measurement=peer_cases.Measurement(case=case, scene="s", contender=OURS, seconds=seconds), side=side,
+            rtk=peers.ABSENT, xcist=peers.ABSENT, host=host.host(), commit="a" * 40,
+            time=f"2026-01-01T00:0{minute}:00+00:00", run="2026-01-01T00:00:00+00:00",
+        )  # fmt: skip
+
+    out.mkdir()
+    lines.append(out / peers.NAME, record("exact", (), 1), record("fdk", (2.0, 2.0), 2))
+    words = [str(out), "--case", "exact", "--case", "fdk"]
+    assert dry(*words, "--repeats", "2") == ["total: 0 of 2 cases, 0 s " + listed[-1].partition(" min ")[2]]
+    (exact, fdk, total) = dry(*words, "--repeats", "5", "--force")
+    assert exact.endswith("  60 s") and fdk.endswith("  66 s") and "2 of 2 cases, 2 min" in total  # 3 runs more of 2 s
 
 
 def test_the_table_keeps_contenders_of_one_run_together():
