@@ -46,6 +46,8 @@ class Arguments:
     """Run again what was as expected."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """List the rows and what they are expected to cost, running nothing."""
+    table: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Only render the table from the newest record of each row, running nothing."""
 
 
 def main(argv: list[str]) -> int:
@@ -59,15 +61,22 @@ def main(argv: list[str]) -> int:
     side = SHORT if given.short else FULL
     cases = _chosen(catalogue(), given.case)
     wanted = [stress_records.identity_of(c, side) for c in cases]
-    found = stress_records.latest(stress_records.read(given.results / stress_records.NAME), wanted)
+    path = given.results / stress_records.NAME
+    stored = stress_records.read(path)
+    found = stress_records.latest(stored, wanted)
     done = set() if given.force else {r.identity for r in found if r.ok}
     left = [c for c, identity in zip(cases, wanted, strict=True) if identity not in done]
     if given.dry_run:
         _list(left, len(cases), short=given.short)
         return 0
+    if given.table:
+        shown = stress_records.newest(stored, [(c.name, c.subject) for c in cases], side)
+        if old := sum(r.identity not in wanted for r in shown):
+            sys.stderr.write(f"{path}: {old} of {len(shown)} rows are of other sources than those that are here\n")
+        return _report(shown, given)
     given.results.mkdir(parents=True, exist_ok=True)
     _work(left, side, given)
-    return _report(stress_records.latest(stress_records.read(given.results / stress_records.NAME), wanted), given)
+    return _report(stress_records.latest(stress_records.read(path), wanted), given)
 
 
 def catalogue() -> "list[Case]":
@@ -110,6 +119,8 @@ def _report(found: "list[StressRecord]", given: Arguments) -> int:
     from benchmarks import stress_records
 
     path = given.results / stress_records.TABLE_NAME
+    if not found:
+        raise InputError(f"{path.with_name(stress_records.NAME)}: there are no such records; run without --table first")
     path.write_text(stress_records.render(found), encoding="utf-8")
     wrong = [r for r in found if not r.ok]
     for r in wrong:

@@ -70,6 +70,12 @@ def latest(records: Sequence[StressRecord], wanted: Sequence[str]) -> list[Stres
     return [last[identity] for identity in wanted if identity in last]
 
 
+def newest(records: Sequence[StressRecord], wanted: Sequence[tuple[str, str]], side: int) -> list[StressRecord]:
+    """Return the last record of each (case, subject) on grids of `side`, whatever its sources, as in `latest`."""
+    last = {(record.case, record.subject): record for record in records if record.side == side}
+    return [last[place] for place in wanted if place in last]
+
+
 def render(records: Sequence[StressRecord]) -> str:
     """Render rows as Markdown: what is not as expected, the cases, then every row."""
     wrong = [r for r in records if not r.ok]

@@ -260,3 +260,24 @@ def test_the_step_is_that_of_a_majoriser(monkeypatch):
     monkeypatch.setattr(ordered.Fit, "_move", jacobi)
     found = misfit()
     assert diagonals and falling < 0.06 and found > 3 * falling, (falling, found)
+
+
+def test_the_table_is_rendered_from_the_newest_records_alone(command, tmp_path, monkeypatch, capsys):
+    with pytest.raises(InputError, match="there are no such records; run without --table first"):
+        command("--table")
+    assert not (tmp_path / "out").exists()
+    command()
+    (tmp_path / "out" / "stress.md").rename(tmp_path / "first.md")
+    capsys.readouterr()
+    assert command("--table") == 1 and Here.ran == 3 and not capsys.readouterr().err
+    assert (tmp_path / "out" / "stress.md").read_bytes() == (tmp_path / "first.md").read_bytes()
+    assert command("--table", "--case", "fine") == 0
+    # other sources change nothing of what was found, and are named
+    others = [dataclasses.replace(case, code="other") for case in catalogue()[:3]]
+    monkeypatch.setattr(stress, "catalogue", lambda: others)
+    capsys.readouterr()
+    assert command("--table") == 1 and Here.ran == 3
+    assert (tmp_path / "out" / "stress.md").read_bytes() == (tmp_path / "first.md").read_bytes()
+    assert "3 of 3 rows are of other sources" in capsys.readouterr().err
+    with pytest.raises(InputError, match="no such records"):
+        stress.main([str(tmp_path / "out"), "--table"])  # of the larger grids
