@@ -16,6 +16,7 @@ from ctsim.errors import InputError
 
 if TYPE_CHECKING:
     from benchmarks.records import Record
+    from phantoms.scene import Scene
 
 METHODS = ("fdk", "limar", "nmar", "os-sart")
 SCENE, SHARE = "lung-Fe", 0.6
@@ -41,6 +42,8 @@ class Arguments:
     """Repetitions of each scene."""
     table: tyro.conf.FlagCreatePairsOff[bool] = False
     """Only judge the records that are there, computing nothing."""
+    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print the scans to make, the runs to do and what they will cost; write nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,6 +60,8 @@ def main(arguments: list[str]) -> int:
     given = tyro.cli(Arguments, prog="run-benchmark reproduce", args=arguments)
     from benchmarks import records, tables
 
+    if given.dry_run:
+        return _dry_run(given)
     if not given.table and (code := _compute(given)) not in (0, 1):  # a method's failure is shown below
         return code
     found = records.latest(records.read_all(given.results)[0])
@@ -74,14 +79,52 @@ def _compute(given: Arguments) -> int:
     """Make the scans that are missing, then run what has no record."""
     from benchmarks import cli_run, make_dataset
 
-    seeds = [str(seed) for seed in given.seeds]
-    code = make_dataset.main([given.suite, str(given.data), "--seeds", *seeds])
-    if code:
-        return code
-    scenes = make_dataset.select(make_dataset.load(given.suite), (), given.seeds)
-    chosen = [word for scene in scenes for word in ("--scene", scene.name)]
+    code = make_dataset.main(_scans_of(given))
+    return code or cli_run.main(_runs_of(given, [scene.name for scene in _scenes(given)]))
+
+
+def _scans_of(given: Arguments) -> list[str]:
+    """Return the words of make-dataset."""
+    return [given.suite, str(given.data), "--seeds", *map(str, given.seeds)]
+
+
+def _runs_of(given: Arguments, scenes: list[str]) -> list[str]:
+    """Return the words of run-benchmark on these scenes."""
     methods = [word for name in METHODS for word in ("--method", name)]
-    return cli_run.main([str(given.data), str(given.results), *methods, *chosen])
+    return [str(given.data), str(given.results), *methods, *(word for name in scenes for word in ("--scene", name))]
+
+
+def _scenes(given: Arguments) -> "tuple[Scene, ...]":
+    from benchmarks import make_dataset
+
+    return make_dataset.select(make_dataset.load(given.suite), (), given.seeds)
+
+
+def _dry_run(given: Arguments) -> int:
+    """Print the plans of scans to make, the runs on those that are there, and what runs on the others will take."""
+    from benchmarks import cli_run, costs, make_dataset, records
+    from benchmarks.schedule import Costs
+    from ctsim.writer import is_complete
+    from phantoms.scene import scene_id
+
+    if code := make_dataset.main([*_scans_of(given), "--dry-run"]):
+        return code
+    scenes = _scenes(given)
+    there = [scene.name for scene in scenes if is_complete(given.data, scene.name, scene_id(scene))]
+    if there and (code := cli_run.main([*_runs_of(given, there), "--dry-run"])):
+        return code
+    names = [scene.name for scene in scenes if scene.name not in there]
+    if names:
+        known = Costs(records.read_all(given.results)[0])
+        usual = {method: known.method(method) for method in METHODS}
+        rows = [
+            (method, f"{name}, to be made, and its twin", None if seconds is None else 2 * seconds)
+            for method, seconds in usual.items()
+            for name in names
+        ]
+        how = "by each method's median in the records of earlier runs, without warm-up and scoring"
+        sys.stdout.write(costs.listing(rows, len(METHODS) * len(scenes), "pairs of runs", how))
+    return 0
 
 
 def judged(found: "list[Record]") -> list[Claim]:

@@ -3,7 +3,7 @@ import sys
 import pytest
 from conftest import SMALLEST
 
-from benchmarks import cli, reproduce
+from benchmarks import cli, make_dataset, records, reproduce
 from benchmarks.protocol import Score
 from benchmarks.records import Cost, Record, Run
 
@@ -56,6 +56,28 @@ def test_what_was_not_measured_is_not_said_to_hold():
     assert [c.holds for c in reproduce.judged([])] == [None] * 4
     assert [c.holds for c in reproduce.judged([record("fdk", 1), record("limar", 2)])] == [None] * 4
     assert "not measured" in reproduce.markdown(reproduce.judged([]))
+
+
+def test_a_dry_run_plans_scans_and_lists_runs(tmp_path, capsys):
+    suite = tmp_path / "suite.toml"
+    suite.write_text(SMALLEST.replace('"smallest"', '"lung-Fe"'), encoding="utf-8")
+    words = [*(str(tmp_path / name) for name in ("data", "r")), "--suite", str(suite), "--seeds", "1", "2"]
+    before = sorted(tmp_path.iterdir())
+    assert reproduce.main([*words, "--dry-run"]) == 0 and sorted(tmp_path.iterdir()) == before
+    out = capsys.readouterr().out
+    assert "on disk" in out and "total: 8 of 8 pairs of runs, 0 s" in out  # 4 methods on 2 scans
+    assert out.rstrip().endswith("never run: fdk, limar, nmar, os-sart")
+    # one scan is there, and its runs are those of run-benchmark; what is recorded tells of the scan that is not
+    assert make_dataset.main([str(suite), str(tmp_path / "data"), "--seeds", "1"]) == 0
+    (tmp_path / "r").mkdir()
+    for known in (record("fdk", 1, wall=3.0), record("limar", 1, wall=5.0)):
+        records.append(tmp_path / "r" / records.NAME, known)
+    capsys.readouterr()
+    assert reproduce.main([*words, "--dry-run"]) == 0
+    out = capsys.readouterr().out
+    assert out.count("already complete") == 1 and "total: 8 of 8 runs, 16 s" in out  # scan and twin, 2 × (3 + 5) s
+    assert "total: 4 of 8 pairs of runs, 16 s" in out
+    assert sum("to be made, and its twin  6 s" in line and line.startswith("fdk") for line in out.splitlines()) == 1
 
 
 def test_one_command_makes_the_scans_the_records_and_the_verdict(tmp_path, monkeypatch, capsys):
