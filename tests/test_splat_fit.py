@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from benchmarks.make_dataset import main as make_dataset
+from benchmarks.metrics import psnr3d
 from benchmarks.protocol import tissue_score, truth_of
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -46,6 +47,13 @@ name = "small"
 seed = 7
 phantom = { recipe = "teeth", metal = "Ti", n_voxel = [56, 56, 56] }
 scanner = { n_voxel = [40, 40, 40], n_detector = [64, 64], n_views = 60 }
+"""
+
+TOY = """
+name = "toy"
+seed = 1
+phantom = { recipe = "lung", metal = "Fe", n_voxel = [96, 96, 96] }
+scanner = { n_voxel = [64, 64, 64], n_detector = [96, 96], n_views = 90, i0 = 1e5 }
 """
 
 
@@ -160,6 +168,20 @@ def test_it_beats_fdk_with_and_without_metal(small):
     for scan in (small.scan, small.metal_free.scan):
         ours, theirs = (tissue_score(f(scan).values.numpy(), truth).values["rmse"] for f in (reconstruct, fdk))
         assert ours < 0.8 * theirs  # measured: 0.72 on both
+
+
+def test_two_passes_over_the_finest_grid_reach_what_prototypes_did(tmp_path):
+    """Prototypes on 64³ voxels and 90 views of 96² had 34.9 dB after 30 view updates and 36.0 after 90 of Adam.
+
+    They knew the spectrum, which this does not, and it has 180 updates on the finest grid and 45 on a coarser one.
+    """
+    (tmp_path / "scene.toml").write_text(TOY, encoding="utf-8")
+    assert make_dataset([str(tmp_path / "scene.toml"), str(tmp_path / "data")]) == 0
+    toy = open_scan(list_scans(tmp_path / "data")[0])
+    reference = truth_of(toy).references["effective"]
+    volume = reconstruct(toy.scan, passes=(1, 2))
+    assert volume.details["view_updates"] == 225
+    assert psnr3d(volume.values.numpy(), reference, data_range=float(np.ptp(reference))) > 35
 
 
 def test_shorter_steps_in_the_last_pass_let_the_fit_settle(small, monkeypatch):
