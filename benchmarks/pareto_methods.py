@@ -31,7 +31,7 @@ from reconstruct.watch import watch
 STOPS = frozenset((1, 2, 3, 5, 8, 12, 20, 30, 50, 80, 120, 200))
 BY_VALUE: dict[str, tuple[str, tuple[Any, ...]]] = {
     "ibhc": ("iterations", (1, 2, 3, 4, 6)),
-    "splat": ("passes", ((1, 0), (1, 1), (2, 1), (3, 1), (3, 2), (3, 3), (3, 6))),
+    "splat": ("passes", ((1, 0), (1, 1), (2, 1), (3, 1), (3, 2), (3, 4), (3, 12))),
 }
 """Methods that run once for each of these values of a parameter; the default is added."""
 PUBLISHED, STEPS = ("paper", "r2"), 6000

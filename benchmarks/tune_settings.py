@@ -35,7 +35,7 @@ VALUES: dict[str, dict[str, tuple[Any, ...]]] = {
     "fista-tv": {"tv": (0.0006, 0.0012, 0.005), "tv_iterations": (10, 40)},
     "asd-pocs": {"alpha": (0.005, 0.01, 0.05), "tv_steps": (10, 40)},
     "awpcsd": {"alpha": (0.01, 0.05), "delta": (0.5, 1.0, 4.0), "tv_steps": (10, 40)},
-    "splat": {"passes": ((3, 2), (3, 8), (8, 4)), "tv": (0.0, 0.03, 0.08, 0.12), "fineness": (1.0, 1.25)},
+    "splat": {"passes": ((3, 4), (3, 12), (8, 7)), "tv": (0.0, 0.0125, 0.05), "fineness": (1.0, 1.25)},
 }
 PROTOCOLS = ("tissue", "aligned")
 

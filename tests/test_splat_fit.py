@@ -18,6 +18,7 @@ from ctsim.types import Status
 from reconstruct.fdk import reconstruct as fdk
 from reconstruct.splat import fast
 from reconstruct.splat.curve import MATERIALS, MaterialCurve
+from reconstruct.splat.lattice import Lattice
 from reconstruct.splat.level import Data, carve, coarser, refined, weighted
 from reconstruct.splat.method import reconstruct
 from reconstruct.splat.ordered import Fit, bit_reversed
@@ -261,19 +262,20 @@ def test_a_dark_that_cannot_be_is_called_divergence(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "views, given, expected",
+    "sizes, views, given, expected",
     [
-        ((60, 120, 240), None, [3, 3, 4]),
-        ((90, 180, 360, 720), None, [3, 3, 2, 1]),
-        ((90, 180, 360, 720), (3, 4), [3, 3, 3, 4]),
-        ((24,), None, [7]),
-        ((2000,), None, [1]),
-        ((30, 60), (1, 0), [1, 0]),
+        ((48, 96, 192), (60, 120, 240), None, [3, 3, 7]),
+        ((48, 96, 192, 384), (90, 180, 360, 720), None, [3, 3, 3, 1]),
+        ((48, 96, 192, 384), (90, 180, 360, 720), (3, 4), [3, 3, 3, 4]),
+        ((32,), (24,), None, [10]),
+        ((1000,), (2000,), None, [1]),
+        ((24, 48), (30, 60), (1, 0), [1, 0]),
     ],
 )
-def test_where_a_pass_makes_many_steps_fewer_are_taken(views, given, expected):
+def test_where_a_pass_is_long_fewer_are_taken(sizes, views, given, expected):
     nothing = np.empty((0, 0, 0), np.float32)
-    levels = [Data(geometry=msgspec.structs.replace(GEOMETRY, n_views=n), p=nothing, weights=nothing) for n in views]
+    grids = [msgspec.structs.replace(GEOMETRY, n_views=n, n_voxel=(k, k, k)) for n, k in zip(views, sizes, strict=True)]
+    levels = [Data(geometry=grid, p=nothing, weights=nothing) for grid in grids]
     assert fast._passes(levels, given) == expected
 
 
@@ -281,3 +283,20 @@ def test_values_without_sense_are_refused_by_name(stored):
     for bad, name in (({"passes": (0, 0)}, "passes"), ({"tv": -1.0}, "tv"), ({"seconds": float("nan")}, "seconds")):
         with pytest.raises(InputError, match=name):
             reconstruct(stored.scan, **bad)
+
+
+def test_early_passes_and_coarser_grids_denoise_more(small, monkeypatch):
+    told, denoise = [], Lattice.denoise
+
+    def noting(self, values, tau, iterations):
+        told.append((self.geometry.n_voxel, tau))
+        return denoise(self, values, tau, iterations)
+
+    monkeypatch.setattr(Lattice, "denoise", noting)
+    reconstruct(small.scan, passes=(3, 5))
+    sizes = list(dict.fromkeys(size for size, _ in told))
+    assert len(sizes) == 2
+    coarse, fine = ([tau for size, tau in told if size == wanted] for wanted in sizes)
+    assert np.allclose(np.reshape(coarse, (3, -1)) / coarse[-1], np.array([[4], [2], [1]]))
+    assert np.allclose(np.reshape(fine, (5, -1)) / fine[-1], np.array([[8], [4], [2], [1], [1]]))
+    assert coarse[-1] == pytest.approx(4 * fine[-1] / 2)  # half as many views

@@ -26,7 +26,7 @@ from reconstruct.scatter import open_excess
 from reconstruct.splat.curve import STRONGEST, MaterialCurve
 from reconstruct.splat.lattice import Lattice
 from reconstruct.splat.level import Data, carve, coarser, refined, weighted
-from reconstruct.splat.ordered import Fit, n_subsets
+from reconstruct.splat.ordered import Fit
 from reconstruct.splat.response import Response, basis_functions, evaluate, make_response, tangent
 from reconstruct.splat.volume import voxelise
 from reconstruct.watch import Stopwatch
@@ -40,8 +40,9 @@ SMALLEST = 24  # voxels along an axis below which there is no coarser level
 AT_THE_END, FEW, FEWEST = 0.9, 1e-4, 10
 """Share of the curve's last attenuation, which no metal has; the share of the splats, or how many, that may have it."""
 RESPONSES = ("tube", "known")
-PASSES, STEPS = (3, 4), 96
-"""Passes over each coarser grid and the finest, fewer where they would make more steps, one a subset of views."""
+PASSES, MOST = (3, 7), 6e10
+"""Passes over each coarser grid and the finest, fewer where one would meet more than so many voxels, one a view."""
+COARSER = 4.0  # times the denoising on a coarser grid
 Image = NDArray[np.float32]
 
 
@@ -49,19 +50,19 @@ Image = NDArray[np.float32]
 class Settings:
     """What the preset "fast" may be told.
 
-    `passes` over the views are those of each coarser level and of the finest; None makes them 3 and 4, or fewer, at
-    least one, where they would make more than 96 steps, one for ten views. `tv` is the threshold of denoising in units
-    of water a pass. The finest grid is `fineness` times that of the volume, at most as fine as the detector's pixels at
-    the isocentre. `response` "tube" is a tube behind `filtration` mm of aluminium, seen by a scintillator;
-    "known" takes `tube` and `detector`, tables of a scene file, whole or in part. `readout` is an energy in keV, or
-    "hardened": by the object's own water. After `seconds` it returns what there is. `scatter` is what every reading
-    holds of it over the open field (S/I0); None has it found in the pixels that no shadow reaches (`open_excess`), 0 is
-    for scans whose open pixels are brighter than their open field for another reason. Raises InputError for values that
-    make no sense.
+    `passes` over the views are those of each coarser level and of the finest; None makes them 3 and 7, or fewer, at
+    least one, where a level's views times its voxels would make more than 6e10, minutes of two cores. `tv` is the
+    threshold of denoising in units of water a hundred views, more in the first passes and on coarser levels. The finest
+    grid is `fineness` times that of the volume, at most as fine as the detector's pixels at the isocentre. `response`
+    "tube" is a tube behind `filtration` mm of aluminium, seen by a scintillator; "known" takes `tube` and `detector`,
+    tables of a scene file, whole or in part. `readout` is an energy in keV, or "hardened": by the object's own water.
+    After `seconds` it returns what there is. `scatter` is what every reading holds of it over the open field (S/I0);
+    None has it found in the pixels that no shadow reaches (`open_excess`), 0 is for scans whose open pixels are
+    brighter than their open field for another reason. Raises InputError for values that make no sense.
     """
 
     passes: tuple[int, int] | None = None
-    tv: float = 0.05
+    tv: float = 0.025
     fineness: float = 1.5
     response: Literal["tube", "known"] = "tube"
     filtration: float = 0.5
@@ -197,7 +198,8 @@ def _coarse_to_fine(
             return None
         lattice = Lattice(geometry=level.geometry, support=support)
         u = lattice.gather(start)
-        fit = Fit(data=level, lattice=lattice, response=response, curve=curve, u=u, tv=settings.tv, view_updates=done)
+        tv = settings.tv * (1 if level is data else COARSER)
+        fit = Fit(data=level, lattice=lattice, response=response, curve=curve, u=u, tv=tv, view_updates=done)
 
         def go_on(fit: Fit, whole: bool, k: int = k, done: int = done) -> bool:
             here = work[k] * (fit.view_updates - done) / updates[k]
@@ -214,8 +216,8 @@ def _passes(levels: list[Data], given: tuple[int, int] | None) -> list[int]:
     most = [(given or PASSES)[level is levels[-1]] for level in levels] if len(levels) > 1 else [sum(given or PASSES)]
     if given is not None:
         return most
-    enough = [max(STEPS // n_subsets(level.geometry.n_views), 1) for level in levels]
-    return [min(n, steps) for n, steps in zip(most, enough, strict=True)]
+    work = [level.geometry.n_views * math.prod(level.geometry.n_voxel) for level in levels]
+    return [min(n, max(int(MOST / each), 1)) for n, each in zip(most, work, strict=True)]
 
 
 def _open_photons(data: Data) -> float:

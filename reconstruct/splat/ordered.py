@@ -30,6 +30,11 @@ STEEPEST = 0.8
 REST, A_PASS = 4, 6
 """Denoisings are so many subsets apart, but six in a long pass; so are measurements of the curvature in the first."""
 SMOOTHING = 8  # iterations of a denoising
+SETTLED = 4
+"""The pass whose denoising is as asked for; from there back to the first it is twice as strong in each.
+
+What is then smoothed away too far is regained from the data, while streaks come back slowly.
+"""
 LONGEST = 3.0  # times the median root of a step: hardly seen splats, their steps spread by F, make a fit diverge
 SAMPLE = 1 << 18  # roots of which the median is taken
 FAINT = 0.5  # times water: splats below are preconditioned as if they held this
@@ -41,8 +46,8 @@ Image = NDArray[np.float32]
 class Fit:
     """The unknowns `u`, float32 [splat] in 1/mm of the hardened beam, on one lattice, and how they fare.
 
-    `tv` is the denoiser's threshold a pass in units of water. `loss` is the mean |P − p| of the last subset, `misfit`
-    that of the last pass.
+    `tv` is the denoiser's threshold a hundred views in units of water. `loss` is the mean |P − p| of the last subset,
+    `misfit` that of the last pass.
     """
 
     data: Data
@@ -78,14 +83,15 @@ class Fit:
         every = max(REST, n // A_PASS)
         for turn in range(1, passes + 1):
             misfit = 0.0
+            threshold = self.tv * self.curve.water * 2 ** max(min(passes, SETTLED) - turn, 0)
             for k, subset in enumerate(bit_reversed(n)):
                 views = np.arange(subset, n_views, n)
                 length = 1 / (1 + k / n) if turn == passes else 1.0
                 self.loss = self._step(views, turn == 1 and k % every == 0, length)
                 misfit += self.loss / n
                 if (k + 1) % every == 0 or k + 1 == n:
-                    share = (k % every + 1) / n
-                    self.u = self.lattice.denoise(self.u, self.tv * self.curve.water * share, SMOOTHING)
+                    hundreds = (k % every + 1) / n * n_views / 100
+                    self.u = self.lattice.denoise(self.u, threshold * hundreds, SMOOTHING)
                 if k + 1 == n:
                     self.misfit = misfit
                 if not proceed(self, k + 1 == n):
