@@ -38,11 +38,11 @@ def run_benchmark() -> int:
     return guarded("run-benchmark", "benchmarks.cli_run", arguments)
 
 
-def guarded(name: str, module: str, arguments: list[str]) -> int:
+def guarded(name: str, module: str, arguments: list[str], *, resumes: bool = True) -> int:
     """Call `main(arguments) -> int` of a module; say the user's errors in one sentence, exit code 2.
 
     Ctrl-C ends with 130, and so does SIGTERM, by which schedulers stop a job; what was recorded until then
-    stays. Other exceptions are ours and keep their traceback.
+    stays, and the same command goes on from it where it `resumes`. Other exceptions are ours and keep their traceback.
     """
     import msgspec
 
@@ -61,7 +61,8 @@ def guarded(name: str, module: str, arguments: list[str]) -> int:
         where = f"{error.filename}: " if error.filename else ""
         return _complain(name, f"{where}{error.strerror or error}")
     except KeyboardInterrupt:
-        print(f"\n{name}: interrupted; what was finished is kept, run the same command to go on", file=sys.stderr)
+        then = "what was finished is kept, run the same command to go on" if resumes else "it begins anew the next time"
+        print(f"\n{name}: interrupted; {then}", file=sys.stderr)
         return EXIT_INTERRUPTED
     finally:
         signal.signal(signal.SIGTERM, before)

@@ -115,7 +115,7 @@ def _compute(given: Arguments) -> int:
     costs = schedule.Costs(records.read_all(given.results)[0])
     groups = schedule.ordered(left, costs)
     if given.dry_run:
-        sys.stdout.write(schedule.text(groups, len(listed), costs))
+        sys.stdout.write(schedule.text(groups, len(listed), costs, schedule.estimated))
         return 0
     workers = open_pool(given.workers, given.scheduler)
     given.results.mkdir(parents=True, exist_ok=True)

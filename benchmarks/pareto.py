@@ -239,7 +239,7 @@ def _dry_run(given: Arguments, wanted: dict[Part, list[str]]) -> int:
 
 def _planned(given: Arguments, part: Part, scene: str) -> list[tuple[str, str, float]]:
     """Return (curve, identity, seconds of a run) of a scene's settings; a scan that is not made has no identity."""
-    from benchmarks import make_dataset, pareto_methods, pareto_simulator
+    from benchmarks import estimates, make_dataset, pareto_methods, pareto_simulator
     from ctsim.writer import is_complete
     from phantoms.scene import scene_id
 
@@ -250,11 +250,15 @@ def _planned(given: Arguments, part: Part, scene: str) -> list[tuple[str, str, f
         return [(curve, identity, usual) for curve, identity in every]
     data = given.out / "data"
     (recipe,) = make_dataset.select(make_dataset.load(given.suite), (scene,), ())
-    fdk = pareto_methods.fdk_seconds(recipe.resolve().geometry)
+    fdk = estimates.fdk_seconds(recipe.resolve().geometry)
     made = is_complete(data, scene, scene_id(recipe))
     bench = pareto_methods.Bench(data / scene) if made else None
     return [
-        (e.method.name, bench.setting(e, machine()).identity if bench else "", fdk * pareto_methods.in_fdks(e))
+        (
+            e.method.name,
+            bench.setting(e, machine()).identity if bench else "",
+            fdk * (estimates.in_fdks(e.method) or estimates.UNKNOWN),
+        )
         for e in _efforts(given)
     ]
 

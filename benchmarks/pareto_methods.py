@@ -21,11 +21,8 @@ from benchmarks.methods import Method, find
 from benchmarks.pareto_records import Mark, Setting
 from benchmarks.protocol import VERSION, Truth, tissue_range, truth_of
 from benchmarks.run import scan_for, warm_up
-from ctsim.geometry import Geometry
 from ctsim.store import StoredScan, open_scan
-from ctsim.types import Scan, Status
-from reconstruct.fdk import reconstruct as fdk
-from reconstruct.splat.fast import PASSES
+from ctsim.types import Status
 from reconstruct.watch import watch
 
 STOPS = frozenset((1, 2, 3, 5, 8, 12, 20, 30, 50, 80, 120, 200))
@@ -36,26 +33,6 @@ BY_VALUE: dict[str, tuple[str, tuple[Any, ...]]] = {
 """Methods that run once for each of these values of a parameter; the default is added."""
 PUBLISHED, STEPS = ("paper", "r2"), 6000
 """Presets of `splat` that run once, for so many steps of the published schedule, watched after each pass."""
-FDKS = {
-    "fdk": 1.0,
-    "limar": 2.0,
-    "nmar": 4.4,
-    "bhc-poly": 6.8,
-    "water-precorrection": 1.7,
-    "ibhc": 2.7,
-    "sart": 3.0,
-    "os-sart": 2.3,
-    "sirt": 1.5,
-    "cgls": 1.3,
-    "fista-tv": 1.5,
-    "asd-pocs": 2.3,
-    "awpcsd": 3.7,
-    "splat": 3.4,
-    "splat paper": 2950.0,
-    "splat r2": 7590.0,
-}
-"""Cost in FDKs, for estimates, as measured on lung-Fe of `quick`: of an iteration or a pass where those are given."""
-UNKNOWN = 5.0
 LAST = 2  # times the default: how far iterations go
 
 
@@ -102,24 +79,6 @@ def efforts(name: str) -> list[Effort]:
 def _published(preset: str) -> Effort:
     method = find("splat", {"preset": preset, "steps": STEPS, "readout": "hardened"})
     return Effort(method=method, label=f"{STEPS} steps", curve=f"splat {preset}", watched=True)
-
-
-def in_fdks(effort: Effort) -> float:
-    """Return about how many times FDK's time a run takes."""
-    name, params = effort.method.name, effort.method.params
-    amount = PASSES if effort.curve == "splat" else None
-    amount = params.get(BY_VALUE[name][0] if name in BY_VALUE else "iterations") or amount
-    count = sum(amount) if isinstance(amount, tuple | list) else amount if isinstance(amount, int) else 1
-    return FDKS.get(effort.curve, UNKNOWN) * count
-
-
-def fdk_seconds(geometry: Geometry) -> float:
-    """Time FDK of a blank scan, after a run that compiles."""
-    blank = Scan(geometry=geometry, counts=torch.ones(geometry.shape), flat=torch.ones(geometry.n_detector))
-    fdk(blank)
-    start = time.perf_counter()
-    fdk(blank)
-    return time.perf_counter() - start
 
 
 def _words(value: Any) -> str:

@@ -3,7 +3,7 @@
 import functools
 import pkgutil
 import statistics
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -60,12 +60,33 @@ def ordered(left: list[Task], costs: Costs) -> list[Group]:
     return sorted(groups, key=lambda g: (expected[g[0].method.label], labels.index(g[0].method.label), g[0].place))
 
 
-def text(groups: list[Group], n_listed: int, costs: Costs) -> str:
-    """Return what --dry-run prints: the runs in their order with the seconds expected of each, and their sum."""
+def text(
+    groups: list[Group], n_listed: int, costs: Costs, guess: Callable[[Task], float | None] = lambda _: None
+) -> str:
+    """Return what --dry-run prints: the runs in their order with the seconds expected of each, and their sum.
+
+    `guess` is for runs of methods that have no records.
+    """
     left = [task for group in groups for task in group]
     names = [task.stored.name + ("" if task.variant == "metal" else " (metal-free)") for task in left]
-    rows = [(task.method.label, name, costs.task(task)) for task, name in zip(left, names, strict=True)]
-    return listing(rows, n_listed, "runs", "by the records of earlier runs, without warm-up and scoring")
+    known = [costs.task(task) for task in left]
+    guessed = dict.fromkeys(task.method.label for task, seconds in zip(left, known, strict=True) if seconds is None)
+    rows = [
+        (task.method.label, name, guess(task) if seconds is None else seconds)
+        for task, name, seconds in zip(left, names, known, strict=True)
+    ]
+    how = "without warm-up and scoring, by the records of earlier runs"
+    if found := [label for label, _, seconds in rows if label in guessed and seconds is not None]:
+        how += f"; guessed from FDK's time: {', '.join(dict.fromkeys(found))}"
+    return listing(rows, n_listed, "runs", how)
+
+
+def estimated(task: Task) -> float | None:
+    """Guess the seconds of a run from FDK's time on this machine, None for a method of the user's own."""
+    from benchmarks.estimates import fdk_seconds, in_fdks
+
+    fdks = in_fdks(task.method)
+    return None if fdks is None else fdks * fdk_seconds(task.stored.geometry)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

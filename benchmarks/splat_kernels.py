@@ -127,4 +127,4 @@ def _row(case: str, name: str, seconds: float, count: int, error: float | None) 
 
 
 if __name__ == "__main__":
-    sys.exit(guarded("splat_kernels", "benchmarks.splat_kernels", sys.argv[1:]))
+    sys.exit(guarded("splat_kernels", "benchmarks.splat_kernels", sys.argv[1:], resumes=False))

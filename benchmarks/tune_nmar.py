@@ -119,4 +119,4 @@ def _held(trace: Trace) -> torch.Tensor:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded("tune_nmar", "benchmarks.tune_nmar", sys.argv[1:]))
+    sys.exit(guarded("tune_nmar", "benchmarks.tune_nmar", sys.argv[1:], resumes=False))

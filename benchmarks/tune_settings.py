@@ -99,4 +99,4 @@ def psnrs(values: np.ndarray, truth: Truth) -> list[float]:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded("tune_settings", "benchmarks.tune_settings", sys.argv[1:]))
+    sys.exit(guarded("tune_settings", "benchmarks.tune_settings", sys.argv[1:], resumes=False))

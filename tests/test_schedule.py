@@ -7,11 +7,13 @@ import pytest
 from test_run import double
 from test_tables import record
 
-from benchmarks import cli_run, records, run, schedule, tables
-from benchmarks.methods import Method
+from benchmarks import cli_run, estimates, records, run, schedule, tables
+from benchmarks.estimates import FDKS, fdk_seconds, in_fdks
+from benchmarks.methods import TABLE, Method, find
 from benchmarks.schedule import Costs, ordered
 from benchmarks.workers import Lost
 from ctsim.errors import InputError
+from ctsim.geometry import Geometry
 
 OPTIONS = run.Options(keep_volumes=False)
 
@@ -166,3 +168,50 @@ def test_tables_follow_the_runs(tmp_path, monkeypatch):
     monkeypatch.setattr(cli_run, "_scans", lambda given: [double(given.data)])
     assert cli_run.main([str(tmp_path), str(tmp_path / "r"), "--method", "test_run:good"]) == 0
     assert seen[0] == 1 and seen[-1] == 2  # after the first run, and at the end
+
+
+def test_a_method_that_never_ran_is_guessed_from_the_time_of_fdk(smallest, tmp_path, capsys):
+    told = [
+        str(smallest),
+        str(tmp_path / "results"),
+        "--dry-run",
+        "--no-anchor",
+        "--method",
+        "fdk",
+        "--method",
+        "splat",
+    ]
+    assert cli_run.main(told) == 0
+    out = capsys.readouterr().out
+    assert "unknown" not in out and "guessed from FDK's time: fdk, splat" in out
+
+
+@pytest.mark.parametrize(
+    "name, overrides, expected",
+    [
+        ("fdk", {}, 1.0),
+        ("sirt", {"iterations": 7}, 7 * FDKS["sirt"]),
+        ("splat", {}, 10 * FDKS["splat"]),
+        ("splat", {"passes": [1, 2]}, 3 * FDKS["splat"]),
+        ("splat", {"preset": "r2"}, 30_000 * FDKS["splat r2"]),
+        ("splat", {"preset": "paper", "steps": 100}, 100 * FDKS["splat paper"]),
+    ],
+)
+def test_a_guess_counts_iterations_passes_or_steps(name, overrides, expected):
+    assert in_fdks(find(name, overrides)) == pytest.approx(expected)
+
+
+def test_every_method_of_the_table_has_a_guess_and_others_have_none():
+    assert set(TABLE) <= set(FDKS)
+    assert in_fdks(method("my:method")) is None
+
+
+def test_fdk_s_time_is_that_of_a_small_scan_times_what_is_more_of_it(monkeypatch):
+    seen = []
+    monkeypatch.setattr(estimates, "fdk", lambda scan: seen.append(scan.geometry))
+    large = Geometry(
+        dso=100.0, dsd=150.0, n_voxel=(256, 256, 256), d_voxel=(0.2,) * 3, n_detector=(512, 512), d_detector=(0.2, 0.2),
+        n_views=720, angles_deg=tuple(0.5 * k for k in range(720)),
+    )  # fmt: skip
+    assert fdk_seconds(large) > 0
+    assert [(g.n_voxel, g.n_views) for g in seen] == [((64, 64, 64), 64)] * 2

@@ -16,7 +16,7 @@ from ctsim.materials import attenuation
 from ctsim.store import list_scans, open_scan
 from ctsim.types import Status
 from reconstruct.fdk import reconstruct as fdk
-from reconstruct.splat import fast
+from reconstruct.splat.course import passes_over
 from reconstruct.splat.curve import MATERIALS, MaterialCurve
 from reconstruct.splat.lattice import Lattice
 from reconstruct.splat.level import Data, carve, coarser, refined, weighted
@@ -276,7 +276,7 @@ def test_where_a_pass_is_long_fewer_are_taken(sizes, views, given, expected):
     nothing = np.empty((0, 0, 0), np.float32)
     grids = [msgspec.structs.replace(GEOMETRY, n_views=n, n_voxel=(k, k, k)) for n, k in zip(views, sizes, strict=True)]
     levels = [Data(geometry=grid, p=nothing, weights=nothing) for grid in grids]
-    assert fast._passes(levels, given) == expected
+    assert passes_over(levels, given) == expected
 
 
 def test_values_without_sense_are_refused_by_name(stored):
@@ -300,3 +300,52 @@ def test_early_passes_and_coarser_grids_denoise_more(small, monkeypatch):
     assert np.allclose(np.reshape(coarse, (3, -1)) / coarse[-1], np.array([[4], [2], [1]]))
     assert np.allclose(np.reshape(fine, (5, -1)) / fine[-1], np.array([[8], [4], [2], [1], [1]]))
     assert coarse[-1] == pytest.approx(4 * fine[-1] / 2)  # half as many views
+
+
+class Interrupted(Exception):
+    pass
+
+
+def test_an_interrupted_fit_goes_on_to_the_same_bits(small, tmp_path, monkeypatch):
+    monkeypatch.setattr("reconstruct.splat.checkpoint.EVERY", 0.0)
+    shares: list[float] = []
+
+    def interrupt(progress):
+        shares.append(progress.share)
+        # on the coarse grid, at its end, at the fine one's start, and in its second pass
+        if len(shares) in {5, 9, 11, 25}:
+            raise Interrupted
+
+    told = {"passes": (1, 3), "checkpoints": str(tmp_path)}
+    with listen(interrupt, every=0.0):
+        for _ in range(4):
+            with pytest.raises(Interrupted):
+                reconstruct(small.scan, **told)
+            assert len(list(tmp_path.iterdir())) == 1
+        found = reconstruct(small.scan, **told)
+    whole = reconstruct(small.scan, passes=(1, 3))
+    assert torch.equal(found.values, whole.values)
+    assert found.details["misfit"] == whole.details["misfit"]
+    assert len(shares) == 8 + 3 * 8 + 4  # subsets; one that was cut off had been taken, but not written
+    assert not list(tmp_path.iterdir())
+
+
+def test_time_that_ran_out_can_be_given_later_also_for_another_read_out(small, tmp_path):
+    told = {"passes": (1, 1), "checkpoints": str(tmp_path)}
+    early = reconstruct(small.scan, seconds=0.0, **told)
+    assert 0 < early.details["view_updates"] < 20 and len(list(tmp_path.iterdir())) == 1
+    late = reconstruct(small.scan, readout=60.0, **told)
+    assert torch.equal(late.values, reconstruct(small.scan, passes=(1, 1), readout=60.0).values)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_checkpoint_is_refused(small, tmp_path):
+    told = {"passes": (1, 1), "checkpoints": str(tmp_path)}
+    reconstruct(small.scan, seconds=0.0, **told)
+    reconstruct(small.scan, seconds=0.0, **{**told, "tv": 0.5})
+    files = list(tmp_path.iterdir())
+    assert len(files) == 2  # other settings do not go on from it
+    for file in files:
+        np.savez(file, level=np.array(0))
+    with pytest.raises(InputError, match="delete it"):
+        reconstruct(small.scan, **told)

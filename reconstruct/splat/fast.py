@@ -5,9 +5,10 @@ to a grid finer than the volume's, as fine as the detector sees. No mask, no spe
 enter.
 """
 
+import dataclasses
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
@@ -23,9 +24,10 @@ from ctsim.types import Scan, Status, Volume
 from reconstruct.beam import Given, detected, refuse_beam
 from reconstruct.log import line_integrals
 from reconstruct.scatter import open_excess
+from reconstruct.splat.checkpoint import Checkpoint, identity_of
+from reconstruct.splat.course import PASSES, Course, levels_of, passes_over
 from reconstruct.splat.curve import STRONGEST, MaterialCurve
-from reconstruct.splat.lattice import Lattice
-from reconstruct.splat.level import Data, carve, coarser, refined, weighted
+from reconstruct.splat.level import Data, weighted
 from reconstruct.splat.ordered import Fit
 from reconstruct.splat.response import Response, basis_functions, evaluate, make_response, tangent
 from reconstruct.splat.volume import voxelise
@@ -33,16 +35,11 @@ from reconstruct.watch import Stopwatch
 
 OPEN = 5.0  # standard deviations of an open pixel below which a ray met nothing
 LEAST_OPEN = 0.01
-EMPTY = 0.05  # times water: a voxel of the coarser volume below that holds no splat
 VIEWS, SHORTEST = 12, 0.5  # views whose pixels stand for all, and the least path in voxels that counts as one
 DENSEST = 15.0  # times water, that is no metal: enamel 9, titanium 43
-SMALLEST = 24  # voxels along an axis below which there is no coarser level
 AT_THE_END, FEW, FEWEST = 0.9, 1e-4, 10
 """Share of the curve's last attenuation, which no metal has; the share of the splats, or how many, that may have it."""
 RESPONSES = ("tube", "known")
-PASSES, MOST = (3, 7), 6e10
-"""Passes over each coarser grid and the finest, fewer where one would meet more than so many voxels, one a view."""
-COARSER = 4.0  # times the denoising on a coarser grid
 Image = NDArray[np.float32]
 
 
@@ -56,9 +53,10 @@ class Settings:
     grid is `fineness` times that of the volume, at most as fine as the detector's pixels at the isocentre. `response`
     "tube" is a tube behind `filtration` mm of aluminium, seen by a scintillator; "known" takes `tube` and `detector`,
     tables of a scene file, whole or in part. `readout` is an energy in keV, or "hardened": by the object's own water.
-    After `seconds` it returns what there is. `scatter` is what every reading holds of it over the open field (S/I0);
-    None has it found in the pixels that no shadow reaches (`open_excess`), 0 is for scans whose open pixels are
-    brighter than their open field for another reason. Raises InputError for values that make no sense.
+    After `seconds` it returns what there is. `checkpoints` is a folder where an unfinished fit is kept each minute and
+    goes on from, "" for none. `scatter` is what every reading holds of it over the open field (S/I0); None has it found
+    in the pixels that no shadow reaches (`open_excess`), 0 is for scans whose open pixels are brighter than their open
+    field for another reason. Raises InputError for values that make no sense.
     """
 
     passes: tuple[int, int] | None = None
@@ -70,6 +68,7 @@ class Settings:
     detector: Given | Detector = None
     readout: float | Literal["hardened"] = "hardened"
     seconds: float = math.inf
+    checkpoints: str = ""
     scatter: float | None = None
 
     def __post_init__(self) -> None:
@@ -105,12 +104,9 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     data = weighted(finer(scan.geometry, settings.fineness), p.numpy(), valid, scatter)
     response = settings.make_response(scan.e_max)
 
-    def proceed(fit: Fit, whole: bool, share: float) -> bool:
-        stopwatch.tell(share, fit.loss)
-        stopwatch.show(fit.view_updates, lambda: _read(fit, settings, scan.geometry)[0], whole=whole)
-        return not stopwatch.over
-
-    fit = None if bool(clamped.all()) else _coarse_to_fine(data, response, settings, proceed)
+    fit = None
+    if not clamped.all():
+        fit = _fitted(_course(data, response, settings), scan, settings, stopwatch)
     details: dict[str, Any] = {
         "response": response.described(),
         "scatter": scatter,
@@ -135,6 +131,27 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         reason=reason,
         details=details,
     )
+
+
+def _fitted(course: Course, scan: Scan, settings: Settings, stopwatch: Stopwatch) -> Fit | None:
+    """Fit until the end or that of the time; keep what is unfinished, if that is asked for."""
+    kept = None
+    if settings.checkpoints:
+        # on what the state of a fit does not depend: its end, its read-out, and where it is kept
+        told = dataclasses.replace(settings, seconds=math.inf, readout="hardened", checkpoints="")
+        kept = Checkpoint(folder=Path(settings.checkpoints), identity=identity_of(scan, told))
+
+    def proceed(fit: Fit, whole: bool, share: float) -> bool:
+        stopwatch.tell(share, fit.loss)
+        stopwatch.show(fit.view_updates, lambda: _read(fit, settings, scan.geometry)[0], whole=whole)
+        if kept is not None and (kept.due() or stopwatch.over):
+            kept.write(course.state(fit))
+        return not stopwatch.over
+
+    fit = course.go(proceed, kept)
+    if kept is not None and not stopwatch.over:
+        kept.remove()
+    return fit
 
 
 def _verdict(fit: Fit, values: Image) -> tuple[Status, str]:
@@ -174,50 +191,17 @@ def _read(fit: Fit, settings: Settings, geometry: Geometry) -> tuple[Image, Imag
     return np.float32(weights[0]) * rho[0] + np.float32(weights[1]) * rho[1], rho, how
 
 
-def _coarse_to_fine(
-    data: Data, response: Response, settings: Settings, proceed: Callable[[Fit, bool, float], bool]
-) -> Fit | None:
-    """Fit level by level while `proceed(fit, whole, share of the work)`; None where the scan shows nothing."""
+def _course(data: Data, response: Response, settings: Settings) -> Course:
     met = max(OPEN / math.sqrt(_open_photons(data)), LEAST_OPEN)
-    curve = MaterialCurve.of(response, _rough_length(data, response, met))
-    levels = [data]
-    while (settings.passes or PASSES)[0] and min(levels[0].geometry.n_voxel) >= 2 * SMALLEST:
-        levels.insert(0, coarser(levels[0]))
-    passes = _passes(levels, settings.passes)
-    updates = np.array([n * level.geometry.n_views for n, level in zip(passes, levels, strict=True)])
-    work = updates * [math.prod(level.geometry.n_voxel) for level in levels]
-    fit, done = None, 0
-    for k, level in enumerate(levels):
-        if fit is None:
-            support = carve(level, met)
-            start = np.where(support, curve.water, 0).astype(np.float32)
-        else:
-            start = refined(fit.volume(), level.geometry)
-            support = start > EMPTY * curve.water
-        if not support.any():
-            return None
-        lattice = Lattice(geometry=level.geometry, support=support)
-        u = lattice.gather(start)
-        tv = settings.tv * (1 if level is data else COARSER)
-        fit = Fit(data=level, lattice=lattice, response=response, curve=curve, u=u, tv=tv, view_updates=done)
-
-        def go_on(fit: Fit, whole: bool, k: int = k, done: int = done) -> bool:
-            here = work[k] * (fit.view_updates - done) / updates[k]
-            return proceed(fit, whole, float((work[:k].sum() + here) / work.sum()))
-
-        if not fit.run(passes[k], go_on):
-            break
-        done = fit.view_updates
-    return fit
-
-
-def _passes(levels: list[Data], given: tuple[int, int] | None) -> list[int]:
-    """Return the passes over each level, coarsest first; a level that is alone has those of all."""
-    most = [(given or PASSES)[level is levels[-1]] for level in levels] if len(levels) > 1 else [sum(given or PASSES)]
-    if given is not None:
-        return most
-    work = [level.geometry.n_views * math.prod(level.geometry.n_voxel) for level in levels]
-    return [min(n, max(int(MOST / each), 1)) for n, each in zip(most, work, strict=True)]
+    levels = levels_of(data, coarse=(settings.passes or PASSES)[0] > 0)
+    return Course(
+        levels=levels,
+        passes=passes_over(levels, settings.passes),
+        response=response,
+        curve=MaterialCurve.of(response, _rough_length(data, response, met)),
+        met=met,
+        tv=settings.tv,
+    )
 
 
 def _open_photons(data: Data) -> float:

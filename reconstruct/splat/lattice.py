@@ -63,6 +63,11 @@ class Lattice:
         )
 
     @property
+    def dual(self) -> NDArray[np.float32]:
+        """The denoiser's dual field, with which it starts: [3, y, x, z]."""
+        return self._denoiser.dual
+
+    @property
     def padded(self) -> tuple[int, int]:
         """Size (y, x) of the support with room for the tails of a ramp filter, which fall as the distance squared."""
         n_y, n_x = (int(fft.next_fast_len(n + n // 4, real=True) or n) for n in self._size[:2])

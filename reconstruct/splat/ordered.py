@@ -9,8 +9,9 @@ a smaller error on a thorax with iron than three without.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,9 +60,11 @@ class Fit:
     loss: float = math.inf
     misfit: float = math.inf
     view_updates: int = 0
+    steps: int = 0
     projector: LatticeProjector = field(init=False)
     _curvature: Image = field(init=False)  # by both densities, summed over the views that it was measured in
     _measured: int = 0
+    _total: float = 0.0  # of the losses of this pass
     _pair: Image = field(init=False)  # densities, then sums by them: memory that is used again costs less than new
     _gradient: Image = field(init=False)
     _roots: Image = field(init=False)
@@ -80,23 +83,39 @@ class Fit:
         """
         n_views = self.data.geometry.n_views
         n = n_subsets(n_views)
-        every = max(REST, n // A_PASS)
-        for turn in range(1, passes + 1):
-            misfit = 0.0
-            threshold = self.tv * self.curve.water * 2 ** max(min(passes, SETTLED) - turn, 0)
-            for k, subset in enumerate(bit_reversed(n)):
-                views = np.arange(subset, n_views, n)
-                length = 1 / (1 + k / n) if turn == passes else 1.0
-                self.loss = self._step(views, turn == 1 and k % every == 0, length)
-                misfit += self.loss / n
-                if (k + 1) % every == 0 or k + 1 == n:
-                    hundreds = (k % every + 1) / n * n_views / 100
-                    self.u = self.lattice.denoise(self.u, threshold * hundreds, SMOOTHING)
-                if k + 1 == n:
-                    self.misfit = misfit
-                if not proceed(self, k + 1 == n):
-                    return False
+        order, every = bit_reversed(n), max(REST, n // A_PASS)
+        while self.steps < passes * n:
+            turn, k = divmod(self.steps, n)
+            views, last = np.arange(order[k], n_views, n), turn + 1 == passes
+            self.loss = self._step(views, turn == 0 and k % every == 0, 1 / (1 + k / n) if last else 1.0)
+            self.steps, self._total = self.steps + 1, (self._total if k else 0.0) + self.loss
+            if (k + 1) % every == 0 or k + 1 == n:
+                hundreds = (k % every + 1) / n * n_views / 100
+                threshold = self.tv * self.curve.water * 2 ** max(min(passes, SETTLED) - 1 - turn, 0)
+                self.u = self.lattice.denoise(self.u, threshold * hundreds, SMOOTHING)
+            if k + 1 == n:
+                self.misfit = self._total / n
+            if not proceed(self, k + 1 == n):
+                return False
         return True
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Return all that the next step depends on, as arrays that it changes."""
+        numbers = np.array([self.steps, self._measured, self.view_updates])
+        reals = np.array([self.loss, self.misfit, self._total])
+        return {
+            "u": self.u,
+            "curvature": self._curvature,
+            "dual": self.lattice.dual,
+            "numbers": numbers,
+            "reals": reals,
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from a state. Raises KeyError where something is missing, ValueError where it does not fit."""
+        self.steps, self._measured, self.view_updates = state["numbers"].tolist()
+        self.loss, self.misfit, self._total = state["reals"].tolist()
+        self.u[...], self._curvature[...], self.lattice.dual[...] = state["u"], state["curvature"], state["dual"]
 
     def volume(self) -> Image:
         """Return u on the voxel grid, a mean over each voxel: [z, y, x] in 1/mm."""

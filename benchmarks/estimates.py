@@ -1,0 +1,73 @@
+"""What a method that has never run will about take: so many times FDK's time, which is measured on a small scan."""
+
+import functools
+import math
+import time
+
+import msgspec
+import torch
+
+from benchmarks.methods import Method
+from ctsim.geometry import Geometry
+from ctsim.types import Scan
+from reconstruct.fdk import reconstruct as fdk
+from reconstruct.splat.course import PASSES
+from reconstruct.splat.published_settings import PRESETS
+
+FDKS = {
+    "fdk": 1.0,
+    "limar": 2.0,
+    "nmar": 4.4,
+    "bhc-poly": 6.8,
+    "water-precorrection": 1.7,
+    "ibhc": 2.7,
+    "sart": 3.0,
+    "os-sart": 2.3,
+    "sirt": 1.5,
+    "cgls": 1.3,
+    "fista-tv": 1.5,
+    "asd-pocs": 2.3,
+    "awpcsd": 3.7,
+    "splat": 3.4,
+    "splat paper": 0.49,
+    "splat r2": 1.27,
+}
+"""Cost in FDKs as measured on lung-Fe of `quick`: of an iteration, a pass or a step where a method has those."""
+UNKNOWN = 5.0  # for a method that is not in the table
+AMOUNTS = ("iterations", "passes", "steps")
+SMALL = 64  # voxels along an axis and views, at most, of the scan on which FDK is timed
+
+
+def in_fdks(method: Method) -> float | None:
+    """Return about how many times FDK's time a run takes, None for a method that is not in the table."""
+    name, params = method.name, method.params
+    default: dict[str, tuple[int, int] | int] = {"splat": PASSES}
+    if name == "splat" and params["preset"] in PRESETS:
+        name = f"splat {params['preset']}"
+        default[name] = PRESETS[params["preset"]].steps
+    if name not in FDKS:
+        return None
+    told = next((params[key] for key in AMOUNTS if params.get(key) is not None), default.get(name, 1))
+    return FDKS[name] * (sum(told) if isinstance(told, tuple | list) else told)
+
+
+@functools.cache
+def fdk_seconds(geometry: Geometry) -> float:
+    """Return about what FDK takes, from a blank scan of fewer voxels and views, after a run that compiles."""
+    small = msgspec.structs.replace(
+        geometry,
+        n_voxel=tuple(min(n, SMALL) for n in geometry.n_voxel),
+        n_views=min(geometry.n_views, SMALL),
+        angles_deg=None,
+        poses=None if geometry.poses is None else geometry.poses[:SMALL],
+    )
+    blank = Scan(geometry=small, counts=torch.ones(small.shape), flat=torch.ones(small.n_detector))
+    fdk(blank)
+    start = time.perf_counter()
+    fdk(blank)
+    seconds = time.perf_counter() - start
+    return seconds * _work(geometry) / _work(small)
+
+
+def _work(geometry: Geometry) -> int:
+    return geometry.n_views * (math.prod(geometry.n_voxel) + math.prod(geometry.n_detector))

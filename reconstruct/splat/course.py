@@ -1,0 +1,127 @@
+"""The course of a fit from coarse to fine: its levels, how often each is gone through, and its state as arrays."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.errors import InputError
+from reconstruct.splat.checkpoint import Checkpoint
+from reconstruct.splat.curve import MaterialCurve
+from reconstruct.splat.lattice import Lattice
+from reconstruct.splat.level import Data, carve, coarser, refined
+from reconstruct.splat.ordered import Fit
+from reconstruct.splat.response import Response
+
+EMPTY = 0.05  # times water: a voxel of the coarser volume below that holds no splat
+SMALLEST = 24  # voxels along an axis below which there is no coarser level
+PASSES, MOST = (3, 7), 6e10
+"""Passes over each coarser grid and the finest, fewer where one would meet more than so many voxels, one a view."""
+COARSER = 4.0  # times the denoising on a coarser grid
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Course:
+    """The levels of a fit, coarsest first, and the passes over each.
+
+    `met` is how far p of a ray that met something lies above that of open ones; `tv` is the denoising of the finest
+    level.
+    """
+
+    levels: list[Data]
+    passes: list[int]
+    response: Response
+    curve: MaterialCurve
+    met: float
+    tv: float
+
+    def go(self, proceed: Callable[[Fit, bool, float], bool], kept: Checkpoint | None = None) -> Fit | None:
+        """Fit level by level while `proceed(fit, whole, share of the work)`; None where the scan shows nothing.
+
+        It goes on from what is kept, if anything is. Raises InputError where that is damaged.
+        """
+        fit = None if kept is None else self._restored(kept)
+        first = 0 if fit is None else self._level(fit)
+        for k in range(first, len(self.levels)):
+            if fit is None or self._level(fit) < k:
+                fit = self._begun(k, fit)
+            if fit is None or not fit.run(self.passes[k], lambda fit, whole: proceed(fit, whole, self._share(fit))):
+                break
+        return fit
+
+    def state(self, fit: Fit) -> dict[str, NDArray[Any]]:
+        """Return all that the next step depends on, as arrays that it changes."""
+        support = np.packbits(fit.lattice.support)
+        return {**fit.state(), "support": support, "level": np.array(self._level(fit))}
+
+    def _restored(self, kept: Checkpoint) -> Fit | None:
+        if (state := kept.read()) is None:
+            return None
+        try:
+            k = int(state["level"])
+            size = self.levels[k].geometry.n_voxel
+            bits = np.unpackbits(state["support"], count=math.prod(size))
+            fit = self._fit(k, bits.astype(bool).reshape(size), np.zeros(size, np.float32))
+            fit.restore(state)
+        except (KeyError, ValueError, IndexError) as error:
+            raise InputError(f"checkpoint {kept.path} is damaged ({error}): delete it to start anew") from None
+        return fit
+
+    def _begun(self, k: int, before: Fit | None) -> Fit | None:
+        """Return the fit of level k after that of the level before, None where there is nothing to fit."""
+        level, water = self.levels[k], self.curve.water
+        if before is None:
+            support = carve(level, self.met)
+            start = np.where(support, water, 0).astype(np.float32)
+        else:
+            start = refined(before.volume(), level.geometry)
+            support = start > EMPTY * water
+        if not support.any():
+            return None
+        return self._fit(k, support, start)
+
+    def _fit(self, k: int, support: NDArray[np.bool_], start: NDArray[np.float32]) -> Fit:
+        lattice = Lattice(geometry=self.levels[k].geometry, support=support)
+        return Fit(
+            data=self.levels[k],
+            lattice=lattice,
+            response=self.response,
+            curve=self.curve,
+            u=lattice.gather(start),
+            tv=self.tv * (1 if self.levels[k] is self.levels[-1] else COARSER),
+            view_updates=int(self._updates[:k].sum()),
+        )
+
+    def _level(self, fit: Fit) -> int:
+        return next(k for k, level in enumerate(self.levels) if level is fit.data)
+
+    @property
+    def _updates(self) -> NDArray[np.int64]:
+        return np.array([n * level.geometry.n_views for n, level in zip(self.passes, self.levels, strict=True)])
+
+    def _share(self, fit: Fit) -> float:
+        """Return the share of the work that is done, counted in voxels times views."""
+        k, updates = self._level(fit), self._updates
+        voxels = np.array([math.prod(level.geometry.n_voxel) for level in self.levels])
+        done = np.append(updates[:k], fit.view_updates - updates[:k].sum())
+        return float(done @ voxels[: k + 1] / (updates @ voxels))
+
+
+def levels_of(data: Data, coarse: bool) -> list[Data]:
+    """Return the data at each resolution, the coarsest first; at their own alone unless `coarse`."""
+    levels = [data]
+    while coarse and min(levels[0].geometry.n_voxel) >= 2 * SMALLEST:
+        levels.insert(0, coarser(levels[0]))
+    return levels
+
+
+def passes_over(levels: list[Data], given: tuple[int, int] | None) -> list[int]:
+    """Return the passes over each level, coarsest first; a level that is alone has those of all."""
+    most = [(given or PASSES)[level is levels[-1]] for level in levels] if len(levels) > 1 else [sum(given or PASSES)]
+    if given is not None:
+        return most
+    work = [level.geometry.n_views * math.prod(level.geometry.n_voxel) for level in levels]
+    return [min(n, max(int(MOST / each), 1)) for n, each in zip(most, work, strict=True)]
