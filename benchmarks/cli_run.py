@@ -60,7 +60,8 @@ class Arguments:
     collect: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="OTHER [OTHER ...]")] = ()
     """Take over what these results folders of other machines have and RESULTS lacks, then only render the tables."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Print which runs are to do, in their order, with what they took the last time; write nothing."""
+    """Print which runs are to do, in their order, with what they took the last time or, where
+    they never ran, a guess from the time of FDK; write nothing."""
     workers: int = 1
     """Do so many runs at once, each with its share of the cores; times are then those of a shared machine."""
     scheduler: Annotated[str | None, tyro.conf.arg(metavar="tcp://HOST:PORT")] = None

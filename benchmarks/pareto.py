@@ -250,14 +250,15 @@ def _planned(given: Arguments, part: Part, scene: str) -> list[tuple[str, str, f
         return [(curve, identity, usual) for curve, identity in every]
     data = given.out / "data"
     (recipe,) = make_dataset.select(make_dataset.load(given.suite), (scene,), ())
-    fdk = estimates.fdk_seconds(recipe.resolve().geometry)
+    geometry = recipe.resolve().geometry
+    fdk = estimates.fdk_seconds(geometry)
     made = is_complete(data, scene, scene_id(recipe))
     bench = pareto_methods.Bench(data / scene) if made else None
     return [
         (
             e.method.name,
             bench.setting(e, machine()).identity if bench else "",
-            fdk * (estimates.in_fdks(e.method) or estimates.UNKNOWN),
+            fdk * (estimates.in_fdks(e.method, geometry) or estimates.UNKNOWN),
         )
         for e in _efforts(given)
     ]

@@ -285,11 +285,12 @@ def checked(outcome: Outcome, shape: tuple[int, int, int]) -> Outcome:
 def warm_up(method: Method, scan: "Scan", device: str) -> float:
     """Run the method on a tiny scan of the same kind, so that compiling is not timed; return its seconds.
 
-    A method that can be told how many seconds it may take gets one. Its own complaint about the tiny scan is not its
-    result and is only logged.
+    A method that can be told how many seconds it may take gets one, and it keeps nothing that a later run would go on
+    from. Its own complaint about the tiny scan is not its result and is only logged.
     """
-    if "seconds" in method.params:
-        method = dataclasses.replace(method, overrides={**method.overrides, "seconds": WARM})
+    told = {"seconds": WARM, "checkpoints": None}
+    told = {name: value for name, value in told.items() if name in method.params}
+    method = dataclasses.replace(method, overrides={**method.overrides, **told})
     with measured() as usage:
         try:
             method.reconstruct(tiny(scan), device)

@@ -85,8 +85,9 @@ def estimated(task: Task) -> float | None:
     """Guess the seconds of a run from FDK's time on this machine, None for a method of the user's own."""
     from benchmarks.estimates import fdk_seconds, in_fdks
 
-    fdks = in_fdks(task.method)
-    return None if fdks is None else fdks * fdk_seconds(task.stored.geometry)
+    geometry = task.stored.geometry
+    fdks = in_fdks(task.method, geometry)
+    return None if fdks is None else fdks * fdk_seconds(geometry)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

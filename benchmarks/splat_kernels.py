@@ -123,7 +123,11 @@ def _error(found: np.ndarray, reference: np.ndarray) -> float:
 
 def _row(case: str, name: str, seconds: float, count: int, error: float | None) -> str:
     off = "–" if error is None else f"{error:.1e}"
-    return f"{case} | {name} | {1e3 * seconds:.1f} | {1e9 * seconds / count:.1f} | {off}"
+    return f"{case} | {name} | {_digits(1e3 * seconds)} | {_digits(1e9 * seconds / count)} | {off}"
+
+
+def _digits(value: float) -> str:
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
 if __name__ == "__main__":

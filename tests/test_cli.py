@@ -89,3 +89,12 @@ def test_the_cpu_is_always_there():
     check_device("cpu")
     with pytest.raises(InputError, match="no such kind"):
         check_device("abacus")
+
+
+def test_what_cannot_go_on_does_not_say_that_it_will(monkeypatch, capsys):
+    def stopped(_arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("benchmarks.tune_nmar.main", stopped)
+    assert cli.guarded("tune_nmar", "benchmarks.tune_nmar", [], resumes=False) == 130
+    assert "begins anew" in capsys.readouterr().err

@@ -16,6 +16,16 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 
 OPTIONS = run.Options(keep_volumes=False)
+CIRCLE = Geometry(
+    dso=100.0,
+    dsd=150.0,
+    n_voxel=(128, 128, 128),
+    d_voxel=(0.2,) * 3,
+    n_detector=(512, 512),
+    d_detector=(0.15, 0.15),
+    n_views=360,
+    angles_deg=tuple(float(k) for k in range(360)),
+)
 
 
 def method(name: str) -> Method:
@@ -191,27 +201,37 @@ def test_a_method_that_never_ran_is_guessed_from_the_time_of_fdk(smallest, tmp_p
     [
         ("fdk", {}, 1.0),
         ("sirt", {"iterations": 7}, 7 * FDKS["sirt"]),
-        ("splat", {}, 10 * FDKS["splat"]),
-        ("splat", {"passes": [1, 2]}, 3 * FDKS["splat"]),
+        ("sirt", {"iterations": "many"}, None),
+        ("splat", {}, 7 * 1.5**3 * FDKS["splat"]),
+        ("splat", {"passes": [1, 2], "fineness": 1}, 2 * FDKS["splat"]),
         ("splat", {"preset": "r2"}, 30_000 * FDKS["splat r2"]),
         ("splat", {"preset": "paper", "steps": 100}, 100 * FDKS["splat paper"]),
     ],
 )
 def test_a_guess_counts_iterations_passes_or_steps(name, overrides, expected):
-    assert in_fdks(find(name, overrides)) == pytest.approx(expected)
+    found = in_fdks(find(name, overrides), CIRCLE)
+    assert found is None if expected is None else found == pytest.approx(expected)
+
+
+def test_where_a_pass_is_long_splat_is_guessed_with_fewer():
+    long = msgspec.structs.replace(CIRCLE, n_views=10_000, angles_deg=None)
+    assert in_fdks(find("splat"), long) == pytest.approx(1 * 1.5**3 * FDKS["splat"])
 
 
 def test_every_method_of_the_table_has_a_guess_and_others_have_none():
     assert set(TABLE) <= set(FDKS)
-    assert in_fdks(method("my:method")) is None
+    assert in_fdks(method("my:method"), CIRCLE) is None
 
 
 def test_fdk_s_time_is_that_of_a_small_scan_times_what_is_more_of_it(monkeypatch):
     seen = []
     monkeypatch.setattr(estimates, "fdk", lambda scan: seen.append(scan.geometry))
-    large = Geometry(
-        dso=100.0, dsd=150.0, n_voxel=(256, 256, 256), d_voxel=(0.2,) * 3, n_detector=(512, 512), d_detector=(0.2, 0.2),
-        n_views=720, angles_deg=tuple(0.5 * k for k in range(720)),
-    )  # fmt: skip
+    large = CIRCLE
     assert fdk_seconds(large) > 0
     assert [(g.n_voxel, g.n_views) for g in seen] == [((64, 64, 64), 64)] * 2
+
+
+def test_the_time_of_fdk_is_found_for_poses_which_fdk_itself_refuses():
+    poses = tuple(map(tuple, msgspec.structs.replace(CIRCLE, n_views=9, angles_deg=None).pose_array().tolist()))
+    small = {"n_voxel": (8, 8, 8), "n_detector": (8, 8), "n_views": 9, "angles_deg": None, "poses": poses}
+    assert fdk_seconds(msgspec.structs.replace(CIRCLE, **small)) > 0

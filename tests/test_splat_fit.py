@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from benchmarks.make_dataset import main as make_dataset
+from benchmarks.methods import find
 from benchmarks.metrics import psnr3d
 from benchmarks.protocol import tissue_score, truth_of
+from benchmarks.run import warm_up
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
@@ -336,6 +338,25 @@ def test_time_that_ran_out_can_be_given_later_also_for_another_read_out(small, t
     assert 0 < early.details["view_updates"] < 20 and len(list(tmp_path.iterdir())) == 1
     late = reconstruct(small.scan, readout=60.0, **told)
     assert torch.equal(late.values, reconstruct(small.scan, passes=(1, 1), readout=60.0).values)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_budget_counts_what_was_spent_before_an_interruption(small, tmp_path):
+    told = {"passes": (1, 1), "checkpoints": str(tmp_path)}
+    reconstruct(small.scan, seconds=1e-9, **told)
+    (file,) = tmp_path.iterdir()
+    with np.load(file) as kept:
+        np.savez(tmp_path / "later", **{**kept, "seconds": np.array(1000.0)})
+    (tmp_path / "later.npz").replace(file)
+    left = []
+    with listen(left.append, every=0.0):
+        found = reconstruct(small.scan, seconds=1000.0, **told)
+    assert len(left) == 1 and left[0].seconds > 1000 and left[0].remaining == 0
+    assert found.details["view_updates"] < 20 and list(tmp_path.iterdir()) == [file]
+
+
+def test_warming_up_keeps_nothing_that_a_run_would_go_on_from(small, tmp_path):
+    assert warm_up(find("splat", {"checkpoints": str(tmp_path)}), small.scan, "cpu") > 0
     assert not list(tmp_path.iterdir())
 
 

@@ -1,15 +1,14 @@
 """The course of a fit from coarse to fine: its levels, how often each is gone through, and its state as arrays."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.errors import InputError
-from reconstruct.splat.checkpoint import Checkpoint
+from ctsim.geometry import Geometry
 from reconstruct.splat.curve import MaterialCurve
 from reconstruct.splat.lattice import Lattice
 from reconstruct.splat.level import Data, carve, coarser, refined
@@ -19,7 +18,7 @@ from reconstruct.splat.response import Response
 EMPTY = 0.05  # times water: a voxel of the coarser volume below that holds no splat
 SMALLEST = 24  # voxels along an axis below which there is no coarser level
 PASSES, MOST = (3, 7), 6e10
-"""Passes over each coarser grid and the finest, fewer where one would meet more than so many voxels, one a view."""
+"""Passes over each coarser grid and the finest; fewer, at least one, where all of a grid would meet more voxels."""
 COARSER = 4.0  # times the denoising on a coarser grid
 
 
@@ -38,12 +37,11 @@ class Course:
     met: float
     tv: float
 
-    def go(self, proceed: Callable[[Fit, bool, float], bool], kept: Checkpoint | None = None) -> Fit | None:
-        """Fit level by level while `proceed(fit, whole, share of the work)`; None where the scan shows nothing.
+    def go(self, proceed: Callable[[Fit, bool, float], bool], fit: Fit | None = None) -> Fit | None:
+        """Fit level by level while `proceed(fit, whole, share of the work)`, from a `fit` on that has begun.
 
-        It goes on from what is kept, if anything is. Raises InputError where that is damaged.
+        None where the scan shows nothing.
         """
-        fit = None if kept is None else self._restored(kept)
         first = 0 if fit is None else self._level(fit)
         for k in range(first, len(self.levels)):
             if fit is None or self._level(fit) < k:
@@ -57,17 +55,13 @@ class Course:
         support = np.packbits(fit.lattice.support)
         return {**fit.state(), "support": support, "level": np.array(self._level(fit))}
 
-    def _restored(self, kept: Checkpoint) -> Fit | None:
-        if (state := kept.read()) is None:
-            return None
-        try:
-            k = int(state["level"])
-            size = self.levels[k].geometry.n_voxel
-            bits = np.unpackbits(state["support"], count=math.prod(size))
-            fit = self._fit(k, bits.astype(bool).reshape(size), np.zeros(size, np.float32))
-            fit.restore(state)
-        except (KeyError, ValueError, IndexError) as error:
-            raise InputError(f"checkpoint {kept.path} is damaged ({error}): delete it to start anew") from None
+    def restored(self, state: Mapping[str, NDArray[Any]]) -> Fit:
+        """Return the fit of a state. Raises KeyError, IndexError or ValueError where it is none of this course."""
+        k = int(state["level"])
+        size = self.levels[k].geometry.n_voxel
+        bits = np.unpackbits(state["support"], count=math.prod(size))
+        fit = self._fit(k, bits.astype(bool).reshape(size), np.zeros(size, np.float32))
+        fit.restore(state)
         return fit
 
     def _begun(self, k: int, before: Fit | None) -> Fit | None:
@@ -123,5 +117,9 @@ def passes_over(levels: list[Data], given: tuple[int, int] | None) -> list[int]:
     most = [(given or PASSES)[level is levels[-1]] for level in levels] if len(levels) > 1 else [sum(given or PASSES)]
     if given is not None:
         return most
-    work = [level.geometry.n_views * math.prod(level.geometry.n_voxel) for level in levels]
-    return [min(n, max(int(MOST / each), 1)) for n, each in zip(most, work, strict=True)]
+    return [min(n, affordable(level.geometry)) for n, level in zip(most, levels, strict=True)]
+
+
+def affordable(geometry: Geometry) -> int:
+    """Return how many passes over the views of a grid stay below the most that is spent on one."""
+    return max(int(MOST / (geometry.n_views * math.prod(geometry.n_voxel))), 1)

@@ -48,15 +48,16 @@ class Settings:
     """What the preset "fast" may be told.
 
     `passes` over the views are those of each coarser level and of the finest; None makes them 3 and 7, or fewer, at
-    least one, where a level's views times its voxels would make more than 6e10, minutes of two cores. `tv` is the
-    threshold of denoising in units of water a hundred views, more in the first passes and on coarser levels. The finest
-    grid is `fineness` times that of the volume, at most as fine as the detector's pixels at the isocentre. `response`
-    "tube" is a tube behind `filtration` mm of aluminium, seen by a scintillator; "known" takes `tube` and `detector`,
-    tables of a scene file, whole or in part. `readout` is an energy in keV, or "hardened": by the object's own water.
-    After `seconds` it returns what there is. `checkpoints` is a folder where an unfinished fit is kept each minute and
-    goes on from, "" for none. `scatter` is what every reading holds of it over the open field (S/I0); None has it found
-    in the pixels that no shadow reaches (`open_excess`), 0 is for scans whose open pixels are brighter than their open
-    field for another reason. Raises InputError for values that make no sense.
+    least one, where the passes over a level times its views times its voxels would be more than 6e10, minutes of two
+    cores. `tv` is the threshold of denoising in units of water a hundred views, more in the first passes and on coarser
+    levels. The finest grid is `fineness` times that of the volume, at most as fine as the detector's pixels at the
+    isocentre. `response` "tube" is a tube behind `filtration` mm of aluminium, seen by a scintillator; "known" takes
+    `tube` and `detector`, tables of a scene file, whole or in part. `readout` is an energy in keV, or "hardened": by
+    the object's own water. After `seconds`, those before an interruption included, it returns what there is.
+    `checkpoints` is a folder where an unfinished fit is kept each minute and goes on from, "" for none. `scatter` is
+    what every reading holds of it over the open field (S/I0); None has it found in the pixels that no shadow reaches
+    (`open_excess`), 0 is for scans whose open pixels are brighter than their open field for another reason. Raises
+    InputError for values that make no sense.
     """
 
     passes: tuple[int, int] | None = None
@@ -104,9 +105,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     data = weighted(finer(scan.geometry, settings.fineness), p.numpy(), valid, scatter)
     response = settings.make_response(scan.e_max)
 
-    fit = None
-    if not clamped.all():
-        fit = _fitted(_course(data, response, settings), scan, settings, stopwatch)
+    fit = None if clamped.all() else _fitted(_course(data, response, settings), scan, settings, stopwatch)
     details: dict[str, Any] = {
         "response": response.described(),
         "scatter": scatter,
@@ -135,23 +134,34 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
 
 def _fitted(course: Course, scan: Scan, settings: Settings, stopwatch: Stopwatch) -> Fit | None:
     """Fit until the end or that of the time; keep what is unfinished, if that is asked for."""
-    kept = None
-    if settings.checkpoints:
-        # on what the state of a fit does not depend: its end, its read-out, and where it is kept
-        told = dataclasses.replace(settings, seconds=math.inf, readout="hardened", checkpoints="")
-        kept = Checkpoint(folder=Path(settings.checkpoints), identity=identity_of(scan, told))
+    kept = _checkpoint(course, scan, settings) if settings.checkpoints else None
+    begun, over = None, False
+    if kept is not None and (state := kept.read()) is not None:
+        try:
+            begun, before = course.restored(state), float(state["seconds"])
+        except (KeyError, IndexError, ValueError) as error:
+            raise InputError(f"checkpoint {kept.path} is damaged ({error}): delete it to start anew") from None
+        stopwatch = Stopwatch(before + stopwatch.seconds, settings.seconds)
 
     def proceed(fit: Fit, whole: bool, share: float) -> bool:
+        nonlocal over
         stopwatch.tell(share, fit.loss)
         stopwatch.show(fit.view_updates, lambda: _read(fit, settings, scan.geometry)[0], whole=whole)
-        if kept is not None and (kept.due() or stopwatch.over):
-            kept.write(course.state(fit))
-        return not stopwatch.over
+        over = stopwatch.over
+        if kept is not None and (over or kept.due()):
+            kept.write({**course.state(fit), "seconds": np.array(stopwatch.seconds)})
+        return not over
 
-    fit = course.go(proceed, kept)
-    if kept is not None and not stopwatch.over:
+    fit = course.go(proceed, begun)
+    if kept is not None and not over:
         kept.remove()
     return fit
+
+
+def _checkpoint(course: Course, scan: Scan, settings: Settings) -> Checkpoint:
+    """Return where a fit is kept, named by what its state depends on: not by its end, its read-out, or the folder."""
+    told = dataclasses.replace(settings, seconds=math.inf, readout="hardened", checkpoints="")
+    return Checkpoint(folder=Path(settings.checkpoints), identity=identity_of(scan, (told, course.passes)))
 
 
 def _verdict(fit: Fit, values: Image) -> tuple[Status, str]:

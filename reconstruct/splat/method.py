@@ -20,12 +20,13 @@ PRESETS = ("fast", "paper", "r2")
 class Options:
     """What any preset may be told; None leaves what the preset says.
 
-    The first ones are those of `reconstruct.splat.fast.Settings`, of `published_settings.Settings` those from `basis`
-    on; `response`, `readout`, `tube` and `detector` belong to both.
+    Those down to `detector` are of `reconstruct.splat.fast.Settings`, those from `basis` on of
+    `published_settings.Settings`; `seconds`, `checkpoints`, `response`, `readout`, `tube` and `detector` are of both.
     """
 
     preset: str = "fast"
     seconds: float = math.inf
+    checkpoints: str | None = None
     response: str | None = None
     readout: float | Literal["hardened"] | None = None
     passes: tuple[int, int] | None = None
@@ -44,7 +45,6 @@ class Options:
     seed: int | None = None
     held_out: int | None = None
     patience: int | None = None
-    checkpoints: str | None = None
     n_splats: int | None = None
 
     def __post_init__(self) -> None:

@@ -32,7 +32,7 @@ REST, A_PASS = 4, 6
 """Denoisings are so many subsets apart, but six in a long pass; so are measurements of the curvature in the first."""
 SMOOTHING = 8  # iterations of a denoising
 SETTLED = 4
-"""The pass whose denoising is as asked for; from there back to the first it is twice as strong in each.
+"""The pass whose denoising is as asked for, or the last; from there back to the first it is twice as strong in each.
 
 What is then smoothed away too far is regained from the data, while streaks come back slowly.
 """
