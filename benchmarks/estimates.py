@@ -51,8 +51,9 @@ def in_fdks(method: Method, geometry: Geometry) -> float | None:
             name, default = f"splat {params['preset']}", PRESETS[params["preset"]].steps
         elif name == "splat":
             fine = finer(geometry, params["fineness"] or Settings().fineness)
-            passes = params["passes"] or (0, min(PASSES[1], affordable(fine)))
-            return FDKS[name] * passes[1] * math.prod(fine.n_voxel) / math.prod(geometry.n_voxel)
+            coarse, finest = params["passes"] or (PASSES[0], min(PASSES[1], affordable(fine)))
+            passes = finest + coarse / 15  # Σ 16⁻ⁿ: a coarser grid has an eighth of the voxels and half of the views
+            return FDKS[name] * passes * math.prod(fine.n_voxel) / math.prod(geometry.n_voxel)
         told = next((params[key] for key in AMOUNTS if params.get(key) is not None), default)
         return FDKS[name] * float(told)
     except (KeyError, IndexError, TypeError, ValueError):  # what is wrong with a parameter the method says better

@@ -170,7 +170,7 @@ def test_it_beats_fdk_with_and_without_metal(small):
     truth = truth_of(small)
     for scan in (small.scan, small.metal_free.scan):
         ours, theirs = (tissue_score(f(scan).values.numpy(), truth).values["rmse"] for f in (reconstruct, fdk))
-        assert ours < 0.8 * theirs  # measured: 0.72 on both
+        assert ours < 0.6 * theirs  # measured: 0.52 and 0.53
 
 
 def test_two_passes_over_the_finest_grid_reach_35_db(tmp_path):
