@@ -1,14 +1,20 @@
 """Files of records, one JSON line each, of commands that append as they measure and go on after they were stopped."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar, cast
 
 import msgspec
 
+from ctsim.durable import write_synced
 from ctsim.errors import InputError
 
 R = TypeVar("R", bound=msgspec.Struct)
+
+
+class _Dated(Protocol):
+    time: str
 
 
 def append(path: Path, *records: msgspec.Struct) -> None:
@@ -41,3 +47,24 @@ def read(path: Path, kind: type[R], what: str) -> list[R]:
         except msgspec.MsgspecError as error:
             raise InputError(f"{path}, line {number}: expected {what}: {error}") from None
     return found
+
+
+def collect(path: Path, others: Sequence[Path], kind: type[R], what: str) -> dict[Path, int]:
+    """Take over the records that `path` lacks of files of its name in other folders; return how many from each.
+
+    The file is replaced whole, all records in the order of their `time`, so that the newest is the last.
+    Raises InputError for a folder without records.
+    """
+    held = {msgspec.json.encode(record): record for record in read(path, kind, what)}
+    counts = {}
+    for other in others:
+        found = read(other / path.name, kind, what)
+        if not found:
+            raise InputError(f"--collect {other}: there are no records, expected a folder with {path.name}")
+        lacked = {line: record for record in found if (line := msgspec.json.encode(record)) not in held}
+        held |= lacked
+        counts[other] = len(lacked)
+    ordered = sorted(held, key=lambda line: cast(_Dated, held[line]).time)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_synced(path, b"".join(line + b"\n" for line in ordered))
+    return counts

@@ -15,7 +15,7 @@ import threading
 import time
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from multiprocessing import connection
@@ -65,7 +65,7 @@ def open_pool(workers: int, scheduler: str | None) -> contextlib.AbstractContext
 
 
 @dataclass(slots=True)
-class _Worker:
+class Worker:
     """A process, the pipe to it, and the number of the job that it has."""
 
     process: Any
@@ -78,7 +78,7 @@ class Local:
 
     def __init__(self, n: int) -> None:
         self._n = n
-        self._workers: list[_Worker] = []
+        self._workers: list[Worker] = []
 
     def __enter__(self) -> Self:
         return self
@@ -126,17 +126,17 @@ class Local:
                     raise answer
                 yield job, answer
 
-    def _idle(self) -> _Worker | None:
+    def _idle(self) -> Worker | None:
         """Return a worker without a job, a new one where there may be more, None where all are busy."""
         for worker in self._workers:
             if worker.job is None:
                 return worker
         if len(self._workers) == self._n:
             return None
-        self._workers.append(_start(self._n))
+        self._workers.append(start(threads_of(self._n)))
         return self._workers[-1]
 
-    def _bury(self, worker: _Worker) -> str:
+    def _bury(self, worker: Worker) -> str:
         """Forget a worker whose pipe is closed; say how it ended."""
         from benchmarks.isolate import how_it_ended
 
@@ -153,15 +153,17 @@ def threads_of(n: int) -> dict[str, str]:
     return {name: str(min(share, int(given)) if given.isdecimal() else share) for name, given in before.items()}
 
 
-def _start(n: int) -> _Worker:
-    """Start one of `n` workers. It does not hear Ctrl-C: the parent decides what that means."""
+def start(environment: Mapping[str, str]) -> Worker:
+    """Start a worker with these variables, such as `threads_of` a number of workers: libraries read them on import.
+
+    It does not hear Ctrl-C: the parent decides what that means.
+    """
     context = multiprocessing.get_context("spawn")
     mine, its = context.Pipe()
     process = context.Process(target=_serve, args=(its,))
-    share = threads_of(n)  # read when numba and torch are imported
-    before = {name: os.environ.get(name) for name in share}
+    before = {name: os.environ.get(name) for name in environment}
     heard = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited, so that it holds from the first instruction
-    os.environ.update(share)
+    os.environ.update(environment)
     try:
         process.start()
     finally:
@@ -172,7 +174,7 @@ def _start(n: int) -> _Worker:
                 os.environ[name] = value
         signal.signal(signal.SIGINT, heard)
     its.close()
-    return _Worker(process, mine)
+    return Worker(process, mine)
 
 
 def _serve(pipe: connection.Connection) -> None:

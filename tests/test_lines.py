@@ -1,0 +1,47 @@
+"""Files of records that commands append to, and what comes of several of them."""
+
+import msgspec
+import pytest
+
+from benchmarks import lines
+from ctsim.errors import InputError
+
+
+class Row(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    time: str
+    value: dict[str, float]
+
+
+def row(hour: int, value: float = 0.0) -> Row:
+    return Row(time=f"2026-01-01T{hour:02}:00:00+00:00", value={"error": value})
+
+
+def test_a_line_that_was_cut_short_is_left_out_and_written_over(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    lines.append(path, row(1))
+    with path.open("ab") as file:
+        file.write(b'{"time": "torn')
+    assert lines.read(path, Row, "a row") == [row(1)]
+    lines.append(path, row(2))
+    assert lines.read(path, Row, "a row") == [row(1), row(2)]
+
+
+def test_files_of_several_machines_are_one_in_the_order_of_time(tmp_path):
+    here, there, third = (tmp_path / name for name in ("here", "there", "third"))
+    for folder, rows in ((there, (row(1), row(4))), (third, (row(2), row(4), row(4, 1.0)))):
+        folder.mkdir()
+        lines.append(folder / "rows.jsonl", *rows)
+    path = here / "rows.jsonl"
+    assert lines.collect(path, (there, third), Row, "a row") == {there: 2, third: 2}
+    assert lines.read(path, Row, "a row") == [row(1), row(2), row(4), row(4, 1.0)]
+    lines.append(path, row(3))
+    assert lines.collect(path, (there,), Row, "a row") == {there: 0}
+    assert [found.time[11:13] for found in lines.read(path, Row, "a row")] == ["01", "02", "03", "04", "04"]
+
+
+def test_a_folder_without_records_changes_nothing(tmp_path):
+    lines.append(tmp_path / "rows.jsonl", row(1))
+    before = (tmp_path / "rows.jsonl").read_bytes()
+    with pytest.raises(InputError, match=r"--collect .*nowhere: there are no records, expected a folder with rows"):
+        lines.collect(tmp_path / "rows.jsonl", (tmp_path / "nowhere",), Row, "a row")
+    assert (tmp_path / "rows.jsonl").read_bytes() == before
