@@ -67,6 +67,19 @@ def test_columns_agree_with_splats(geometry):
     assert found.sum() == pytest.approx(exact.sum(), abs=1e-3 * np.abs(exact).sum())
 
 
+def test_exact_splats_are_those_of_the_exact_projector_and_its_transpose():
+    lattice = lattice_of(GEOMETRY)
+    projector, exact = LatticeProjector(GEOMETRY, lattice, exact=True), Projector(geometry=GEOMETRY, tolerance=0)
+    assert not projector.by_columns
+    values = np.random.default_rng(0).uniform(-1, 1, (len(lattice), 2)).astype(np.float32)
+    shapes, ewa = lattice.splats(values).shapes(), LatticeProjector(GEOMETRY, lattice)
+    found, expected = projector.forward(values, VIEWS), exact.forward(shapes, values, VIEWS)
+    np.testing.assert_array_equal(found, expected)
+    assert not np.array_equal(projector.pictures(found), ewa.pictures(ewa.forward(values, VIEWS)))
+    images = projector.arranged(np.random.default_rng(1).random((len(VIEWS), 2, *GEOMETRY.n_detector), np.float32))
+    np.testing.assert_array_equal(projector.adjoint(images, VIEWS), exact.adjoint(shapes, images, VIEWS))
+
+
 def test_each_column_is_its_product_of_gaussians_to_float32():
     lattice = lattice_of(GEOMETRY)
     projector, exact = LatticeProjector(GEOMETRY, lattice), Projector(geometry=GEOMETRY, tolerance=np.inf)

@@ -20,15 +20,15 @@ class LatticeProjector:
     """Projects the splats of `lattice`, in its order, along the rays of `geometry`, in two channels.
 
     Images lie as the kernels want them, [view, channel, u, v + 8] or as `Projector` has them: `arranged` puts pictures
-    [view, v, u] into that form, and `pictures` takes them out of it.
+    [view, v, u] into that form, and `pictures` takes them out of it. Splats are projected by EWA unless `exact`, which
+    has no columns: those of half a voxel span so small an angle that EWA is off by a thousandth of the peak at most.
     """
 
-    def __init__(self, geometry: Geometry, lattice: Lattice) -> None:
-        # splats of half a voxel span so small an angle that EWA leaves out about a thousandth of the peak at most
-        self._projector = Projector(geometry=geometry, tolerance=math.inf)
+    def __init__(self, geometry: Geometry, lattice: Lattice, *, exact: bool = False) -> None:
+        self._projector = Projector(geometry=geometry, tolerance=0 if exact else math.inf)
         self._n_detector, self._scale = geometry.n_detector, lattice.scale
         self._shapes = lattice.splats(np.zeros((len(lattice), 1), np.float32)).shapes()
-        self.by_columns = _upright(self._projector.cameras)
+        self.by_columns = not exact and _upright(self._projector.cameras)
         if self.by_columns:
             places = lattice.positions[:, :2]
             apart = np.any(places[1:] != places[:-1], axis=1) | (np.diff(lattice.index) != 1)

@@ -27,7 +27,7 @@ class Course:
     """The levels of a fit, coarsest first, and the passes over each.
 
     `met` is how far p of a ray that met something lies above that of open ones; `tv` is the denoising of the finest
-    level.
+    level; `exact` is how splats are projected.
     """
 
     levels: list[Data]
@@ -36,6 +36,7 @@ class Course:
     curve: MaterialCurve
     met: float
     tv: float
+    exact: bool
 
     def go(self, proceed: Callable[[Fit, bool, float], bool], fit: Fit | None = None) -> Fit | None:
         """Fit level by level while `proceed(fit, whole, share of the work)`, from a `fit` on that has begun.
@@ -86,6 +87,7 @@ class Course:
             curve=self.curve,
             u=lattice.gather(start),
             tv=self.tv * (1 if self.levels[k] is self.levels[-1] else COARSER),
+            exact=self.exact,
             view_updates=int(self._updates[:k].sum()),
         )
 

@@ -51,18 +51,19 @@ class Settings:
     least one, where the passes over a level times its views times its voxels would be more than 6e10, minutes of two
     cores. `tv` is the threshold of denoising in units of water a hundred views, more in the first passes and on coarser
     levels. The finest grid is `fineness` times that of the volume, at most as fine as the detector's pixels at the
-    isocentre. `response` "tube" is a tube behind `filtration` mm of aluminium, seen by a scintillator; "known" takes
-    `tube` and `detector`, tables of a scene file, whole or in part. `readout` is an energy in keV, or "hardened": by
-    the object's own water. After `seconds`, those before an interruption included, it returns what there is.
-    `checkpoints` is a folder where an unfinished fit is kept each minute and goes on from, "" for none. `scatter` is
-    what every reading holds of it over the open field (S/I0); None has it found in the pixels that no shadow reaches
-    (`open_excess`), 0 is for scans whose open pixels are brighter than their open field for another reason. Raises
-    InputError for values that make no sense.
+    isocentre. Its splats are projected by EWA, or if `exact` by their exact line integrals. `response` "tube" is a tube
+    behind `filtration` mm of aluminium, seen by a scintillator; "known" takes `tube` and `detector`, tables of a scene
+    file, whole or in part. `readout` is an energy in keV, or "hardened": by the object's own water. After `seconds`,
+    those before an interruption included, it returns what there is. `checkpoints` is a folder where an unfinished fit
+    is kept each minute and goes on from, "" for none. `scatter` is what every reading holds of it over the open field
+    (S/I0); None has it found in the pixels that no shadow reaches (`open_excess`), 0 is for scans whose open pixels are
+    brighter than their open field for another reason. Raises InputError for values that make no sense.
     """
 
     passes: tuple[int, int] | None = None
     tv: float = 0.025
     fineness: float = 1.5
+    exact: bool = False
     response: Literal["tube", "known"] = "tube"
     filtration: float = 0.5
     tube: Given | Tube = None
@@ -211,6 +212,7 @@ def _course(data: Data, response: Response, settings: Settings) -> Course:
         curve=MaterialCurve.of(response, _rough_length(data, response, met)),
         met=met,
         tv=settings.tv,
+        exact=settings.exact,
     )
 
 

@@ -32,6 +32,7 @@ class Options:
     passes: tuple[int, int] | None = None
     tv: float | None = None
     fineness: float | None = None
+    exact: bool | None = None
     filtration: float | None = None
     scatter: float | None = None
     tube: Mapping[str, Any] | None = None

@@ -48,7 +48,7 @@ class Fit:
     """The unknowns `u`, float32 [splat] in 1/mm of the hardened beam, on one lattice, and how they fare.
 
     `tv` is the denoiser's threshold a hundred views in units of water. `loss` is the mean |P − p| of the last subset,
-    `misfit` that of the last pass.
+    `misfit` that of the last pass. Splats are projected by EWA unless `exact`.
     """
 
     data: Data
@@ -57,6 +57,7 @@ class Fit:
     curve: MaterialCurve
     u: Image
     tv: float
+    exact: bool = False
     loss: float = math.inf
     misfit: float = math.inf
     view_updates: int = 0
@@ -70,7 +71,7 @@ class Fit:
     _roots: Image = field(init=False)
 
     def __post_init__(self) -> None:
-        self.projector = LatticeProjector(self.data.geometry, self.lattice)
+        self.projector = LatticeProjector(self.data.geometry, self.lattice, exact=self.exact)
         n = len(self.lattice)
         self._curvature, self._pair = np.zeros((n, 2), np.float32), np.empty((n, 2), np.float32)
         self._gradient, self._roots = np.empty(n, np.float32), np.empty(n, np.float32)
