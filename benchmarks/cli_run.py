@@ -50,7 +50,8 @@ class Arguments:
     isolate: tyro.conf.FlagCreatePairsOff[bool] = False
     """Run each method in a process of its own: exact peak memory, and a crash ends only that run."""
     seconds: float | None = None
-    """Time limit of one run, its start included; implies --isolate."""
+    """Time of one run; implies --isolate. A method with a parameter seconds, as splat, is told it and ends with what it
+    has by then; others, their start included, end with the status timeout."""
     keep_volumes: bool = True
     """Keep reconstructions as TIFF stacks; pictures are drawn from them."""
     anchor: bool = True
@@ -172,7 +173,7 @@ def _methods(given: Arguments) -> "list[Method]":
 
     names = tuple(dict.fromkeys(given.method)) or ("fdk",)
     overrides = methods.parse_overrides(given.set, names)
-    return [methods.find(name, overrides[name]) for name in names]
+    return [methods.within(methods.find(name, overrides[name]), given.seconds) for name in names]
 
 
 def _scans(given: Arguments) -> "list[Stored]":

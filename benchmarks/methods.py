@@ -133,6 +133,13 @@ def find(name: str, overrides: dict[str, Any] | None = None) -> Method:
     )
 
 
+def within(method: Method, seconds: float | None) -> Method:
+    """Tell a method how many seconds it has, where it can be told and was not."""
+    if seconds is None or "seconds" not in method.params or "seconds" in method.overrides:
+        return method
+    return find(method.name, {**method.overrides, "seconds": seconds})
+
+
 def _parameters(name: str, function: Callable[..., Any]) -> dict[str, Any]:
     """Return the keyword parameters with their defaults, as JSON values; scan and device are not among them."""
     parameters = list(inspect.signature(function).parameters.values())

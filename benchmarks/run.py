@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 STORE = "ctsim.store:open_scan"
+LATE = 120.0  # seconds beyond its own
 WARM = 1.0  # seconds that a warm-up lasts beyond compiling, where a method knows of time
 
 
@@ -41,7 +42,8 @@ WARM = 1.0  # seconds that a warm-up lasts beyond compiling, where a method know
 class Options:
     """How to run: `seconds` limits one run and implies `isolate`; `anchor` runs on the metal-free twins too.
 
-    `store` names the function that opens a scan's folder.
+    A method that was told these seconds has `LATE` more to start and to end. `store` names the function that opens a
+    scan's folder.
     """
 
     device: str = "cpu"
@@ -221,7 +223,10 @@ def run_one(task: Task, options: Options, warm: dict[tuple[str, str, str], float
     """Run one task. `warm` remembers which methods are compiled for which counts."""
     outcome = _skip(task)
     if outcome is None and (options.isolate or options.seconds is not None):
-        return run_apart(options.store, task.stored.folder, task.variant, task.method, options.device, options.seconds)
+        limit = options.seconds
+        if limit is not None and task.method.overrides.get("seconds") == limit:
+            limit += LATE
+        return run_apart(options.store, task.stored.folder, task.variant, task.method, options.device, limit)
     if outcome is None:
         key = (task.method.label, str(task.scan.counts.dtype), options.device)
         if key not in warm:

@@ -1,6 +1,7 @@
 """Which runs are to be done, in what order, what they will take; and doing them, here or on workers."""
 
 import functools
+import math
 import pkgutil
 import statistics
 from collections.abc import Callable, Iterator
@@ -87,7 +88,8 @@ def estimated(task: Task) -> float | None:
 
     geometry = task.stored.geometry
     fdks = in_fdks(task.method, geometry)
-    return None if fdks is None else fdks * fdk_seconds(geometry)
+    told = task.method.params.get("seconds") or math.inf
+    return None if fdks is None else min(fdks * fdk_seconds(geometry), told)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -101,6 +101,13 @@ def slow(scan, *, device):
     time.sleep(60)
 
 
+def punctual(scan, *, device, seconds=None):
+    import time
+
+    time.sleep(0.2 if seconds is None else seconds)
+    return good(scan, device=device)
+
+
 def crash(scan, *, device):
     os._exit(7)
 
@@ -154,6 +161,16 @@ def test_a_time_limit_is_a_status(tmp_path):
     assert record.status == "timeout" and "0.5 s" in record.reason
     with pytest.raises(InputError, match="seconds"):
         run.Options(seconds=-1)
+
+
+def test_a_method_that_can_be_told_its_seconds_ends_by_itself(tmp_path):
+    told = methods.within(methods.find("test_run:punctual"), 0.5)
+    assert told.label == "test_run:punctual[seconds=0.5]"
+    options = run.Options(store="test_run:open_double", seconds=0.5, anchor=False)  # less than a process has to start
+    (outcome,) = (run.run_one(task, options, {}) for task in run.tasks([double(tmp_path)], [told], options))
+    assert outcome.status == "ok" and outcome.cost.wall > 0.5
+    mine = methods.find("test_run:punctual", {"seconds": 0.1})
+    assert methods.within(mine, 0.5) == mine and methods.within(methods.find("fdk"), 0.5) == methods.find("fdk")
 
 
 def test_a_rerun_does_only_what_is_missing(tmp_path):

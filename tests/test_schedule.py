@@ -1,6 +1,7 @@
 """Which runs come first, what they are said to take, records of several machines, and tables in any order of ends."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -216,6 +217,13 @@ def test_a_guess_counts_iterations_passes_or_steps(name, overrides, expected):
 def test_where_a_pass_is_long_splat_is_guessed_with_fewer():
     long = msgspec.structs.replace(CIRCLE, n_views=10_000, angles_deg=None)
     assert in_fdks(find("splat"), long) == pytest.approx((1 + 3 / 15) * 1.5**3 * FDKS["splat"])
+
+
+def test_a_method_that_has_so_many_seconds_is_guessed_to_take_no_more(monkeypatch):
+    monkeypatch.setattr(estimates, "fdk_seconds", lambda geometry: 100.0)
+    stored = SimpleNamespace(geometry=CIRCLE)
+    told, free = (SimpleNamespace(method=find("splat", given), stored=stored) for given in ({"seconds": 9.0}, {}))
+    assert schedule.estimated(told) == 9.0 < schedule.estimated(free)
 
 
 def test_every_method_of_the_table_has_a_guess_and_others_have_none():
