@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.protocol import Score, Stored, Truth
+from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 
 N_VIEWS = 12
@@ -77,6 +78,8 @@ def held_out(stored: Stored) -> HeldOut | str:
         return "scene.toml describes another geometry than the scan's: held-out views are not its own"
     try:
         return _simulated(scene, views, stored)
+    except InputError as error:  # such as a CT volume's file that is not here
+        return f"held-out views cannot be simulated: {' '.join(str(error).split())}"
     except MemoryError:
         return "there was not enough memory to simulate held-out views"
 

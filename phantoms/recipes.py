@@ -19,8 +19,9 @@ from phantoms.body_lung import Lung, lung
 from phantoms.body_organic import BellPepper, Chicken, Walnut, bell_pepper, chicken, walnut
 from phantoms.body_random import Random, random
 from phantoms.body_teeth import Teeth, teeth
+from phantoms.body_volume import CtVolume, ct_volume
 
-AnyRecipe = Validation | MetalRods | Lung | Teeth | Broccoli | Walnut | Chicken | BellPepper | Random
+AnyRecipe = Validation | MetalRods | Lung | Teeth | Broccoli | Walnut | Chicken | BellPepper | Random | CtVolume
 
 Builder = Callable[[Shape, Triple, np.random.Generator, Any], Phantom]
 
@@ -34,6 +35,7 @@ BUILDERS: dict[type[Recipe], Builder] = {
     Chicken: chicken,
     BellPepper: bell_pepper,
     Random: random,
+    CtVolume: ct_volume,
 }
 
 NAMES = tuple(str(kind.__struct_config__.tag) for kind in BUILDERS)

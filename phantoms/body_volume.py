@@ -1,0 +1,149 @@
+"""A CT volume from a file as a body: grey values become tissue and its density, metal is put into it."""
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.errors import InputError
+from ctsim.geometry import Triple
+from ctsim.materials import attenuation
+from ctsim.solids import Solid
+from ctsim.types import Phantom
+from phantoms.bodies import REACH, Millimetres, Recipe, Shape, assemble, half_box
+from phantoms.inserts import count, diameter, inserts
+
+TISSUES = ("air", "lung", "adipose", "soft_tissue", "cortical_bone")
+FROM_HU = (-900.0, -250.0, -20.0, 200.0)
+"""The HU from which a voxel is the next of `TISSUES`."""
+LENGTH = 3.0  # of an insert, in its diameters
+
+
+class CtVolume(Recipe, frozen=True, kw_only=True, tag="ct_volume"):
+    """A CT volume with metal capsules in its bone (Ti by default), two unless `n_inserts` or `at` say otherwise.
+
+    `path` is a TIFF stack or .npy array [z, y, x], z upwards, of voxels of `spacing` mm (z, y, x), whose value v is
+    v·rescale[0] + rescale[1] HU. Its middle comes to that of the cube of `size`; what lies beyond the object's reach
+    is cut off. At `kev` every voxel has the attenuation of its HU. `at` are the inserts' centres (x, y, z) in mm from
+    the middle. `sha256` is the file's, filled in where it is empty; another file is refused.
+    """
+
+    path: str
+    spacing: tuple[Millimetres, Millimetres, Millimetres]
+    metal: str = "Ti"
+    rescale: tuple[float, float] = (1.0, 0.0)
+    kev: float = 70.0
+    at: tuple[Triple, ...] = ()
+    sha256: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the ranges; take the file's hash, so that the recipe says what is scanned."""
+        Recipe.__post_init__(self)
+        self.within("kev", 20, 200)
+        if not np.isfinite(self.rescale).all() or self.rescale[0] <= 0:
+            raise InputError(f"rescale must be a positive slope and an intercept in HU, got {self.rescale}")
+        if self.at and self.n_inserts not in (None, len(self.at)):
+            raise InputError(f"n_inserts is {self.n_inserts}, but at has {len(self.at)} places; give one of them")
+        if not self.sha256:
+            msgspec.structs.force_setattr(self, "sha256", _digest(self.path))
+
+
+def ct_volume(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: CtVolume) -> Phantom:
+    """Resample a CT volume linearly, split it by its HU into tissues of its own density, put metal into it.
+
+    Raises InputError for a file that cannot be read, is none of a volume, or is not the recipe's.
+    """
+    hu = _read(params)
+    labels, density = _tissues(_resampled(hu, params, n, d_voxel), params.kev)
+    phantom = assemble(labels, d_voxel, TISSUES, _inserts(hu, params, half_box(n, d_voxel), rng))
+    return Phantom(
+        labels=phantom.labels,
+        materials=phantom.materials,
+        d_voxel=d_voxel,
+        density=density,
+        solids=phantom.solids,
+    )
+
+
+def _digest(path: str) -> str:
+    try:
+        with Path(path).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"path: {path} cannot be read ({error.strerror}); expected a TIFF stack or a .npy") from None
+
+
+def _read(params: CtVolume) -> NDArray[np.float32]:
+    """Return the file's volume in HU."""
+    if (found := _digest(params.path)) != params.sha256:
+        raise InputError(f"path: {params.path} has the SHA-256 {found}, the scene was made of {params.sha256}")
+    try:
+        if params.path.endswith(".npy"):
+            values = np.load(params.path, allow_pickle=False)
+        else:
+            import tifffile
+
+            values = tifffile.imread(params.path)
+    except Exception as error:  # whatever a decoder says of a file that is not one
+        raise InputError(f"path: {params.path} is no TIFF stack or .npy array: {error}") from None
+    if values.ndim != 3 or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+        raise InputError(
+            f"path: {params.path} holds {values.dtype} of shape {values.shape}, expected finite numbers [z, y, x]"
+        )
+    slope, intercept = params.rescale
+    return values.astype(np.float32) * np.float32(slope) + np.float32(intercept)
+
+
+def _resampled(hu: NDArray[np.float32], params: CtVolume, n: Shape, d_voxel: Triple) -> NDArray[np.float32]:
+    """Return HU on the label grid, middle on middle; −1000 outside the volume."""
+    from scipy import ndimage
+
+    step = np.divide(d_voxel, params.spacing)
+    first: Any = (0.5 - np.divide(n, 2)) * step + np.divide(hu.shape, 2) - 0.5
+    out = np.empty(n, np.float32)
+    ndimage.affine_transform(hu, step, first, output=out, order=1, mode="constant", cval=-1000.0)
+    return out
+
+
+def _tissues(hu: NDArray[np.float32], kev: float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Return labels and densities, relative to nominal, that have the attenuation of `hu` at `kev`."""
+    labels = np.digitize(hu, FROM_HU).astype(np.uint8)
+    water, *nominal = (float(attenuation(name, np.array([kev]))[0]) for name in ("water", *TISSUES[1:]))
+    scale = np.array([0, *(water / mu for mu in nominal)], np.float32)
+    density = np.maximum(1 + hu / np.float32(1000), 0) * scale[labels]
+    return labels, np.where(labels, density, np.float32(1))
+
+
+def _inserts(hu: NDArray[np.float32], params: CtVolume, unit: float, rng: np.random.Generator) -> list[Solid]:
+    """Return capsules of random direction at the places that are given, or at random ones."""
+    if not (n := count(params, len(params.at) or 2)):
+        return []
+    make, d = inserts(params, unit), diameter(params, 4.0, unit)
+    limit = REACH * unit - LENGTH / 2 * d
+    places = np.array(params.at) if params.at else _drawn(hu, params, limit, (rng, n))
+    if np.hypot(*places[:, :2].T).max() > limit or np.abs(places[:, 2]).max() > limit:
+        raise InputError(
+            f"at: inserts {LENGTH * d:.3g} mm long must be centred within {limit:.4g} mm of the axis and of the middle"
+        )
+    ways = rng.standard_normal((n, 3))
+    ways *= LENGTH / 2 * d / np.linalg.norm(ways, axis=1, keepdims=True)
+    ends = [((place - way) / unit, (place + way) / unit) for place, way in zip(places, ways, strict=True)]
+    return [make.rod(f"insert{k}", *both, d, round_ends=True) for k, both in enumerate(ends)]
+
+
+def _drawn(
+    hu: NDArray[np.float32], params: CtVolume, limit: float, of: tuple[np.random.Generator, int]
+) -> NDArray[np.float64]:
+    """Draw so many places (x, y, z) in mm from the file's own voxels, whatever the label grid: bone, or else tissue."""
+    z, y, x = ((np.arange(k) + 0.5 - k / 2) * d for k, d in zip(hu.shape, params.spacing, strict=True))
+    near = (np.abs(z)[:, None, None] <= limit) & (np.hypot(y[:, None], x) <= limit)
+    for least in (FROM_HU[-1], FROM_HU[0]):
+        if (found := np.flatnonzero((hu >= least) & near)).size:
+            k, j, i = np.unravel_index(of[0].choice(found, of[1]), hu.shape)
+            return np.stack([x[i], y[j], z[k]], 1)
+    raise InputError(
+        f"path: {params.path} has no voxel above {FROM_HU[0]:g} HU within {limit:.4g} mm; is rescale right?"
+    )

@@ -1,0 +1,151 @@
+"""A CT volume as a body: attenuation by its HU, places in mm, metal in bone, and files that are not what is said."""
+
+import hashlib
+import re
+
+import msgspec
+import numpy as np
+import pytest
+import tifffile
+from scipy import ndimage
+
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+from ctsim.materials import attenuation
+from ctsim.store import list_scans, open_scan
+from ctsim.voxelise import attenuation_volume
+from phantoms.body_volume import TISSUES, CtVolume
+from phantoms.recipes import build_recipe
+from phantoms.scene import parse_suite, scene_id, scene_to_toml
+
+SPACING = (2.0, 1.5, 1.0)
+
+
+@pytest.fixture
+def head(tmp_path):
+    """Save a ball of 46 mm, fat round bone round brain with a block of lung in it; return its HU."""
+    axes = ((np.arange(n) + 0.5 - n / 2) * d for n, d in zip((30, 40, 60), SPACING, strict=True))
+    z, y, x = np.meshgrid(*axes, indexing="ij")
+    r = np.sqrt(x**2 + y**2 + z**2)
+    hu = np.full(r.shape, -1000, np.int16)
+    hu[r < 23], hu[r < 19], hu[r < 14] = -100, 900, 35
+    hu[(np.abs(x - 5) < 4) & (np.abs(y) < 5) & (np.abs(z) < 6)] = -700
+    tifffile.imwrite(tmp_path / "head.tif", (hu + 1024).astype(np.uint16))
+    return hu
+
+
+def recipe(tmp_path, **changes):
+    given = {"path": str(tmp_path / "head.tif"), "spacing": SPACING, "rescale": (1.0, -1024.0), "n_voxel": (60,) * 3}
+    return CtVolume(**({**given, "size": 60.0} | changes))
+
+
+def test_at_its_energy_every_voxel_has_the_attenuation_of_its_hu(head, tmp_path):
+    params = recipe(tmp_path, metal="none", kev=60.0)
+    phantom = build_recipe(params, 0)
+    (water,) = attenuation("water", np.array([60.0]))
+    mu = {name: float(attenuation(name, np.array([60.0]))[0]) for name in TISSUES}
+    grid = Geometry(
+        dso=200.0,
+        dsd=300.0,
+        n_voxel=head.shape,
+        d_voxel=SPACING,
+        n_detector=(8, 8),
+        d_detector=(1.0, 1.0),
+        n_views=1,
+    )
+    found = attenuation_volume(phantom, grid, mu)
+    # away from edges, where neither resampling to 1 mm nor averaging back changes what is uniform
+    inside = ndimage.minimum_filter(head, 3) == ndimage.maximum_filter(head, 3)
+    assert {-1000, -700, 35, 900} <= set(np.unique(head[inside]).tolist())
+    expected = np.where(head > -900, water * (1 + head / 1000), 0)
+    np.testing.assert_allclose(found[inside], expected[inside], rtol=1e-5, atol=1e-7)
+    assert set(np.unique(phantom.labels)) == {0, 1, 2, 3, 4}
+
+
+def test_the_same_place_is_bone_on_every_grid(head, tmp_path):
+    for n in (30, 61):
+        labels = build_recipe(recipe(tmp_path, n_voxel=(n,) * 3, metal="none"), 0).labels
+        at = [round((15.0 + 30.0) / 60.0 * n - 0.5), n // 2, n // 2]  # 15 mm up, along z
+        assert labels[tuple(at)] == TISSUES.index("cortical_bone")
+        assert labels[n // 2, n // 2, n // 3] == TISSUES.index("soft_tissue")
+
+
+def test_metal_lies_in_bone_or_where_it_is_said_whatever_the_grid(head, tmp_path):
+    drawn = [build_recipe(recipe(tmp_path, n_voxel=(n,) * 3), 5).solids for n in (24, 60)]
+    assert drawn[0] == drawn[1] and len(drawn[0]) == 2
+    for solid in drawn[0]:
+        (capsule,) = solid.primitives
+        k, j, i = (int(c / d + n / 2) for c, d, n in zip(capsule.centre[::-1], SPACING, head.shape, strict=True))
+        assert head[k, j, i] == 900 and solid.material == "Ti" and solid.metal
+    (one,) = build_recipe(recipe(tmp_path, at=((5.0, -3.0, 2.0),), insert_mm=2.0), 5).solids
+    assert one.primitives[0].centre == pytest.approx((5.0, -3.0, 2.0)) and one.primitives[0].params == (2.0, 1.0)
+
+
+def test_a_scene_says_which_file_it_is_of(head, tmp_path):
+    text = f'''
+name = "head"
+phantom = {{ recipe = "ct_volume", path = "{tmp_path}/head.tif", spacing = [2.0, 1.5, 1.0], rescale = [1.0, -1024.0] }}
+scanner = {{ n_voxel = [16, 16, 16], n_detector = [24, 24], n_views = 4 }}
+'''
+    (scene,) = parse_suite(text)
+    assert scene.phantom.sha256 == hashlib.sha256((tmp_path / "head.tif").read_bytes()).hexdigest()
+    kept = scene_to_toml(scene)
+    np.save(tmp_path / "head.npy", head)
+    tifffile.imwrite(tmp_path / "head.tif", (head + 1000).astype(np.uint16))
+    (other,) = parse_suite(text)
+    assert scene_id(other) != scene_id(scene)
+    (stale,) = parse_suite(kept)  # the file has changed since: its scene can be read, not built
+    assert scene_id(stale) == scene_id(scene)
+    with pytest.raises(InputError, match=r"head\.tif has the SHA-256 .*, the scene was made of"):
+        build_recipe(stale.phantom, 0)
+    same = build_recipe(recipe(tmp_path, path=str(tmp_path / "head.npy"), rescale=(1.0, 0.0)), 0)
+    assert set(np.unique(same.labels)) == {0, 1, 2, 3, 4}
+
+
+def test_a_scan_of_it_is_made_and_reopened(head, tmp_path):
+    from benchmarks.make_dataset import main as make_dataset
+
+    (tmp_path / "scene.toml").write_text(
+        f'''
+name = "head"
+phantom = {{ recipe = "ct_volume", path = "{tmp_path}/head.tif", spacing = [2.0, 1.5, 1.0], rescale = [1.0, -1024.0] }}
+scanner = {{ n_voxel = [16, 16, 16], n_detector = [24, 24], n_views = 4 }}
+''',
+        encoding="utf-8",
+    )
+    assert make_dataset([str(tmp_path / "scene.toml"), str(tmp_path / "data")]) == 0
+    stored = open_scan(list_scans(tmp_path / "data")[0])
+    assert stored.metal.any() and stored.metal_free is not None
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"path": "nowhere.tif"}, "path: nowhere.tif cannot be read (No such file or directory); expected a TIFF"),
+        ({"rescale": (0.0, 0.0)}, "rescale must be a positive slope"),
+        ({"kev": 5.0}, "kev must be within 20 to 200"),
+        ({"at": ((0.0, 0.0, 0.0),), "n_inserts": 2}, "n_inserts is 2, but at has 1 places"),
+        ({"at": ((29.0, 0.0, 0.0),)}, "at: inserts 12 mm long must be centred within 21.6 mm"),
+        ({"rescale": (1.0, -9000.0)}, "has no voxel above -900 HU within 21.6 mm; is rescale right?"),
+    ],
+)
+def test_what_makes_no_sense_is_one_sentence(head, tmp_path, changes, words):
+    with pytest.raises(InputError, match=re.escape(words)):
+        build_recipe(recipe(tmp_path, **changes), 0)
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (np.zeros((3, 4)), r"holds float64 of shape (3, 4), expected finite numbers [z, y, x]"),
+        (np.full((3, 4, 5), np.nan), "expected finite numbers"),
+    ],
+)
+def test_a_file_of_something_else_is_refused(tmp_path, data, words):
+    np.save(tmp_path / "head.npy", data)
+    given = CtVolume(path=str(tmp_path / "head.npy"), spacing=SPACING)
+    with pytest.raises(InputError, match=re.escape(words)):
+        build_recipe(given, 0)
+    (tmp_path / "head.npy").write_bytes(b"no array")
+    with pytest.raises(InputError, match=r"head\.npy is no TIFF stack or \.npy array"):
+        build_recipe(msgspec.structs.replace(given, sha256=""), 0)
