@@ -4,11 +4,13 @@ What a job has loaded, compiled or cached stays for the next. The process is rep
 it or overstayed.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 from benchmarks import workers
 from benchmarks.isolate import how_it_ended
+from ctsim.errors import InputError
 
 
 class Stopped(RuntimeError):
@@ -23,6 +25,8 @@ class Limited:
     """Does jobs in a process of its own, each within `seconds`, None for no limit; `environment` is added to ours."""
 
     def __init__(self, seconds: float | None, environment: Mapping[str, str] | None = None) -> None:
+        if seconds is not None and not (math.isfinite(seconds) and seconds > 0):
+            raise InputError(f"seconds must be positive, got {seconds}")
         self.seconds = seconds
         self._environment = environment or {}
         self._worker: workers.Worker | None = None

@@ -22,6 +22,12 @@ def limited():
         yield process
 
 
+@pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_limit_that_is_none_is_refused(seconds):
+    with pytest.raises(InputError, match="seconds must be positive"):
+        Limited(seconds)
+
+
 def test_jobs_share_a_process_that_is_not_ours(limited):
     first = limited.run(os.getpid)
     assert first != os.getpid() and limited.run(os.getpid) == first
