@@ -19,6 +19,8 @@ from ctsim.errors import InputError
 from ctsim.human import human_bytes, human_time
 
 if TYPE_CHECKING:
+    from importlib.resources.abc import Traversable
+
     from ctsim.plan import Plan
     from ctsim.types import Phantom, Scanner
     from phantoms.scene import Scene
@@ -81,14 +83,20 @@ def load(suite: str) -> "tuple[Scene, ...]":
     """
     from phantoms.scene import load_suite
 
-    folder = resources.files("benchmarks") / "suites"
-    bundled = {entry.name.removesuffix(".toml"): entry for entry in folder.iterdir() if entry.name.endswith(".toml")}
-    if suite in bundled:
-        with resources.as_file(bundled[suite]) as path:
+    known = bundled()
+    if suite in known:
+        with resources.as_file(known[suite]) as path:
             return load_suite(path)
     if not Path(suite).is_file():
-        raise InputError(f"{suite}: neither a TOML file nor a bundled suite ({', '.join(sorted(bundled))})")
+        raise InputError(f"{suite}: neither a TOML file nor a bundled suite ({', '.join(sorted(known))})")
     return load_suite(Path(suite))
+
+
+def bundled() -> "dict[str, Traversable]":
+    """Return the bundled suites by name: the files with `[[scene]]` tables, beside which commands have theirs."""
+    folder = resources.files("benchmarks") / "suites"
+    files = {entry.name.removesuffix(".toml"): entry for entry in folder.iterdir() if entry.name.endswith(".toml")}
+    return {name: entry for name, entry in files.items() if "\n[[scene]]\n" in entry.read_text(encoding="utf-8")}
 
 
 def select(scenes: "tuple[Scene, ...]", only: tuple[str, ...], seeds: tuple[int, ...]) -> "tuple[Scene, ...]":

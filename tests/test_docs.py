@@ -65,10 +65,11 @@ def test_commands_in_the_pages_are_understood():
 
 
 def test_the_readme_names_every_recipe_and_suite():
+    from benchmarks.make_dataset import bundled
     from phantoms.recipes import NAMES
 
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    suites = [p.stem for p in (ROOT / "benchmarks" / "suites").glob("*.toml")]
+    suites = bundled()
     assert suites
     for name in (*NAMES, *suites):
         assert f"`{name}`" in text, name

@@ -10,7 +10,7 @@ import pytest
 import tifffile
 
 import benchmarks.make_dataset as command
-from benchmarks.make_dataset import main
+from benchmarks.make_dataset import bundled, load, main
 from ctsim import simulate
 from ctsim.human import human_bytes, human_time
 from ctsim.store import list_scans, open_scan
@@ -220,6 +220,15 @@ def test_a_scene_too_large_for_memory_is_named(suite, tmp_path, monkeypatch, cap
     assert main([suite, str(tmp_path / "data"), *flags]) == 2
     error = capsys.readouterr().err
     assert "make-dataset: rods: " in error and "memory" in error and error.count("\n") == 1
+
+
+def test_what_commands_measure_is_no_suite_of_scenes(tmp_path, capsys):
+    assert {"quick", "core", "paper"} <= bundled().keys() and "pareto" not in bundled()
+    for name in bundled():
+        assert load(name), name
+    assert main(["pareto", str(tmp_path / "data")]) == 2
+    offered = capsys.readouterr().err.partition("bundled suite ")[2]
+    assert "quick" in offered and "pareto" not in offered and not (tmp_path / "data").exists()
 
 
 def test_units_read_well():
