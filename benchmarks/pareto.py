@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from benchmarks import lines
 from benchmarks.host import commit, host, use_threads
-from benchmarks.pareto_records import NAME, Mark, Part, Setting, Timed, append, latest, read, runs
+from benchmarks.pareto_records import NAME, Mark, Part, Setting, Timed, latest, read, runs
 from benchmarks.records import OK
 from ctsim.errors import InputError
 from ctsim.human import human_time
@@ -110,15 +111,16 @@ def _measure(given: Arguments, wanted: dict[Part, list[str]]) -> int:
     from tqdm import tqdm
 
     commit()  # remembered: the code that is loaded, whatever is committed meanwhile
+    given.out.mkdir(parents=True, exist_ok=True)
     path, failed = given.out / NAME, 0
     for part, scenes in wanted.items():
         for scene in scenes:
             tasks = _choices() if part == "simulator" else _methods(given, scene)
-            done = runs(read(path)[0])
+            done = runs(read(path))
             left = sum(max(given.repeats - done[task.setting.identity], 0) for task in tasks)
             with tqdm(total=left, desc=f"{part} {scene}", unit="run", disable=not left, file=sys.stderr) as bar:
                 for timed in rounds(tasks, given.repeats, done):
-                    append(path, timed)
+                    lines.append(path, timed)
                     failed += timed.status not in (OK, "skipped")
                     bar.set_postfix_str(f"{timed.setting.curve}, {timed.setting.label}: {timed.status}")
                     bar.update()
@@ -220,7 +222,7 @@ def _efforts(given: Arguments) -> "list[Effort]":
 def _dry_run(given: Arguments, wanted: dict[Part, list[str]]) -> int:
     """Print the runs that are left and about how long they take, from a plan and an FDK timed here."""
     use_threads(given.threads)
-    done, total, lines = runs(read(given.out / NAME)[0]), 0.0, [("part", "scene", "curve", "runs left", "about")]
+    done, total, rows = runs(read(given.out / NAME)), 0.0, [("part", "scene", "curve", "runs left", "about")]
     for part, scenes in wanted.items():
         for scene in scenes:
             found = _planned(given, part, scene)
@@ -229,10 +231,10 @@ def _dry_run(given: Arguments, wanted: dict[Part, list[str]]) -> int:
                 left = sum(max(n, 0) for n, _ in mine)
                 seconds = sum(max(n, 0) * s for n, s in mine)
                 total += seconds
-                lines.append((part, scene, curve, str(left), human_time(seconds)))
-    widths = [max(len(line[k]) for line in lines) for k in range(5)]
-    for line in lines:
-        sys.stdout.write("  ".join(word.ljust(w) for word, w in zip(line, widths, strict=True)).rstrip() + "\n")
+                rows.append((part, scene, curve, str(left), human_time(seconds)))
+    widths = [max(len(row[k]) for row in rows) for k in range(5)]
+    for row in rows:
+        sys.stdout.write("  ".join(word.ljust(w) for word, w in zip(row, widths, strict=True)).rstrip() + "\n")
     sys.stdout.write(f"total: {human_time(total)}, without compiling, planning and the reference\n")
     return 0
 
@@ -269,10 +271,7 @@ def _report(out: Path) -> None:
     from benchmarks import pareto_figure, pareto_table
     from benchmarks.pareto_records import points
 
-    found, torn = read(out / NAME)
-    if torn:
-        sys.stderr.write(f"{out / NAME}: {torn} lines were cut short; those runs are left out\n")
-    shown = latest(found)
+    shown = latest(read(out / NAME))
     if not shown:
         raise InputError(f"{out / NAME}: there are no records; run without --table first")
     summary = pareto_table.summary(shown)

@@ -5,7 +5,6 @@ of one run. Runs of a setting are counted by its identity, so a command that was
 """
 
 import hashlib
-import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,12 +14,12 @@ from typing import Any, Literal
 
 import msgspec
 
+from benchmarks import lines
 from benchmarks.host import Host
 from benchmarks.pareto_front import Pair, knee
 from benchmarks.records import OK
-from ctsim.errors import InputError
 
-NAME = "pareto.jsonl"
+NAME, WHAT = "pareto.jsonl", "a record of run-benchmark pareto"
 VERSION = 1
 """Part of every identity: a change of what is measured counts it up."""
 
@@ -96,35 +95,9 @@ class Point:
         return median(self.seconds), self.values[ERROR[self.setting.part]]
 
 
-def append(path: Path, record: Timed) -> None:
-    """Append one record and force it to the disk, behind what an interrupted writer may have left torn."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("ab+") as file:
-        if file.tell():
-            file.seek(-1, os.SEEK_END)
-            if file.read(1) != b"\n":
-                file.write(b"\n")
-        file.write(msgspec.json.encode(record) + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def read(path: Path) -> tuple[list[Timed], int]:
-    """Read a records file; lines that are cut short are left out and counted.
-
-    Raises InputError where a whole JSON line is not a record. A file that is not there has none.
-    """
-    if not path.exists():
-        return [], 0
-    decoder, found, torn = msgspec.json.Decoder(Timed), [], 0
-    for number, line in enumerate(path.read_bytes().splitlines(), 1):
-        try:
-            found += [decoder.decode(line)] if line.strip() else []
-        except msgspec.ValidationError as error:
-            raise InputError(f"{path}, line {number}: expected a record of run-benchmark pareto: {error}") from None
-        except msgspec.DecodeError:
-            torn += 1
-    return found, torn
+def read(path: Path) -> list[Timed]:
+    """Read the records of a pareto file (see `lines.read`)."""
+    return lines.read(path, Timed, WHAT)
 
 
 def runs(found: Sequence[Timed]) -> Counter[str]:

@@ -14,7 +14,7 @@ from conftest import SMALLEST
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks import cli, pareto, pareto_figure, pareto_methods, pareto_simulator, pareto_table
+from benchmarks import cli, lines, pareto, pareto_figure, pareto_methods, pareto_simulator, pareto_table
 from benchmarks.host import host
 from benchmarks.methods import TABLE
 from benchmarks.pareto_front import beaten_by, front, knee
@@ -22,7 +22,6 @@ from benchmarks.pareto_records import (
     Mark,
     Setting,
     Timed,
-    append,
     at_knee,
     enough,
     failures,
@@ -113,16 +112,15 @@ def test_seconds_are_medians_over_the_runs_of_a_mark():
     assert [(p.label, p.pair) for p in points(found)] == [("1", (3.0, 0.5)), ("2", (6.0, 0.25))]
 
 
-def test_a_torn_line_costs_one_run_and_nothing_after_it(tmp_path):
+def test_a_torn_last_line_costs_one_run_and_nothing_after_it(tmp_path):
     path = tmp_path / "pareto.jsonl"
-    for _ in range(2):
-        append(path, timed(setting(), ("a", 1.0, 1.0)))
+    lines.append(path, *(timed(setting(label), (label, 1.0, 1.0)) for label in "ab"))
     path.write_bytes(path.read_bytes()[:-20])
-    append(path, timed(setting("b"), ("b", 1.0, 1.0)))
-    found, torn = read(path)
-    assert [t.setting.label for t in found] == ["a", "b"] and torn == 1
+    assert [t.setting.label for t in read(path)] == ["a"]
+    lines.append(path, timed(setting("c"), ("c", 1.0, 1.0)))
+    assert [t.setting.label for t in read(path)] == ["a", "c"]
     path.write_text('{"setting": 1}\n')
-    with pytest.raises(InputError, match="line 1"):
+    with pytest.raises(InputError, match="line 1: expected a record of run-benchmark pareto"):
         read(path)
 
 
@@ -261,7 +259,7 @@ def test_a_method_that_fails_is_a_row_with_its_reason_and_is_tried_again(tmp_pat
         assert pareto.main([*command, "--method", f"{__name__}:fails"]) == 1
         text = capsys.readouterr().out
         assert f"| {__name__}:fails | defaults | error | ValueError: no such luck |" in text
-    assert len(read(tmp_path / "pareto.jsonl")[0]) == 2
+    assert len(read(tmp_path / "pareto.jsonl")) == 2
 
 
 def fails(scan, *, device):
@@ -380,7 +378,7 @@ def test_bad_input_is_said_in_one_sentence(arguments, says, tmp_path, monkeypatc
 
 def test_the_page_gives_commands_that_exist():
     text = (Path(__file__).parents[1] / "docs" / "pareto.md").read_text(encoding="utf-8")
-    lines = re.findall(r"^    run-benchmark pareto (.*)$", text, re.M)
-    assert len(lines) >= 3
-    for line in lines:
+    found = re.findall(r"^    run-benchmark pareto (.*)$", text, re.M)
+    assert len(found) >= 3
+    for line in found:
         tyro.cli(pareto.Arguments, args=shlex.split(line, comments=True))
