@@ -1,7 +1,8 @@
 """`run-benchmark skipping RESULTS`: what is left out, what that saves, and how far the results are apart.
 
 Records go to RESULTS/skipping.jsonl case by case; the table, RESULTS/skipping.md, shows the newest of each case, so
-that cases can be measured one by one. What this commit recorded on this machine is not measured again.
+that cases can be measured one by one. What this commit recorded on this machine is not measured again. All cases are
+those of one process, which is replaced where a case overstays.
 """
 
 import dataclasses
@@ -18,6 +19,9 @@ from ctsim.errors import InputError
 
 if TYPE_CHECKING:
     from benchmarks.host import Host
+    from benchmarks.limited import Limited
+    from benchmarks.skipping_cases import Setup
+    from benchmarks.skipping_tables import Measured
 
 Case = Literal[
     "materials", "bricks", "rays", "energies", "edges", "scatter", "twin", "truth",
@@ -36,7 +40,8 @@ SECONDS: dict[Case, float] = {
 class Arguments:
     """Measure everything that is left out: the time with and without it, and the largest difference of the result.
 
-    Exit code 1 where a difference exceeds what is stated of it. The machine should have nothing else to do.
+    Exit code 1 where a difference exceeds what is stated of it or a case did not end. The machine should have nothing
+    else to do.
     """
 
     results: tyro.conf.Positional[Path]
@@ -47,6 +52,8 @@ class Arguments:
     """Counted runs with and without each skip; the table shows medians."""
     size: Literal["core", "small"] = "core"
     """The scene lung-Fe of the suite core, or tiny grids that prove the command and say nothing about speed."""
+    seconds: float | None = None
+    """Time limit of one case, all of its runs together, with the start of its process where that is due."""
     force: tyro.conf.FlagCreatePairsOff[bool] = False
     """Measure again what is recorded of this commit on this machine."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -56,7 +63,7 @@ class Arguments:
 
 
 def main(argv: list[str]) -> int:
-    """Run the command; 0 if every difference is within what is stated, 1 if one is not."""
+    """Run the command; 0 if every difference is within what is stated, 1 if one is not or was not measured."""
     given = tyro.cli(Arguments, prog="run-benchmark skipping", args=argv)
     if given.repeats < 1:
         raise InputError(f"--repeats must be at least 1, got {given.repeats}")
@@ -65,9 +72,7 @@ def main(argv: list[str]) -> int:
         sys.stdout.write(_planned(given, wanted))
         return 0
     if not given.table:
-        given.results.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix="ctsim-skipping-") as folder:
-            _measure(given, wanted, Path(folder))
+        _measure(given, wanted)
     return _report(given, wanted)
 
 
@@ -109,23 +114,36 @@ def _planned(given: Arguments, wanted: tuple[Case, ...]) -> str:
     return costs.listing(rows, len(wanted), "cases", "without compiling and preparing (a minute for all cases)")
 
 
-def _measure(given: Arguments, wanted: tuple[Case, ...], folder: Path) -> None:
+def _measure(given: Arguments, wanted: tuple[Case, ...]) -> None:
     """Measure the wanted cases that are not recorded; a case is stored as soon as it is measured."""
-    from benchmarks import lines, skipping_cases, skipping_methods, skipping_tables
+    from benchmarks import lines, skipping_cases, skipping_tables
+    from benchmarks.limited import Limited
 
     left, (here, now) = _left(given, wanted)
-    setup = skipping_cases.Setup(size=given.size, repeats=given.repeats, folder=folder)
-    cases = skipping_cases.CASES | skipping_methods.CASES
     began = datetime.now(UTC).isoformat(timespec="microseconds")
-    for case in wanted:
-        if case not in left:
-            sys.stderr.write(f"{case}: recorded already\n")
-            continue
-        sys.stderr.write(f"{case} …\n")
-        measured = [pair.measure(given.repeats) for pair in cases[case](setup)]
-        time = datetime.now(UTC).isoformat(timespec="seconds")
-        records = [
-            skipping_tables.SkipRecord(measured=one, size=given.size, host=here, commit=now, time=time, run=began)
-            for one in measured
-        ]
-        lines.append(given.results / NAME, *records)
+    with tempfile.TemporaryDirectory(prefix="ctsim-skipping-") as folder, Limited(given.seconds) as process:
+        given.results.mkdir(parents=True, exist_ok=True)
+        setup = skipping_cases.Setup(size=given.size, repeats=given.repeats, folder=Path(folder))
+        for case in wanted:
+            if case not in left:
+                sys.stderr.write(f"{case}: recorded already\n")
+                continue
+            sys.stderr.write(f"{case} …\n")
+            measured = _within(process, case, setup)
+            time = datetime.now(UTC).isoformat(timespec="seconds")
+            records = [
+                skipping_tables.SkipRecord(measured=one, size=given.size, host=here, commit=now, time=time, run=began)
+                for one in measured
+            ]
+            lines.append(given.results / NAME, *records)
+
+
+def _within(process: "Limited", case: Case, setup: "Setup") -> "list[Measured]":
+    """Measure a case in the process; what does not end in time, or with which the process dies, has failed."""
+    from benchmarks import skipping_methods, skipping_tables
+    from benchmarks.limited import Stopped
+
+    try:
+        return process.run(skipping_methods.measured, case, setup)
+    except Stopped as end:
+        return [skipping_tables.failed(case, end.status, str(end))]

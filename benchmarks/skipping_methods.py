@@ -16,11 +16,12 @@ from baselines.limar import interpolated
 from baselines.metal import Trace, find_metal
 from baselines.nmar import Normalise, normalised
 from baselines.prior import Choice, choose_prior
-from benchmarks import cli_run, make_dataset
+from benchmarks import cli_run, make_dataset, skipping_cases
 from benchmarks.cli import EXIT_INTERRUPTED
 from benchmarks.methods import Method, find
 from benchmarks.run import scan_for
 from benchmarks.skipping_cases import Pair, Pairs, Setup, largest
+from benchmarks.skipping_tables import Measured
 from benchmarks.volumes import read_volume
 from ctsim.store import StoredScan, open_scan
 from ctsim.types import Scan
@@ -214,3 +215,8 @@ def recorded_run(setup: Setup) -> Iterator[Pair[list[NDArray[np.float32]]]]:
 
 
 CASES: dict[str, Pairs] = {"metal-free": metal_free, "rows": rows, "scan": stored_scan, "record": recorded_run}
+
+
+def measured(case: str, setup: Setup) -> list[Measured]:
+    """Measure all pairs of a case, of those here and in `skipping_cases`."""
+    return [pair.measure(setup.repeats) for pair in (skipping_cases.CASES | CASES)[case](setup)]

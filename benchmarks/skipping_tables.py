@@ -8,6 +8,7 @@ import msgspec
 
 from benchmarks import lines
 from benchmarks.host import Host, certain
+from benchmarks.records import OK
 
 CORE = "core"
 
@@ -16,7 +17,7 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """One skip: seconds with and without it, run by run in pairs, and the largest difference of the result.
 
     `difference` is in what `unit` says, None where it is not finite; `limit` is what `stated` allows it, None where
-    the two are meant to differ.
+    the two are meant to differ. A case that did not end has no seconds, and a `status` and its `reason`.
     """
 
     case: str
@@ -29,6 +30,8 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     limit: float | None
     stated: str
     note: str = ""
+    status: str = OK
+    reason: str = ""
 
     @property
     def held(self) -> bool:
@@ -39,6 +42,23 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def gain(self) -> float:
         """Median over pairs of neighbouring runs of the time without the skip over that with it."""
         return median(b / a for a, b in zip(self.skipping, self.whole, strict=True))
+
+
+def failed(case: str, status: str, reason: str) -> Measured:
+    """Return what stands for a case that did not end."""
+    return Measured(
+        case=case,
+        scene="",
+        what="",
+        skipping=(),
+        whole=(),
+        difference=None,
+        unit="",
+        limit=None,
+        stated="",
+        status=status,
+        reason=reason,
+    )
 
 
 class SkipRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -58,20 +78,20 @@ def read(path: Path) -> list[SkipRecord]:
 
 
 def known(path: Path, size: str, repeats: int, at: tuple[Host, str]) -> set[str]:
-    """Return the cases recorded at `size`, with so many runs, on this machine by this commit: `at` = (host, commit).
+    """Return the cases last recorded at `size` with so many runs on this machine by this commit: `at` = (host, commit).
 
     Code that differs from its commit, or has none, knows nothing.
     """
     if not certain(at[1]):
         return set()
-    found = [r for r in read(path) if (r.size, r.host, r.commit) == (size, *at)]
-    return {r.measured.case for r in found if len(r.measured.skipping) >= repeats}
+    last = {r.measured.case: r.measured for r in read(path) if (r.size, r.host, r.commit) == (size, *at)}
+    return {case for case, m in last.items() if len(m.skipping) >= repeats}
 
 
 def seconds(records: Sequence[SkipRecord]) -> dict[str, float]:
     """Return what one run both ways takes of each case, all of its pairs together, as in the records of `latest`."""
     found: dict[str, float] = {}
-    for m in (record.measured for record in records):
+    for m in (record.measured for record in records if record.measured.status == OK):
         found[m.case] = found.get(m.case, 0.0) + median(m.skipping) + median(m.whole)
     return found
 
@@ -97,6 +117,8 @@ def render(records: Sequence[SkipRecord]) -> str:
 
 
 def _cells(m: Measured) -> tuple[str, ...]:
+    if m.status != OK:
+        return m.case, *("–",) * 7, "NO", f"{m.status}: {m.reason}"
     difference = "not finite" if m.difference is None else f"{m.difference:.2g} {m.unit}" if m.difference else "0"
     allowed = m.stated if not m.limit else f"≤ {m.limit:.2g} ({m.stated})"
     seconds = (f"{median(s):.4f}" for s in (m.skipping, m.whole))
@@ -108,9 +130,10 @@ def _provenance(records: Sequence[SkipRecord]) -> str:
     """Say where and by what code; cases that were measured one by one may be of several commits."""
     h, times = records[-1].host, sorted(record.time for record in records)
     commits = dict.fromkeys(r.commit[:12] + "+changes" * r.commit.endswith("+changes") for r in records)
+    least = min((len(r.measured.skipping) for r in records if r.measured.status == OK), default=0)
     return (
         f"{times[0]} to {times[-1]}, commit {', '.join(commits)}, {h.cpu}, {h.cores} cores, {h.threads} threads, "
         f"Python {h.python}, numba {h.versions.get('numba', '?')}; size {records[-1].size}. Medians of "
-        f"{min(len(r.measured.skipping) for r in records)} or more interleaved runs; the gain is the median over pairs "
-        "of the time without the skip over that with it."
+        f"{least} or more interleaved runs; the gain is the median over pairs of the time without the skip over that "
+        "with it."
     )

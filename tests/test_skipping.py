@@ -22,6 +22,12 @@ def run(tmp_path_factory):
     return code, skipping_tables.read(folder / skipping.NAME), folder
 
 
+@pytest.fixture
+def here(monkeypatch):
+    """Cases are measured in this process, where they can be replaced."""
+    monkeypatch.setattr("benchmarks.limited.Limited.run", lambda self, function, *given: function(*given))
+
+
 def small(tmp_path):
     return Setup(size="small", repeats=1, folder=tmp_path)
 
@@ -60,7 +66,7 @@ def test_every_case_is_measured_and_stays_within_what_is_stated(run):
 
 
 @pytest.mark.parametrize("difference", [2.0, math.nan, math.inf])
-def test_a_difference_beyond_what_is_stated_ends_with_one(tmp_path, monkeypatch, capsys, difference):
+def test_a_difference_beyond_what_is_stated_ends_with_one(here, tmp_path, monkeypatch, capsys, difference):
     monkeypatch.setitem(skipping_cases.CASES, "rays", lambda setup: iter([fake(0.5), fake(difference)]))
     assert skipping.main([str(tmp_path), "--case", "rays", "--repeats", "2"]) == 1
     assert "| NO |" in capsys.readouterr().out
@@ -72,7 +78,7 @@ def test_a_difference_beyond_what_is_stated_ends_with_one(tmp_path, monkeypatch,
     assert "NO" not in out and out.count("| rays |") == 2  # the newest run alone
 
 
-def test_an_interrupted_command_goes_on_from_the_case_it_was_in(tmp_path, monkeypatch, capsys):
+def test_an_interrupted_command_goes_on_from_the_case_it_was_in(here, tmp_path, monkeypatch, capsys):
     done = []
 
     def once(setup):
@@ -135,7 +141,7 @@ def test_a_dry_run_lists_what_is_left_and_what_it_takes(tmp_path, monkeypatch, c
     assert dry(*words, "--repeats", "2", "--force")[0][:2] == ["rays", "3"]
 
 
-def test_the_table_is_rendered_from_the_records_alone(tmp_path, monkeypatch, capsys):
+def test_the_table_is_rendered_from_the_records_alone(here, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(skipping_cases.CASES, "rays", lambda setup: iter([fake(2.0)]))
     words = [str(tmp_path), "--case", "rays", "--repeats", "1"]
     assert skipping.main(words) == 1
@@ -152,6 +158,25 @@ def test_the_table_is_rendered_from_the_records_alone(tmp_path, monkeypatch, cap
         said = capsys.readouterr().err
         assert said.count("\n") == 1 and "there are no records of size" in said
     assert not (tmp_path / "none").exists()
+
+
+def test_a_case_that_overstays_is_a_row_with_its_reason_and_is_tried_again(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(host, "commit", lambda: "a" * 40)
+    words = [str(tmp_path), "--case", "rays", "--case", "twin", "--repeats", "1"]
+    # a process cannot even start in that time
+    assert skipping.main([*words, "--seconds", "0.01"]) == 1
+    out = capsys.readouterr().out
+    for case in ("rays", "twin"):
+        assert f"| {case} | – | – | – | – | – | – | – | NO | timeout: did not end within 0.01 s |" in out
+    assert [r.measured.status for r in skipping_tables.read(tmp_path / skipping.NAME)] == ["timeout"] * 2
+    assert skipping.main([*words, "--dry-run"]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["rays", "twin", "total:"]
+    monkeypatch.setattr("benchmarks.limited.Limited.run", lambda self, function, *given: function(*given))
+    for case in ("rays", "twin"):
+        monkeypatch.setitem(skipping_cases.CASES, case, lambda setup, case=case: iter([fake(0.0, case=case)]))
+    assert skipping.main(words) == 0
+    said = capsys.readouterr()
+    assert "timeout" not in said.out and "recorded already" not in said.err
 
 
 def test_an_interrupted_make_dataset_interrupts_the_command():
@@ -220,6 +245,9 @@ def test_regardless_of_metal_all_is_projected_and_reconstructed(tmp_path, monkey
 def test_wrong_arguments_are_one_sentence(tmp_path):
     with pytest.raises(InputError, match="--repeats must be at least 1"):
         skipping.main([str(tmp_path), "--repeats", "0"])
+    with pytest.raises(InputError, match="seconds must be positive"):
+        skipping.main([str(tmp_path / "out"), "--seconds", "-1"])
+    assert not (tmp_path / "out").exists()
     with pytest.raises(SystemExit):
         skipping.main([str(tmp_path), "--case", "nothing"])
 
