@@ -2,7 +2,7 @@
 
 Every timed run is a line of OUT/pareto.jsonl. Settings are run in turns, once each a round, so that a drift of the
 machine meets all alike; times are medians over the rounds. OUT/pareto.md and OUT/pareto.png show the points, their
-Pareto front and its knee.
+Pareto front and its knee. All runs are those of one process, which is replaced where a run overstays.
 """
 
 import datetime
@@ -16,17 +16,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from benchmarks import lines
+from benchmarks import lines, pareto_suite
 from benchmarks.host import commit, host, use_threads
-from benchmarks.pareto_records import NAME, Mark, Part, Setting, Timed, latest, read, runs
+from benchmarks.pareto_records import NAME, Part, Timed, latest, read, runs
 from benchmarks.records import OK
 from ctsim.errors import InputError
 from ctsim.human import human_time
 
 if TYPE_CHECKING:
+    from benchmarks.pareto_jobs import Job, Ran
     from benchmarks.pareto_methods import Effort
+    from benchmarks.pareto_suite import Suite
 
-RODS, SUITE, SMALL = "rods", "quick", "lung-Fe"
+RODS = "rods"
 
 
 @dataclass(frozen=True)
@@ -42,29 +44,21 @@ class Arguments:
     part: Annotated[tuple[Part, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="PART")] = ()
     """Only this part, simulator or methods (default: both)."""
     scene: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME")] = ()
-    """Only this scene; may be given several times. The simulator has rods, methods those of --suite (lung-Fe)."""
-    suite: str = SUITE
-    """The suite, or TOML file, that the methods' scenes are from."""
+    """Only this scene; may be given several times. The simulator has rods, methods those of the dataset (lung-Fe)."""
+    suite: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """What to measure: a TOML file with tables of your own over those of benchmarks/suites/pareto.toml."""
     method: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME")] = ()
-    """Only this method, or module:function of your own; may be given several times (default: all of the table)."""
+    """Only this method, or module:function of your own; may be given several times (default: all of --suite)."""
     repeats: int = 3
     """Rounds: counted runs of each setting; the table shows medians."""
     threads: int = 2
     """Threads of the kernels."""
+    seconds: float | None = None
+    """Time limit of one run, with the start of its process and the warm-up where those are due."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print what is left to run and about how long it takes; measure nothing."""
     table: tyro.conf.FlagCreatePairsOff[bool] = False
     """Only render the table and the figure from the records, computing nothing."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Task:
-    """A setting to time. `warm` compiles what all of a `kind` share, and returns its seconds."""
-
-    setting: Setting
-    run: Callable[[], tuple[Mark, ...]]
-    kind: str
-    warm: Callable[[], float]
 
 
 def main(argv: list[str]) -> int:
@@ -72,31 +66,40 @@ def main(argv: list[str]) -> int:
     given = tyro.cli(Arguments, prog="run-benchmark pareto", args=argv)
     if given.repeats < 1 or given.threads < 1:
         raise InputError(f"--repeats and --threads must be at least 1, got {given.repeats} and {given.threads}")
-    wanted = _scenes(given)
-    if "methods" in wanted and not given.table:
-        _efforts(given)  # a name that is wrong is said before the first run, not after the simulator's
+    suite = pareto_suite.load(given.suite)
+    wanted = _scenes(given, suite)
+    if given.table:
+        _report(given.out)
+        return 0
+    if "methods" in wanted:
+        _efforts(given, suite)  # a name that is wrong is said before the first run, not after the simulator's
     if given.dry_run:
-        return _dry_run(given, wanted)
-    failed = 0
-    if not given.table:
-        use_threads(given.threads)
-        failed = _measure(given, wanted)
+        return _dry_run(given, suite, wanted)
+    use_threads(given.threads)
+    failed = _measure(given, suite, wanted)
     _report(given.out)
     return 1 if failed else 0
 
 
-def _scenes(given: Arguments) -> dict[Part, list[str]]:
+def _scenes(given: Arguments, suite: "Suite") -> dict[Part, list[str]]:
     """Return the scenes of each part that is asked for."""
     from benchmarks import make_dataset
 
     parts: tuple[Part, ...] = given.part or ("simulator", "methods")
     known: dict[Part, list[str]] = {"simulator": [RODS], "methods": []}
-    known["methods"] = [scene.name for scene in make_dataset.load(given.suite)]
+    try:
+        known["methods"] = [scene.name for scene in make_dataset.load(suite.dataset.suite)]
+    except InputError as error:
+        raise InputError(f"{given.suite}: dataset.suite: {error}") from None
+    for name in suite.dataset.scenes:
+        if name not in known["methods"]:
+            expected = ", ".join(known["methods"])
+            raise InputError(f"{given.suite}: dataset.scenes: there is no {name!r}, expected one of {expected}")
     for name in given.scene:
         if not any(name in known[part] for part in parts):
             expected = "; ".join(f"{part}: {', '.join(known[part])}" for part in parts)
             raise InputError(f"--scene {name!r}: there is no such scene, expected one of {expected}")
-    chosen = given.scene or (RODS, SMALL if SMALL in known["methods"] else known["methods"][0])
+    chosen = given.scene or (RODS, *(suite.dataset.scenes or known["methods"]))
     return {part: [name for name in known[part] if name in chosen] for part in parts}
 
 
@@ -106,20 +109,24 @@ def machine() -> str:
     return f"{here.cpu}, {here.threads} threads"
 
 
-def _measure(given: Arguments, wanted: dict[Part, list[str]]) -> int:
+def _measure(given: Arguments, suite: "Suite", wanted: dict[Part, list[str]]) -> int:
     """Run what is missing, part by part and scene by scene; return how many settings failed."""
     from tqdm import tqdm
 
+    from benchmarks import pareto_jobs
+    from benchmarks.limited import Limited
+
     commit()  # remembered: the code that is loaded, whatever is committed meanwhile
-    given.out.mkdir(parents=True, exist_ok=True)
     path, failed = given.out / NAME, 0
-    for part, scenes in wanted.items():
-        for scene in scenes:
-            tasks = _choices() if part == "simulator" else _methods(given, scene)
+    with Limited(given.seconds) as process:
+        run = functools.partial(pareto_jobs.within, process, given.threads)
+        given.out.mkdir(parents=True, exist_ok=True)
+        for part, scene in ((part, scene) for part, scenes in wanted.items() for scene in scenes):
+            jobs = _choices(suite) if part == "simulator" else _methods(given, suite, scene)
             done = runs(read(path))
-            left = sum(max(given.repeats - done[task.setting.identity], 0) for task in tasks)
+            left = sum(max(given.repeats - done[job.setting.identity], 0) for job in jobs)
             with tqdm(total=left, desc=f"{part} {scene}", unit="run", disable=not left, file=sys.stderr) as bar:
-                for timed in rounds(tasks, given.repeats, done):
+                for timed in rounds(jobs, given.repeats, done, run):
                     lines.append(path, timed)
                     failed += timed.status not in (OK, "skipped")
                     bar.set_postfix_str(f"{timed.setting.curve}, {timed.setting.label}: {timed.status}")
@@ -127,105 +134,73 @@ def _measure(given: Arguments, wanted: dict[Part, list[str]]) -> int:
     return failed
 
 
-def rounds(tasks: list[Task], repeats: int, done: Counter[str]) -> Iterator[Timed]:
-    """Run each task that has fewer than `repeats` runs once a round; what fails is not tried again.
+def rounds(jobs: "list[Job]", repeats: int, done: Counter[str], run: "Callable[[Job], Ran]") -> Iterator[Timed]:
+    """Do each job that has fewer than `repeats` runs once a round; what fails is not tried again.
 
     `done` counts the runs there are, and is counted on.
     """
-    warmed: dict[str, float] = {}
     failed: set[str] = set()
     for number in range(repeats):
-        for task in tasks:
-            identity = task.setting.identity
+        for job in jobs:
+            identity = job.setting.identity
             if done[identity] > number or identity in failed:
                 continue
-            first = None
-            if task.kind not in warmed:
-                first = warmed[task.kind] = task.warm()
-            timed = _timed(task, first)
-            if timed.status == OK:
+            ran = run(job)
+            if ran.status == OK:
                 done[identity] += 1
             else:
                 failed.add(identity)
-            yield timed
+            yield Timed(
+                setting=job.setting,
+                marks=ran.marks,
+                status=ran.status,
+                reason=ran.reason,
+                warm_up=ran.warm_up,
+                host=host(),
+                commit=commit(),
+                time=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            )
 
 
-def _timed(task: Task, warm_up: float | None) -> Timed:
-    """Run a task and turn whatever happens into a record."""
-    from benchmarks.pareto_methods import Ended
-    from benchmarks.run import describe
-
-    marks, status, reason = (), OK, ""
-    try:
-        marks = task.run()
-    except Ended as end:
-        status, reason = end.status, end.reason
-    except MemoryError as error:
-        status, reason = "out_of_memory", describe(error)
-    except Exception as error:  # a method's failure is a result
-        status, reason = "error", describe(error)
-    return Timed(
-        setting=task.setting,
-        marks=marks,
-        status=status,
-        reason=reason,
-        warm_up=warm_up,
-        host=host(),
-        commit=commit(),
-        time=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-    )
-
-
-def _choices() -> list[Task]:
+def _choices(suite: "Suite") -> "list[Job]":
     """List the simulator's choices."""
     from benchmarks import pareto_simulator
+    from benchmarks.pareto_jobs import jobs
 
-    bench, here = pareto_simulator.Bench(), machine()
-    every = pareto_simulator.choices()
-    default = next(choice for choice in every if choice.default)
-    return [
-        Task(
-            setting=bench.setting(choice, here),
-            run=functools.partial(bench.run, choice),
-            kind="simulator",
-            warm=lambda: sum(mark.seconds for mark in bench.run(default)),
-        )
-        for choice in every
-    ]
+    asked = suite.simulator
+    return jobs(pareto_simulator.Bench, (asked.side, asked.views), pareto_simulator.choices(asked), machine())
 
 
-def _methods(given: Arguments, scene: str) -> list[Task]:
+def _methods(given: Arguments, suite: "Suite", scene: str) -> "list[Job]":
     """Make the scene's scan if it is missing, and list the runs of every method that is asked for."""
     from benchmarks import make_dataset, pareto_methods
+    from benchmarks.pareto_jobs import jobs
 
     data = given.out / "data"
-    if make_dataset.main([given.suite, str(data), "--only", scene]):
+    if make_dataset.main([suite.dataset.suite, str(data), "--only", scene]):
         raise InputError(f"{data}: the scan of {scene!r} could not be made")
-    bench, here = pareto_methods.Bench(data / scene), machine()
-    return [
-        Task(
-            setting=bench.setting(effort, here),
-            run=functools.partial(bench.run, effort),
-            kind=effort.method.name,
-            warm=functools.partial(bench.warm_up, effort.method),
-        )
-        for effort in _efforts(given)
-    ]
+    return jobs(pareto_methods.Bench, (data / scene, suite.iterations.stops), _efforts(given, suite), machine())
 
 
-def _efforts(given: Arguments) -> "list[Effort]":
-    from benchmarks import methods, pareto_methods
+def _efforts(given: Arguments, suite: "Suite") -> "list[Effort]":
+    from benchmarks import pareto_methods
 
-    return [effort for name in given.method or tuple(methods.TABLE) for effort in pareto_methods.efforts(name)]
+    found: list[Effort] = []
+    for name in given.method or tuple(listed.name for listed in suite.method):
+        try:
+            found += pareto_methods.efforts(suite, name)
+        except InputError as error:
+            raise InputError(f"{given.suite}: {error}" if given.suite and suite.listed(name) else str(error)) from None
+    return found
 
 
-def _dry_run(given: Arguments, wanted: dict[Part, list[str]]) -> int:
+def _dry_run(given: Arguments, suite: "Suite", wanted: dict[Part, list[str]]) -> int:
     """Print the runs that are left and about how long they take, from a plan and an FDK timed here."""
     use_threads(given.threads)
     done, total, rows = runs(read(given.out / NAME)), 0.0, [("part", "scene", "curve", "runs left", "about")]
     for part, scenes in wanted.items():
         for scene in scenes:
-            found = _planned(given, part, scene)
+            found = _planned(given, suite, part, scene)
             for curve in dict.fromkeys(curve for curve, *_ in found):
                 mine = [(given.repeats - done[i], seconds) for c, i, seconds in found if c == curve]
                 left = sum(max(n, 0) for n, _ in mine)
@@ -239,30 +214,28 @@ def _dry_run(given: Arguments, wanted: dict[Part, list[str]]) -> int:
     return 0
 
 
-def _planned(given: Arguments, part: Part, scene: str) -> list[tuple[str, str, float]]:
+def _planned(given: Arguments, suite: "Suite", part: Part, scene: str) -> list[tuple[str, str, float]]:
     """Return (curve, identity, seconds of a run) of a scene's settings; a scan that is not made has no identity."""
     from benchmarks import estimates, make_dataset, pareto_methods, pareto_simulator
     from ctsim.writer import is_complete
     from phantoms.scene import scene_id
 
     if part == "simulator":
-        sim = pareto_simulator.Bench()
-        usual = sim.estimate()
-        every = [(c.curve, sim.setting(c, machine()).identity) for c in pareto_simulator.choices()]
-        return [(curve, identity, usual) for curve, identity in every]
+        usual = pareto_simulator.Bench(suite.simulator.side, suite.simulator.views).estimate()
+        return [(job.setting.curve, job.setting.identity, usual) for job in _choices(suite)]
     data = given.out / "data"
-    (recipe,) = make_dataset.select(make_dataset.load(given.suite), (scene,), ())
+    (recipe,) = make_dataset.select(make_dataset.load(suite.dataset.suite), (scene,), ())
     geometry = recipe.resolve().geometry
     fdk = estimates.fdk_seconds(geometry)
     made = is_complete(data, scene, scene_id(recipe))
-    bench = pareto_methods.Bench(data / scene) if made else None
+    bench = pareto_methods.Bench(data / scene, suite.iterations.stops) if made else None
     return [
         (
             e.method.name,
             bench.setting(e, machine()).identity if bench else "",
             fdk * (estimates.in_fdks(e.method, geometry) or estimates.UNKNOWN),
         )
-        for e in _efforts(given)
+        for e in _efforts(given, suite)
     ]
 
 

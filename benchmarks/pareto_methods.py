@@ -1,12 +1,13 @@
 """Every method of the table over its own effort, on the clock, scored under protocol `tissue`.
 
-Iterative methods run once to twice their default iterations and are scored as they pass each of `STOPS`
-(`watch`); the clock stands still while they are. A run of k iterations is said to take what it took to get there, and
-what the method took after its last: its closing residual. Methods whose effort is not a count of iterations that can be
-watched run once for each value; those without are single points.
+What that is says the suite. Iterative methods run once, past their default iterations, and are scored as they pass each
+of the stops (`watch`); the clock stands still while they are. A run of k iterations is said to take what it took to get
+there, and what the method took after its last: its closing residual. Methods whose effort is not a count of iterations
+that can be watched run once for each value; those without are single points.
 """
 
 import contextlib
+import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,37 +19,22 @@ import torch
 
 from benchmarks import metrics
 from benchmarks.methods import Method, find
+from benchmarks.pareto_jobs import Ended
 from benchmarks.pareto_records import Mark, Setting
+from benchmarks.pareto_suite import Listed, Suite
 from benchmarks.protocol import VERSION, Truth, tissue_range, truth_of
 from benchmarks.run import scan_for, warm_up
+from ctsim.errors import InputError
 from ctsim.store import StoredScan, open_scan
 from ctsim.types import Status
 from reconstruct.watch import watch
-
-STOPS = frozenset((1, 2, 3, 5, 8, 12, 20, 30, 50, 80, 120, 200))
-BY_VALUE: dict[str, tuple[str, tuple[Any, ...]]] = {
-    "ibhc": ("iterations", (1, 2, 3, 4, 6)),
-    "splat": ("passes", ((1, 0), (1, 1), (2, 1), (3, 1), (3, 2), (3, 4), (3, 12))),
-}
-"""Methods that run once for each of these values of a parameter; the default is added."""
-PUBLISHED, STEPS = ("paper", "r2"), 6000
-"""Presets of `splat` that run once, for so many steps of the published schedule, watched after each pass."""
-LAST = 2  # times the default: how far iterations go
-
-
-class Ended(RuntimeError):
-    """A method ended without a volume to score: its status and the reason."""
-
-    def __init__(self, status: str, reason: str) -> None:
-        super().__init__(f"{status}: {reason}")
-        self.status, self.reason = status, reason
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effort:
     """One run to time: a method with its parameters, what the run and its curve are called.
 
-    A run that is `watched` has a mark at each of `STOPS`, if the method shows its volume.
+    A run that is `watched` has a mark at each stop, if the method shows its volume.
     """
 
     method: Method
@@ -57,28 +43,44 @@ class Effort:
     default: bool = True
     watched: bool = False
 
+    @property
+    def kind(self) -> str:
+        """Its method's name: one warm-up does for all of its parameters."""
+        return self.method.name
 
-def efforts(name: str) -> list[Effort]:
-    """List the runs of a method of the table."""
-    usual = find(name)
-    if name in BY_VALUE:
-        key, values = BY_VALUE[name]
-        default = usual.params[key]
-        runs = {f"{key} {_words(v)}": find(name, {key: v}) for v in values}
-        usually = "defaults" if default is None else f"{key} {_words(default)}"
-        runs = {usually: usual} | runs
-        found = [Effort(method=m, label=label, curve=name, default=label == usually) for label, m in runs.items()]
-        return found + [_published(preset) for preset in PUBLISHED if name == "splat"]
+
+def efforts(suite: Suite, name: str) -> list[Effort]:
+    """List the runs of a method as the suite says, or by its iterations, if it has them, where it is not listed.
+
+    Raises InputError for a method or a parameter that there is not.
+    """
+    usual, listed = find(name), suite.listed(name) or Listed(name=name)
+    main = _by_value(usual, listed) if listed.parameter else [_whole(usual, listed.times, suite.iterations.times)]
+    return main + [
+        Effort(method=find(name, run.set), label=run.label, curve=run.curve, watched=True) for run in listed.run
+    ]
+
+
+def _by_value(usual: Method, listed: Listed) -> list[Effort]:
+    """Return a run for the default of the listed parameter, and one for each other value."""
+    key = listed.parameter
+    runs = {f"{key} {_words(v)}": find(usual.name, {key: v}) for v in listed.values}
+    default = usual.params[key]
+    usually = "defaults" if default is None else f"{key} {_words(default)}"
+    runs = {usually: usual} | runs
+    return [Effort(method=m, label=label, curve=usual.name, default=label == usually) for label, m in runs.items()]
+
+
+def _whole(usual: Method, times: int | None, otherwise: int) -> Effort:
+    """Return one watched run, to so many times the default iterations; a plain one of a method that has none."""
     count = usual.params.get("iterations")
-    if not isinstance(count, int):
-        return [Effort(method=usual, label="defaults", curve=name)]
-    method = find(name, {"iterations": LAST * count})
-    return [Effort(method=method, label=f"{LAST * count} iterations", curve=name, watched=True)]
-
-
-def _published(preset: str) -> Effort:
-    method = find("splat", {"preset": preset, "steps": STEPS, "readout": "hardened"})
-    return Effort(method=method, label=f"{STEPS} steps", curve=f"splat {preset}", watched=True)
+    if isinstance(count, int):
+        count *= times or otherwise
+        method = find(usual.name, {"iterations": count})
+        return Effort(method=method, label=f"{count} iterations", curve=usual.name, watched=True)
+    if times is not None:
+        raise InputError(f"method {usual.name!r} has no default iterations to go {times} times as far as")
+    return Effort(method=usual, label="defaults", curve=usual.name)
 
 
 def _words(value: Any) -> str:
@@ -86,11 +88,16 @@ def _words(value: Any) -> str:
 
 
 class Bench:
-    """One stored scene, ready to score volumes."""
+    """One stored scene, ready to score volumes; runs that are watched have marks at the stops among others."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, stops: tuple[int, ...]) -> None:
         self.stored: StoredScan = open_scan(folder)
-        self.truth: Truth = truth_of(self.stored)
+        self.stops = frozenset(stops)
+
+    @functools.cached_property
+    def truth(self) -> Truth:
+        """What volumes are held against."""
+        return truth_of(self.stored)
 
     def setting(self, effort: Effort, machine: str) -> Setting:
         """Return what determines a run."""
@@ -107,9 +114,9 @@ class Bench:
             machine=machine,
         )
 
-    def warm_up(self, method: Method) -> float:
+    def warm_up(self, effort: Effort) -> float:
         """Run the method on a few views and slices, so that compiling is not timed; return its seconds."""
-        return warm_up(method, scan_for(method, self.stored, "metal"), "cpu")
+        return warm_up(effort.method, scan_for(effort.method, self.stored, "metal"), "cpu")
 
     def run(self, effort: Effort) -> tuple[Mark, ...]:
         """Time one run; return a mark at each stop, or one if the method cannot be watched.
@@ -120,7 +127,7 @@ class Bench:
         scan = scan_for(method, self.stored, "metal")
         if reason := method.skip(scan):
             raise Ended(str(Status.SKIPPED), reason)
-        stops = STOPS | {usual, method.params.get("iterations")}
+        stops = self.stops | {usual, method.params.get("iterations")}
         marks = Marks(began=time.perf_counter(), score=self.values, stops=stops)
         with watch(marks) if effort.watched else contextlib.nullcontext():
             volume = method.reconstruct(scan, "cpu")

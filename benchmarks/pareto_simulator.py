@@ -9,7 +9,7 @@ where the reference has level 1's signal added: a constant, whose own error is n
 import functools
 import time
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import get_args
 
 import msgspec
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from benchmarks.methods import code_version
 from benchmarks.pareto_records import Mark, Setting
+from benchmarks.pareto_suite import Choices, Level
 from benchmarks.peer_cases import SIZE, relative, voxelised
 from benchmarks.peer_poly import poly_scene
 from ctsim.noise import Noise
@@ -31,16 +32,12 @@ from ctsim.types import Phantom, Scanner
 from phantoms.scanners import preset
 
 SCENE = "rods"
-SIDE, VIEWS, CHECKED = 96, 16, 2
-TOLERANCES, SUBRAYS = (1e-2, 1e-3, 1e-4, 1e-5), (1, 4, 8, 13, 21, 34, 55, 89, 144, 233)
-GRIDS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
-"""Label voxels along an axis, in detector pixels along one."""
-USUAL = 1.5  # of the bundled suites
+CHECKED = 2  # views that are held against the reference
+USUAL = 1.5  # label voxels for a pixel in the bundled suites
 FINER, FINEST = 16, 64
 """Of the reference: finer pixels along a side of a pixel, and rays in each."""
 CALM = 1e-4  # |ΔP| of the central ray alone, below which a pixel has no edge
-Level = Literal[0, 1]
-LEVELS: tuple[Level, ...] = (0, 1)
+HIGHEST = max(get_args(Level))  # of scatter, which the reference has
 EXACT, BODY, VOXELS, SCATTER = "exact solids", "body in voxels, metal exact", "all in voxels", "scatter"
 
 
@@ -61,9 +58,14 @@ class Choice:
         """What is compared: whether there is a closed form is the scene's matter, so voxels do not rival solids."""
         return SCATTER if self.curve == SCATTER else EXACT if self.grid is None else "voxels"
 
+    @property
+    def kind(self) -> str:
+        """The part's name: one warm-up does for all."""
+        return "simulator"
 
-def choices() -> list[Choice]:
-    """List every choice: tolerances with sub-rays, voxels instead of solids, and scatter levels."""
+
+def choices(asked: Choices) -> list[Choice]:
+    """List every choice that is asked for: tolerances with sub-rays, voxels instead of solids, and scatter levels."""
     usual = Simulation()
     found = [
         Choice(
@@ -72,25 +74,28 @@ def choices() -> list[Choice]:
             simulation=Simulation(tolerance=tolerance, subrays=subrays),
             default=(tolerance, subrays) == (usual.tolerance, usual.subrays),
         )
-        for tolerance in sorted({*TOLERANCES, usual.tolerance}, reverse=True)
-        for subrays in sorted({*SUBRAYS, usual.subrays})
+        for tolerance in sorted({*asked.tolerances, usual.tolerance}, reverse=True)
+        for subrays in sorted({*asked.subrays, usual.subrays})
     ]
     whole = Simulation(skip=False)
     found.append(Choice(curve="nothing skipped", label=f"{usual.subrays} sub-rays", simulation=whole))
     found += [
-        Choice(curve=curve, label=f"{round(grid * SIDE)}³ labels", grid=grid, metal=metal, default=default)
+        Choice(curve=curve, label=f"{round(grid * asked.side)}³ labels", grid=grid, metal=metal, default=default)
         for curve, metal in ((BODY, False), (VOXELS, True))
-        for grid in GRIDS
+        for grid in asked.grids
         for default in (grid == USUAL and not metal,)
     ]
     level = Scatter().level
-    return found + [Choice(curve=SCATTER, label=f"level {k}", level=k, default=k == level) for k in LEVELS]
+    return found + [Choice(curve=SCATTER, label=f"level {k}", level=k, default=k == level) for k in asked.levels]
+
+
+USUALLY = Choice(curve=EXACT, label="default")
 
 
 class Bench:
     """The scene with its reference and what is prepared for each choice; `side` is that of detector and grid."""
 
-    def __init__(self, side: int = SIDE, views: int = VIEWS) -> None:
+    def __init__(self, side: int, views: int) -> None:
         self.side = side
         scanner = preset("skyscan1273", views, (side, side), (side, side, side), SIZE)
         self.scanner = msgspec.structs.replace(scanner, noise=Noise(model="none"))
@@ -125,7 +130,11 @@ class Bench:
 
     def estimate(self) -> float:
         """Return how long a run of the defaults should take, in seconds; choices together take about as much each."""
-        return self.plan(Choice(curve=EXACT, label="default"))[0].seconds
+        return self.plan(USUALLY)[0].seconds
+
+    def warm_up(self, _: Choice) -> float:
+        """Run the defaults, so that compiling and the reference are not timed with a choice; return the seconds."""
+        return sum(mark.seconds for mark in self.run(USUALLY))
 
     def run(self, choice: Choice) -> tuple[Mark, ...]:
         """Time all views of a choice and return its errors."""
@@ -134,7 +143,7 @@ class Bench:
         views = [images["noise_free"] for _, images in simulate_views(plan, phantom, scanner)]
         seconds = time.perf_counter() - start
         found = np.stack([views[k] for k in self.checked])
-        s = open_fraction(Scatter(level=max(LEVELS)), scanner.geometry) if choice.curve == SCATTER else 0.0
+        s = open_fraction(Scatter(level=HIGHEST), scanner.geometry) if choice.curve == SCATTER else 0.0
         label = f"{choice.label}, {len(plan.rule.energies)} energies"
         return (Mark(label=label, seconds=seconds, values=self.errors(found, s), default=choice.default),)
 

@@ -1,12 +1,18 @@
 import math
+import multiprocessing
+import os
 import re
 import shlex
+import signal
 import sys
+import threading
+import time
 from collections import Counter
 from pathlib import Path
 
 import msgspec
 import numpy as np
+import pareto_ends
 import pytest
 import torch
 import tyro
@@ -14,8 +20,19 @@ from conftest import SMALLEST
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks import cli, lines, pareto, pareto_figure, pareto_methods, pareto_simulator, pareto_table
+from benchmarks import (
+    cli,
+    lines,
+    pareto,
+    pareto_figure,
+    pareto_jobs,
+    pareto_methods,
+    pareto_simulator,
+    pareto_suite,
+    pareto_table,
+)
 from benchmarks.host import host
+from benchmarks.limited import Limited
 from benchmarks.methods import TABLE
 from benchmarks.pareto_front import beaten_by, front, knee
 from benchmarks.pareto_records import (
@@ -37,6 +54,7 @@ from ctsim.settings import Simulation
 from ctsim.types import Volume
 
 # few values, so that ties in one coordinate and in both occur
+SUITE = pareto_suite.load(None)
 PAIRS = st.lists(st.tuples(st.integers(1, 6), st.integers(1, 6)), min_size=1, max_size=12)
 
 
@@ -100,11 +118,11 @@ def setting(label="a", curve="fdk", part="methods", **more):
     return Setting(part=part, curve=curve, label=label, **{**fields, **more})
 
 
-def timed(of, *marks, status="ok"):
+def timed(of, *marks, status="ok", time="t"):
     """A run whose marks are (label, seconds, error)."""
     name = {"simulator": "rms", "methods": "rmse"}[of.part]
     found = tuple(Mark(label=label, seconds=s, values={name: e}) for label, s, e in marks)
-    return Timed(setting=of, marks=found, status=status, reason="", host=host(), commit="c", time="t")
+    return Timed(setting=of, marks=found, status=status, reason="", host=host(), commit="c", time=time)
 
 
 def test_seconds_are_medians_over_the_runs_of_a_mark():
@@ -148,42 +166,146 @@ def test_recommended_are_near_the_least_error_for_methods_and_the_knee_for_the_s
     assert recommended(simulator).label == "1"
 
 
-def test_each_setting_runs_once_a_round_and_a_resumed_command_goes_on():
-    calls = []
-
-    def task(label, kind, fails=False):
-        def run():
-            calls.append(label)
-            if fails:
-                raise pareto_methods.Ended("diverged", "so")
-            return (Mark(label=label, seconds=1.0, values={"rmse": 1.0}),)
-
-        def warm():
-            calls.append(f"warm {kind}")
-            return 0.5
-
-        return pareto.Task(setting=setting(label), run=run, kind=kind, warm=warm)
-
-    tasks = [task("a", "x"), task("b", "x"), task("c", "y", fails=True)]
-    # a has had one run already, so the first round is b's and c's
-    found = list(pareto.rounds(tasks, 3, Counter({tasks[0].setting.identity: 1})))
-    assert calls == ["warm x", "b", "warm y", "c", "a", "b", "a", "b"]
-    assert [(t.status, t.reason) for t in found if t.setting.label == "c"] == [("diverged", "so")]
-    assert [t.warm_up for t in found if t.warm_up is not None] == [0.5, 0.5]
+def pretended(name, **kinds):
+    """Jobs by their choice's name."""
+    tried = [pareto_ends.Tried(label, kind) for label, kind in kinds.items()]
+    return {job.choice.label: job for job in pareto_jobs.jobs(pareto_ends.Scene, (name,), tried, "m")}
 
 
-# --- methods -----------------------------------------------------------------------------------------
+def test_each_setting_runs_once_a_round_and_a_resumed_command_goes_on(monkeypatch):
+    monkeypatch.setattr(pareto_jobs, "use_threads", lambda threads: None)
+    jobs = pretended("rounds", a="x", b="x", c="y", d="y")
+    calls = pareto_ends.CALLS
+    calls.clear()
+    # a has had one run already, so the first round is that of the others
+    done = Counter({jobs["a"].setting.identity: 1})
+    found = list(pareto.rounds(list(jobs.values()), 3, done, lambda job: pareto_jobs.do(2, job)))
+    assert calls == ["open rounds", "warm x", "b", "warm y", "c", "d", "a", "b", "a", "b"]
+    assert {(t.setting.label, t.status, t.reason) for t in found if t.status != "ok"} == {
+        ("c", "diverged", "so"),
+        ("d", "out_of_memory", "MemoryError: no room"),
+    }
+    assert [(t.setting.label, t.warm_up) for t in found if t.warm_up is not None] == [("b", 0.5), ("c", 0.5)]
 
 
-def test_every_method_has_an_effort_and_one_default():
+def test_a_run_that_overstays_is_one_row_and_the_next_warms_up_again():
+    jobs = pretended("hung", a="x", e="x")
+    with Limited(60) as process:
+        first, second = (pareto_jobs.within(process, 1, jobs["a"]) for _ in range(2))
+        assert (first.warm_up, second.warm_up) == (0.5, None)
+        assert first.marks[0].values["threads"] == 1
+        process.seconds = 0.2
+        hung = pareto_jobs.within(process, 1, jobs["e"])
+        assert (hung.status, hung.reason, hung.marks) == ("timeout", "did not end within 0.2 s", ())
+        process.seconds = 60
+        assert pareto_jobs.within(process, 1, jobs["a"]) == first
+
+
+# --- what is measured --------------------------------------------------------------------------------
+
+
+def suite_file(tmp_path, *tables):
+    """Flags for a suite of the smallest scene and these tables."""
+    (tmp_path / "scenes.toml").write_text(SMALLEST, encoding="utf-8")
+    path = tmp_path / "mine.toml"
+    path.write_text("\n".join(['[dataset]\nsuite = "scenes.toml"', *tables]), encoding="utf-8")
+    return path
+
+
+def tuned(scan, *, device, strength=2, iterations=4):
+    raise NotImplementedError
+
+
+def test_the_bundled_suite_has_every_method_and_the_defaults_of_all():
+    assert [listed.name for listed in SUITE.method] == list(TABLE)
     for name in TABLE:
-        found = pareto_methods.efforts(name)
+        found = pareto_methods.efforts(SUITE, name)
         curves = {e.curve for e in found}
         assert [sum(e.default for e in found if e.curve == curve) for curve in curves] == [1] * len(curves), name
         assert len({(e.curve, e.label) for e in found}) == len(found), name
-    assert {e.curve for e in pareto_methods.efforts("splat")} == {"splat", "splat paper", "splat r2"}
-    assert [e.label for e in pareto_methods.efforts("fdk")] == ["defaults"]
-    assert [e.method.overrides for e in pareto_methods.efforts("cgls")] == [{"iterations": 30}]
+    assert {e.curve for e in pareto_methods.efforts(SUITE, "splat")} == {"splat", "splat paper", "splat r2"}
+    assert [e.label for e in pareto_methods.efforts(SUITE, "fdk")] == ["defaults"]
+    assert [e.method.overrides for e in pareto_methods.efforts(SUITE, "cgls")] == [{"iterations": 30}]
+    choices = pareto_simulator.choices(SUITE.simulator)
+    for group in {c.group for c in choices}:
+        assert any(c.default for c in choices if c.group == group), group
+    assert len({(c.curve, c.label) for c in choices}) == len(choices)
+    usual = [c for c in choices if c.default and c.simulation == Simulation() and c.grid is None]
+    assert len(usual) == 2  # of the projections, and without scatter
+
+
+def test_a_file_of_ones_own_says_what_is_measured_and_leaves_the_rest_as_it_is(tmp_path):
+    mine = f"{__name__}:tuned"
+    path = suite_file(
+        tmp_path,
+        "[iterations]\nstops = [1, 4]\ntimes = 3",
+        f"[[method]]\nname = '{mine}'\nparameter = 'strength'\nvalues = [1, 2, [3, 4]]",
+        "[[method.run]]\ncurve = 'both'\nlabel = 'long'\nset = { strength = 9, iterations = 50 }",
+        "[[method]]\nname = 'cgls'\ntimes = 5",
+    )
+    suite = pareto_suite.load(path)
+    assert suite.simulator == SUITE.simulator
+    assert suite.dataset.suite == str(tmp_path / "scenes.toml") and suite.dataset.scenes == ()
+    found = pareto_methods.efforts(suite, mine)
+    assert [(e.curve, e.label, e.method.overrides, e.default, e.watched) for e in found] == [
+        (mine, "strength 2", {"strength": 2}, True, False),
+        (mine, "strength 1", {"strength": 1}, False, False),
+        (mine, "strength 3 + 4", {"strength": [3, 4]}, False, False),
+        ("both", "long", {"strength": 9, "iterations": 50}, True, True),
+    ]
+    assert [e.label for e in pareto_methods.efforts(suite, "cgls")] == ["75 iterations"]
+    # what is not listed goes by its iterations
+    assert [e.label for e in pareto_methods.efforts(suite, "sirt")] == ["300 iterations"]
+    assert [e.label for e in pareto_methods.efforts(SUITE, mine)] == ["8 iterations"]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[dataset", "mine.toml: not TOML"),
+        (
+            "[[scene]]\nname = 'a'",
+            "mine.toml: scene: unknown key; expected one of dataset, iterations, method, simulator",
+        ),
+        ("[dataset]\nsuite = 'none'", "mine.toml: dataset.suite: none: neither a TOML file nor a bundled suite"),
+        (
+            "[dataset]\nsuite = 'quick'\nscenes = ['a']",
+            "mine.toml: dataset.scenes: there is no 'a', expected one of lung-Fe",
+        ),
+        ("[iterations]\ntimes = 2", "mine.toml: iterations.stops: missing; expected a list"),
+        ("[iterations]\ntimes = 2\nstops = [1, 0]", "mine.toml: iterations.stops[1]: Expected `int` >= 1"),
+        ("[[method]]\nname = 'fdk'\nvalue = [3]", "mine.toml: method[0].value: unknown key; expected one of name"),
+        (
+            "[[method]]\nname = 'ibhc'\nvalues = [3]",
+            "mine.toml: method[0].parameter and values: expected both or neither",
+        ),
+        ("[[method]]\nname = 'fdk'\n[[method]]\nname = 'fdk'", "mine.toml: method: two curves are called 'fdk'"),
+        ("[[method]]\nname = 'fdc'", "mine.toml: there is no method 'fdc'"),
+        ("[[method]]\nname = 'fdk'\ntimes = 3", "mine.toml: method 'fdk' has no default iterations"),
+        (
+            "[[method]]\nname = 'ibhc'\nparameter = 'size'\nvalues = [1]",
+            "mine.toml: method 'ibhc' has no parameter 'size'",
+        ),
+        (
+            "[simulator]\nside = 16\nviews = 9\ntolerances = [1e-3, 1.0]\nsubrays = []\ngrids = []\nlevels = []",
+            "mine.toml: simulator.tolerances[1]: Expected `float` <= 0.1",
+        ),
+        (
+            "[simulator]\nside = 16\nviews = 9\ntolerances = []\nsubrays = []\ngrids = []\nlevels = [2]",
+            "mine.toml: simulator.levels[0]: Invalid enum value 2",
+        ),
+    ],
+)
+def test_a_file_that_is_wrong_is_said_in_one_sentence(text, says, tmp_path, monkeypatch, capsys):
+    path, out = tmp_path / "mine.toml", tmp_path / "out"
+    path.write_text(text, encoding="utf-8")
+    monkeypatch.setattr(sys, "argv", ["run-benchmark", "pareto", str(out), "--suite", str(path)])
+    assert cli.run_benchmark() == 2
+    said = capsys.readouterr().err.strip()
+    assert f"{tmp_path}/{says}" in said and "\n" not in said and not out.exists()
+
+
+# --- methods -----------------------------------------------------------------------------------------
 
 
 def slow(scan, *, device, iterations=2):
@@ -206,14 +328,14 @@ def test_the_clock_leaves_out_scoring_and_counts_what_begins_and_ends_a_run(smal
     monkeypatch.setattr("time.perf_counter", lambda: CLOCK[0])
     monkeypatch.setitem(TABLE, "slow", (f"{__name__}:slow", "counts only"))
     (folder,) = (path for path in smallest.iterdir() if (path / "scene.toml").exists())
-    bench = pareto_methods.Bench(folder)
+    bench = pareto_methods.Bench(folder, (1, 2, 3))
 
     def score(volume):
         CLOCK[0] += 100
         return {"rmse": float(volume.mean())}
 
     monkeypatch.setattr(bench, "values", score)
-    (effort,) = pareto_methods.efforts("slow")
+    (effort,) = pareto_methods.efforts(SUITE, "slow")
     marks = bench.run(effort)
     assert [(m.label, m.seconds, m.default) for m in marks] == [
         ("1 iteration", 8.0, False),
@@ -227,9 +349,8 @@ def test_the_clock_leaves_out_scoring_and_counts_what_begins_and_ends_a_run(smal
 
 def test_methods_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(pareto, "use_threads", lambda threads: None)  # the threads of this process are not ours to set
-    (tmp_path / "small.toml").write_text(SMALLEST, encoding="utf-8")
     out = tmp_path / "out"
-    common = [str(out), "--suite", str(tmp_path / "small.toml"), "--part", "methods", "--repeats", "2"]
+    common = [str(out), "--suite", str(suite_file(tmp_path)), "--part", "methods", "--repeats", "2"]
     chosen = ["--method", "fdk", "--method", "cgls", "--method", "limar"]
 
     def left():
@@ -251,19 +372,38 @@ def test_methods_end_to_end(tmp_path, monkeypatch, capsys):
     assert (out / "pareto.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_method_that_fails_is_a_row_with_its_reason_and_is_tried_again(tmp_path, monkeypatch, capsys):
+def test_what_fails_or_overstays_is_a_row_with_its_reason_and_is_tried_again(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(pareto, "use_threads", lambda threads: None)
-    (tmp_path / "small.toml").write_text(SMALLEST, encoding="utf-8")
-    command = [str(tmp_path), "--suite", str(tmp_path / "small.toml"), "--part", "methods", "--repeats", "2"]
-    for _ in range(2):
-        assert pareto.main([*command, "--method", f"{__name__}:fails"]) == 1
-        text = capsys.readouterr().out
-        assert f"| {__name__}:fails | defaults | error | ValueError: no such luck |" in text
-    assert len(read(tmp_path / "pareto.jsonl")) == 2
+    command = [str(tmp_path), "--suite", str(suite_file(tmp_path)), "--part", "methods", "--repeats", "2"]
+    chosen = ["--method", "pareto_ends:fails", "--method", "fdk"]
+    # a process cannot even start in that time
+    assert pareto.main([*command, *chosen, "--seconds", "0.01"]) == 1
+    text = capsys.readouterr().out
+    for name in ("pareto_ends:fails", "fdk"):
+        assert f"| {name} | defaults | timeout | did not end within 0.01 s |" in text
+    assert pareto.main([*command, *chosen]) == 1
+    text = capsys.readouterr().out
+    assert "| pareto_ends:fails | defaults | error | ValueError: no such luck |" in text and "timeout" not in text
+    statuses = [(t.setting.curve, t.status) for t in read(tmp_path / "pareto.jsonl")]
+    failed = [("pareto_ends:fails", "timeout"), ("fdk", "timeout"), ("pareto_ends:fails", "error")]
+    assert statuses == [*failed, ("fdk", "ok"), ("fdk", "ok")]
 
 
-def fails(scan, *, device):
-    raise ValueError("no such luck")
+def test_ctrl_c_ends_a_run_with_its_process_and_keeps_the_records(tmp_path, monkeypatch):
+    monkeypatch.setattr(pareto, "use_threads", lambda threads: None)
+    path = tmp_path / "out" / "pareto.jsonl"
+
+    def interrupt():
+        while not path.exists():
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    chosen = ["--part", "methods", "--method", "fdk", "--method", "pareto_ends:hangs", "--repeats", "1"]
+    with pytest.raises(KeyboardInterrupt):
+        pareto.main([str(path.parent), "--suite", str(suite_file(tmp_path)), *chosen])
+    assert [t.setting.curve for t in read(path)] == ["fdk"]
+    assert not multiprocessing.active_children()
 
 
 # --- simulator ---------------------------------------------------------------------------------------
@@ -272,15 +412,6 @@ def fails(scan, *, device):
 @pytest.fixture(scope="module")
 def bench():
     return pareto_simulator.Bench(side=16, views=4)
-
-
-def test_the_defaults_are_among_the_choices():
-    found = {c.group: [x for x in pareto_simulator.choices() if x.group == c.group] for c in pareto_simulator.choices()}
-    for group, choices in found.items():
-        assert any(c.default for c in choices), group
-        assert len({(c.curve, c.label) for c in choices}) == len(choices)
-    usual = [c for c in pareto_simulator.choices() if c.default and c.simulation == Simulation() and c.grid is None]
-    assert len(usual) == 2  # of the projections, and without scatter
 
 
 def test_the_reference_is_converged_where_the_choices_are_not(bench):
@@ -312,25 +443,25 @@ def test_errors_are_those_of_p(bench):
 def test_scatter_is_judged_with_scatter(bench):
     off, on = (
         bench.run(pareto_simulator.Choice(curve=pareto_simulator.SCATTER, label=str(k), level=k))[0].values["rms"]
-        for k in pareto_simulator.LEVELS
+        for k in (0, pareto_simulator.HIGHEST)
     )
     plain = bench.run(pareto_simulator.Choice(curve="c", label="c"))[0].values["rms"]
     # scatter fills up the darkest pixels, whose error leads, so it can but lessen what edges leave; without it P is off
     assert on < 2 * plain < off
 
 
-def test_simulator_end_to_end(tmp_path, monkeypatch, capsys, bench):
+def test_simulator_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(pareto, "use_threads", lambda threads: None)
-    few = [c for c in pareto_simulator.choices() if c.default or c.label == "4 sub-rays"]
-    monkeypatch.setattr(pareto_simulator, "choices", lambda: few)
-    monkeypatch.setattr(pareto_simulator, "Bench", lambda: bench)
-    assert pareto.main([str(tmp_path), "--part", "simulator", "--repeats", "1"]) == 0
+    choices = "tolerances = [1e-4]\nsubrays = [4]\ngrids = [1.5]\nlevels = [0]"
+    path = suite_file(tmp_path, f"[simulator]\nside = 16\nviews = 2\n{choices}")
+    assert pareto.main([str(tmp_path), "--suite", str(path), "--part", "simulator", "--repeats", "1"]) == 0
     text = capsys.readouterr().out
-    assert "### simulator, rods: exact solids (16² pixels, 4 views)" in text
-    # each default has its verdict in each error
+    assert "### simulator, rods: exact solids (16² pixels, 2 views)" in text
+    # each default has its verdict in each error: of solids, of voxels, of scatter
     verdicts = [line for line in text.splitlines() if line.startswith("- Default ")]
-    assert len(verdicts) == sum(c.default for c in few)
+    assert len(verdicts) == 3
     assert all(line.count("the front in relative RMS") == line.count("in all errors at once") == 1 for line in verdicts)
+    assert "body in voxels, metal exact, 24³ labels" in text
 
 
 def test_verdicts_name_what_beats_a_default():
@@ -367,18 +498,23 @@ def test_verdicts_name_what_beats_a_default():
         (["--part", "simulator", "--scene", "lung-Fe"], "expected one of simulator: rods"),
         (["--method", "fdc"], "there is no method 'fdc'"),
         (["--table"], "there are no records"),
+        (["--part", "methods", "--seconds", "0"], "seconds must be positive, got 0"),
     ],
 )
 def test_bad_input_is_said_in_one_sentence(arguments, says, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(pareto, "use_threads", lambda threads: None)
     monkeypatch.setattr(sys, "argv", ["run-benchmark", "pareto", str(tmp_path / "out"), *arguments])
     assert cli.run_benchmark() == 2
     said = capsys.readouterr().err.strip()
-    assert says in said and "\n" not in said
+    assert says in said and "\n" not in said and not (tmp_path / "out").exists()
 
 
-def test_the_page_gives_commands_that_exist():
+def test_the_page_gives_commands_and_a_file_that_work(tmp_path):
     text = (Path(__file__).parents[1] / "docs" / "pareto.md").read_text(encoding="utf-8")
     found = re.findall(r"^    run-benchmark pareto (.*)$", text, re.M)
     assert len(found) >= 3
     for line in found:
         tyro.cli(pareto.Arguments, args=shlex.split(line, comments=True))
+    path = tmp_path / "mine.toml"
+    path.write_text("\n".join(re.findall(r"^    (?!run-benchmark)(.*)$", text, re.M)), encoding="utf-8")
+    assert [listed.name for listed in pareto_suite.load(path).method] == ["splat", "my_lab.net:reconstruct"]

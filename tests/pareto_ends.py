@@ -1,0 +1,51 @@
+"""Methods and a scene that end in every way, for the tests of pareto; imports little, since processes load it anew."""
+
+import time
+from dataclasses import dataclass
+
+from benchmarks.pareto_jobs import Ended
+from benchmarks.pareto_records import Mark, Setting
+
+CALLS = []
+
+
+def fails(scan, *, device):
+    raise ValueError("no such luck")
+
+
+def hangs(scan, *, device):
+    time.sleep(60)
+
+
+@dataclass(frozen=True)
+class Tried:
+    label: str
+    kind: str
+
+
+class Scene:
+    """Opened, warmed up and run, it says so in CALLS; choices c to e do not end well."""
+
+    def __init__(self, name):
+        CALLS.append(f"open {name}")
+
+    def setting(self, choice, machine):
+        return Setting(
+            part="methods", scene="s", data="d", group="g", curve="x", label=choice.label, params={}, machine=machine
+        )
+
+    def warm_up(self, choice):
+        CALLS.append(f"warm {choice.kind}")
+        return 0.5
+
+    def run(self, choice):
+        import numba
+
+        CALLS.append(choice.label)
+        if choice.label == "c":
+            raise Ended("diverged", "so")
+        if choice.label == "d":
+            raise MemoryError("no room")
+        if choice.label == "e":
+            time.sleep(60)
+        return (Mark(label=choice.label, seconds=1.0, values={"rmse": 1.0, "threads": numba.get_num_threads()}),)
