@@ -18,7 +18,7 @@ import tyro
 
 from benchmarks import lines, pareto_suite
 from benchmarks.host import commit, host, use_threads
-from benchmarks.pareto_records import NAME, Part, Timed, latest, read, runs
+from benchmarks.pareto_records import NAME, WHAT, Part, Timed, latest, read, runs
 from benchmarks.records import OK
 from ctsim.errors import InputError
 from ctsim.human import human_time
@@ -59,6 +59,8 @@ class Arguments:
     """Print what is left to run and about how long it takes; measure nothing."""
     table: tyro.conf.FlagCreatePairsOff[bool] = False
     """Only render the table and the figure from the records, computing nothing."""
+    collect: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="OTHER [OTHER ...]")] = ()
+    """Take over what these results folders of other machines have and OUT lacks, then only render table and figure."""
 
 
 def main(argv: list[str]) -> int:
@@ -68,7 +70,10 @@ def main(argv: list[str]) -> int:
         raise InputError(f"--repeats and --threads must be at least 1, got {given.repeats} and {given.threads}")
     suite = pareto_suite.load(given.suite)
     wanted = _scenes(given, suite)
-    if given.table:
+    if given.collect:
+        for other, count in lines.collect(given.out / NAME, given.collect, Timed, WHAT).items():
+            sys.stderr.write(f"{other}: {count} records taken over\n")
+    if given.table or given.collect:
         _report(given.out)
         return 0
     if "methods" in wanted:

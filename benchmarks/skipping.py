@@ -60,6 +60,8 @@ class Arguments:
     """Print what is left to measure and about how long it takes; measure nothing."""
     table: tyro.conf.FlagCreatePairsOff[bool] = False
     """Only render the table from the records, computing nothing."""
+    collect: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="OTHER [OTHER ...]")] = ()
+    """Take over what these results folders of other machines have and RESULTS lacks, then only render the table."""
 
 
 def main(argv: list[str]) -> int:
@@ -68,12 +70,22 @@ def main(argv: list[str]) -> int:
     if given.repeats < 1:
         raise InputError(f"--repeats must be at least 1, got {given.repeats}")
     wanted = tuple(dict.fromkeys(given.case)) or CASES
-    if given.dry_run:
+    if given.collect:
+        _collect(given)
+    elif given.dry_run:
         sys.stdout.write(_planned(given, wanted))
         return 0
-    if not given.table:
+    elif not given.table:
         _measure(given, wanted)
     return _report(given, wanted)
+
+
+def _collect(given: Arguments) -> None:
+    from benchmarks import lines, skipping_tables
+
+    path, kind = given.results / NAME, skipping_tables.SkipRecord
+    for other, count in lines.collect(path, given.collect, kind, skipping_tables.WHAT).items():
+        sys.stderr.write(f"{other}: {count} records taken over\n")
 
 
 def _report(given: Arguments, wanted: tuple[Case, ...]) -> int:

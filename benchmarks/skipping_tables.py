@@ -10,7 +10,7 @@ from benchmarks import lines
 from benchmarks.host import Host, certain
 from benchmarks.records import OK
 
-CORE = "core"
+CORE, WHAT = "core", "a record of run-benchmark skipping"
 
 
 class Measured(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -74,7 +74,7 @@ class SkipRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 def read(path: Path) -> list[SkipRecord]:
     """Read the records of a skipping file (see `lines.read`)."""
-    return lines.read(path, SkipRecord, "a record of run-benchmark skipping")
+    return lines.read(path, SkipRecord, WHAT)
 
 
 def known(path: Path, size: str, repeats: int, at: tuple[Host, str]) -> set[str]:
@@ -127,13 +127,17 @@ def _cells(m: Measured) -> tuple[str, ...]:
 
 
 def _provenance(records: Sequence[SkipRecord]) -> str:
-    """Say where and by what code; cases that were measured one by one may be of several commits."""
-    h, times = records[-1].host, sorted(record.time for record in records)
+    """Say where and by what code; cases that were measured one by one may be of several machines and commits."""
+    times = sorted(record.time for record in records)
+    machines = dict.fromkeys(_machine(r.host) for r in sorted(records, key=lambda record: record.time))
     commits = dict.fromkeys(r.commit[:12] + "+changes" * r.commit.endswith("+changes") for r in records)
     least = min((len(r.measured.skipping) for r in records if r.measured.status == OK), default=0)
     return (
-        f"{times[0]} to {times[-1]}, commit {', '.join(commits)}, {h.cpu}, {h.cores} cores, {h.threads} threads, "
-        f"Python {h.python}, numba {h.versions.get('numba', '?')}; size {records[-1].size}. Medians of "
-        f"{least} or more interleaved runs; the gain is the median over pairs of the time without the skip over that "
-        "with it."
+        f"{times[0]} to {times[-1]}, commit {', '.join(commits)}, {' and '.join(machines)}; size {records[-1].size}. "
+        f"Medians of {least} or more interleaved runs; the gain is the median over pairs of the time without the skip "
+        "over that with it."
     )
+
+
+def _machine(h: Host) -> str:
+    return f"{h.cpu}, {h.cores} cores, {h.threads} threads, Python {h.python}, numba {h.versions.get('numba', '?')}"

@@ -498,6 +498,7 @@ def test_verdicts_name_what_beats_a_default():
         (["--part", "simulator", "--scene", "lung-Fe"], "expected one of simulator: rods"),
         (["--method", "fdc"], "there is no method 'fdc'"),
         (["--table"], "there are no records"),
+        (["--collect", "nowhere"], "--collect nowhere: there are no records, expected a folder with pareto.jsonl"),
         (["--part", "methods", "--seconds", "0"], "seconds must be positive, got 0"),
     ],
 )
@@ -507,6 +508,22 @@ def test_bad_input_is_said_in_one_sentence(arguments, says, tmp_path, monkeypatc
     assert cli.run_benchmark() == 2
     said = capsys.readouterr().err.strip()
     assert says in said and "\n" not in said and not (tmp_path / "out").exists()
+
+
+def test_records_of_other_machines_are_taken_over_and_the_table_shows_the_last(tmp_path, capsys):
+    here, there = tmp_path / "here", tmp_path / "there"
+    for folder, machine, seconds, day in ((here, "m", 1.0, 1), (there, "n", 7.0, 2)):
+        folder.mkdir()
+        record = timed(setting(machine=machine), ("a", seconds, 1.0), time=f"2026-01-0{day}T00:00:00+00:00")
+        lines.append(folder / "pareto.jsonl", record)
+    both = [*read(here / "pareto.jsonl"), *read(there / "pareto.jsonl")]
+    for taken in (1, 0):
+        assert pareto.main([str(here), "--collect", str(there)]) == 0
+        said = capsys.readouterr()
+        assert f"{there}: {taken} records taken over" in said.err
+        assert "| fdk | a | 7 |" in said.out and "| fdk | a | 1 |" not in said.out
+    assert read(here / "pareto.jsonl") == both
+    assert sorted(path.name for path in here.iterdir()) == ["pareto.jsonl", "pareto.md", "pareto.png"]
 
 
 def test_the_page_gives_commands_and_a_file_that_work(tmp_path):

@@ -2,6 +2,7 @@
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -177,6 +178,31 @@ def test_a_case_that_overstays_is_a_row_with_its_reason_and_is_tried_again(tmp_p
     assert skipping.main(words) == 0
     said = capsys.readouterr()
     assert "timeout" not in said.out and "recorded already" not in said.err
+
+
+def test_records_of_other_machines_are_taken_over(tmp_path, capsys):
+    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
+    another = msgspec.structs.replace(host.host(), cpu="another processor")
+    for folder, case, at, difference in ((ours, "rays", host.host(), 0.0), (theirs, "twin", another, 2.0)):
+        folder.mkdir()
+        measured = skipping_tables.Measured(
+            case=case, scene="none", what="nothing", skipping=(1.0,), whole=(2.0,), difference=difference, unit="P",
+            limit=1.0, stated="exact",
+        )  # fmt: skip
+        record = skipping_tables.SkipRecord(
+            measured=measured, size="core", host=at, commit="a" * 40, time=f"2026-01-01T00:00:0{len(case)}", run=case
+        )
+        lines.append(folder / skipping.NAME, record)
+    both = [*skipping_tables.read(ours / skipping.NAME), *skipping_tables.read(theirs / skipping.NAME)]
+    for taken in (1, 0):
+        assert skipping.main([str(ours), "--collect", str(theirs)]) == 1  # what was measured there is judged too
+        said = capsys.readouterr()
+        assert f"{theirs}: {taken} records taken over" in said.err
+        assert "| rays |" in said.out and "| twin |" in said.out
+        assert host.host().cpu in said.out and "another processor" in said.out
+    assert skipping_tables.read(ours / skipping.NAME) == both
+    with pytest.raises(InputError, match=r"--collect .*none: there are no records"):
+        skipping.main([str(ours), "--collect", str(tmp_path / "none")])
 
 
 def test_an_interrupted_make_dataset_interrupts_the_command():
