@@ -19,6 +19,7 @@ from phantoms.inserts import count, diameter, inserts
 TISSUES = ("air", "lung", "adipose", "soft_tissue", "cortical_bone")
 FROM_HU = (-900.0, -250.0, -20.0, 200.0)
 """The HU from which a voxel is the next of `TISSUES`."""
+WIDEST = 4.0  # mm: in a cube of 60 mm and above an insert's diameter, for implants do not grow with the body
 LENGTH = 3.0  # of an insert, in its diameters
 
 
@@ -121,7 +122,7 @@ def _inserts(hu: NDArray[np.float32], params: CtVolume, unit: float, rng: np.ran
     """Return capsules of random direction at the places that are given, or at random ones."""
     if not (n := count(params, len(params.at) or 2)):
         return []
-    make, d = inserts(params, unit), diameter(params, 4.0, unit)
+    make, d = inserts(params, unit), diameter(params, min(WIDEST, WIDEST * 30 / unit), unit)
     limit = REACH * unit - LENGTH / 2 * d
     places = np.array(params.at) if params.at else _drawn(hu, params, limit, (rng, n))
     if np.hypot(*places[:, :2].T).max() > limit or np.abs(places[:, 2]).max() > limit:

@@ -4,7 +4,9 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
+import tifffile
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
@@ -23,8 +25,9 @@ def test_there_are_examples():
 
 @pytest.mark.parametrize(("kind", "text"), MARKED)
 def test_an_example_works(kind, text, smallest, tmp_path, monkeypatch):
-    """Python runs where data/ holds a dataset; TOML is read as scenes, and every phantom is built."""
+    """Python runs where data/ holds a dataset; TOML is read as scenes, one of head.tif, and every phantom is built."""
     (tmp_path / "data").symlink_to(smallest)
+    tifffile.imwrite(tmp_path / "head.tif", np.full((50, 150, 150), 1074, np.uint16))
     monkeypatch.chdir(tmp_path)
     if kind == "python":
         exec(compile(text, "example", "exec"), {"__name__": "example"})
