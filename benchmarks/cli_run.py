@@ -100,8 +100,6 @@ def _compute(given: Arguments) -> int:
 
     if given.scheduler is None:  # else it is the workers that have the device
         check_device(given.device)
-    if given.scheduler and (given.isolate or given.seconds is not None):
-        raise InputError("--isolate and --seconds start processes, which Dask's workers may not: expected --workers")
     options = run.Options(
         device=given.device,
         isolate=given.isolate,

@@ -1,8 +1,9 @@
 """Run one method in a process of its own, with its own memory count and an optional time limit."""
 
-import multiprocessing
+import functools
 import pkgutil
 import signal
+import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass, field
@@ -13,7 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import intermediates
+from benchmarks import apart, intermediates
 from benchmarks.intermediates import Intermediates
 from benchmarks.records import Cost
 
@@ -52,7 +53,6 @@ def _work(store: str, folder: str, variant: str, method: "Method", device: str, 
     """Be the process: open the scan, warm up, run, leave the outcome in `out`."""
     from benchmarks.run import attempt, scan_for, warm_up
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C means
     stored = pkgutil.resolve_name(store)(folder)
     warm = warm_up(method, scan_for(method, stored, "metal"), device)
     outcome = attempt(method, scan_for(method, stored, variant), device, warm)
@@ -72,18 +72,13 @@ def run_apart(store: str, folder: Path, variant: str, method: "Method", device: 
     that opens the folder.
     """
     with tempfile.TemporaryDirectory(prefix="run-benchmark-") as out:
-        context = multiprocessing.get_context("spawn")
-        process: Any = context.Process(target=_work, args=(store, str(folder), variant, method, device, out))
-        process.start()
-        try:
-            process.join(seconds)
-            if process.is_alive():
+        work = functools.partial(_work, store, str(folder), variant, method, device, out)
+        with apart.started(work) as process:
+            try:
+                process.wait(seconds)
+            except subprocess.TimeoutExpired:
                 return Outcome(status="timeout", reason=f"did not end within {seconds:g} s")
-        finally:
-            if process.is_alive():
-                process.kill()
-                process.join()
-        return _collect(Path(out), process.exitcode)
+        return _collect(Path(out), process.returncode)
 
 
 def how_it_ended(exit_code: int) -> str:

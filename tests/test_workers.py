@@ -49,6 +49,10 @@ def fatal_once(scan, *, device):
     return reconstruct(scan, device=device)
 
 
+def hang(scan, *, device):
+    time.sleep(60)
+
+
 def _die_once(mark):
     try:
         mark.touch(exist_ok=False)
@@ -107,11 +111,15 @@ def score(data: Path, results: Path, *flags: str) -> int:
 
 def scores(results: Path) -> dict:
     """Return what was measured of each run, and fail where one was recorded twice."""
+    return {r.identity: (r.label, r.place, r.status, r.scores) for r in records_of(results)}
+
+
+def records_of(results: Path) -> list:
     from benchmarks import records
 
     found, torn = records.read_all(results)
     assert not torn and len({r.identity for r in found}) == len(found)
-    return {r.identity: (r.label, r.place, r.status, r.scores) for r in found}
+    return found
 
 
 def tables(results: Path) -> str:
@@ -187,6 +195,23 @@ def test_a_cluster_scores_the_same_though_a_worker_is_killed(serial, cluster, tm
     client.run(set_mark, str(tmp_path / "mark"))
     assert score(serial / "data", tmp_path / "results", "--scheduler", address) == 0
     assert (tmp_path / "mark").exists() and same_results(serial / "results", tmp_path / "results")
+
+
+def test_a_clusters_worker_runs_methods_apart_within_a_time_limit(serial, cluster, tmp_path):
+    address, client = cluster
+    client.run(set_mark, str(serial / "mark"))
+    flags = ("--scheduler", address, "--scene", "bare")
+    assert score(serial / "data", tmp_path / "results", *flags, "--isolate") == 0
+    found = scores(tmp_path / "results")
+    assert len(found) == 2 and found.items() <= scores(serial / "results").items()
+    assert all(r.cost.isolated for r in records_of(tmp_path / "results"))
+    from benchmarks.cli_run import main
+
+    words = (serial / "data", tmp_path / "hung", "--method", "test_workers:hang", "--seconds", "2", *flags)
+    assert main([*map(str, words)]) == 1
+    (hung,) = records_of(tmp_path / "hung")
+    assert (hung.status, hung.reason) == ("timeout", "did not end within 2 s")
+    assert len(client.nthreads()) == 2  # no worker was lost over it
 
 
 def job(given: str) -> str:
