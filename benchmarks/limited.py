@@ -35,6 +35,9 @@ class Limited:
         return self
 
     def __exit__(self, *_: object) -> None:
+        if self._worker is not None:  # it waits for a job: it can end by itself and clean up
+            self._worker.pipe.close()
+            self._worker.process.join(workers.GRACE)
         self._end()
 
     def run(self, function: Callable[..., Any], *given: Any) -> Any:

@@ -1,8 +1,10 @@
 """Jobs in a process of their own, within a time limit."""
 
+import atexit
 import os
 import signal
 import time
+from pathlib import Path
 
 import pytest
 
@@ -53,6 +55,16 @@ def test_what_a_job_raises_is_raised_and_its_process_stays(limited):
     with pytest.raises(InputError, match="a sentence"):
         limited.run(fail, "a sentence")
     assert limited.run(os.getpid) == first
+
+
+def clean_up(path: str) -> None:
+    atexit.register(Path(path).touch)
+
+
+def test_a_process_without_a_job_ends_by_itself_and_cleans_up(tmp_path):
+    with Limited(WHOLE) as process:
+        process.run(clean_up, str(tmp_path / "cleaned"))
+    assert (tmp_path / "cleaned").exists()
 
 
 def test_ctrl_c_ends_the_job_with_its_process(limited):
