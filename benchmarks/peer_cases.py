@@ -5,12 +5,10 @@ run each that is not counted. Seconds are those of whole sweeps over the views; 
 prepare once for a scene (bricks, pose matrices, permuted volumes) is prepared before.
 """
 
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +17,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks import peer_rtk, peer_xcist
+from benchmarks import apart, peer_catalogue, peer_paper, peer_rtk, peer_xcist
+from benchmarks.peer_catalogue import Case
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.plan import present_materials
@@ -34,8 +33,9 @@ from phantoms.recipes import build_recipe
 from phantoms.scanners import preset
 from reconstruct.fdk import fdk as ours_fdk
 
-OURS, RTK, XCIST = "ctsim", peer_rtk.NAME, peer_xcist.NAME
-PEERS = {RTK: peer_rtk, XCIST: peer_xcist}
+OURS = "ctsim"
+MEASURED = RTK, XCIST = "itk-rtk", "xcist"  # the catalogue's peers that there is code for
+FAILED = ("error", "timeout")
 SIZE = 60.0  # edge of the scenes' cube in mm
 FULL, SMALL = 256, 32  # side of grids and detectors
 KEV = np.array([50.0])
@@ -43,16 +43,20 @@ KEV = np.array([50.0])
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setup:
-    """How large the cases are: grid and detector side `n`, counted runs, threads, and which of PEERS are there."""
+    """How large the cases are: grid and detector side `n`, counted runs, threads; which peers are there."""
 
     n: int = 256
     repeats: int = 5
     threads: int = 2
-    present: frozenset[str] = frozenset(PEERS)
+    versions: Mapping[str, str] = field(default_factory=dict)
 
-    def views(self, full: int) -> int:
+    def views(self, case: Case) -> int:
         """Return the number of views, fewer on small grids."""
-        return full if self.n >= 256 else max(full // 15, 2)
+        return case.views if self.n >= FULL else max(case.views // 15, 2)
+
+    def measures(self, case: Case, peer: str) -> bool:
+        """Say whether a peer takes part: the catalogue says so, it is there, and there is code for it."""
+        return peer in case.peers and peer in self.versions and peer in MEASURED
 
     def scanner(self, views: int) -> Scanner:
         """Return the desktop scanner of the bundled suites on n³ voxels and n² pixels."""
@@ -94,13 +98,17 @@ def in_turns(
     return {name: (s[0], tuple(s[1:])) for name, s in seconds.items()}
 
 
-def absent(setup: Setup, case: str, scene: str, *peers: str) -> list[Measurement]:
-    """Return the rows that say which of a case's peers are not there, and how to install them."""
-    missing = [name for name in peers if name not in setup.present]
-    return [
-        Measurement(case=case, scene=scene, contender=name, status="absent", reason=PEERS[name].INSTALL)
-        for name in missing
-    ]
+def left_out(setup: Setup, case: Case, scene: str) -> list[Measurement]:
+    """Return the rows that say which of a case's peers are not measured: how to install them, or that no code can."""
+    out = []
+    for peer in peer_catalogue.load().peer:
+        if peer.name in case.peers and not setup.measures(case, peer.name):
+            status, reason = "absent", peer.absence
+            if version := setup.versions.get(peer.name):
+                status = "not measured"
+                reason = f"{peer.distribution} {version} is installed, not measured: this command has no code for it"
+            out.append(Measurement(case=case.name, scene=scene, contender=peer.name, status=status, reason=reason))
+    return out
 
 
 def relative(p: NDArray, exact: NDArray) -> float:
@@ -133,10 +141,13 @@ def path_scenes(n: int) -> dict[str, Phantom]:
 
 def paths(setup: Setup) -> list[Measurement]:
     """Case 1: path lengths in all materials at once against Joseph's projector on one material."""
-    geometry = setup.scanner(setup.views(90)).geometry
-    rtk = peer_rtk.Rtk(geometry, setup.threads) if RTK in setup.present else None
+    case = peer_catalogue.case("paths")
+    geometry = setup.scanner(setup.views(case)).geometry
+    rtk = peer_rtk.Rtk(geometry, setup.threads) if setup.measures(case, RTK) else None
+    phantoms = path_scenes(setup.n)
     out = []
-    for scene, phantom in path_scenes(setup.n).items():
+    for scene in case.scenes:
+        phantom = phantoms[scene]
         contenders: dict[str, Callable[[], object]] = {OURS: partial(_trace_all, Tracer.of(phantom), geometry)}
         if rtk is not None:
             commonest = 1 + int(np.argmax(np.bincount(phantom.labels.ravel())[1:]))
@@ -145,7 +156,7 @@ def paths(setup: Setup) -> list[Measurement]:
         for name, (first, seconds) in in_turns(contenders, setup.repeats).items():
             timed = {"seconds": seconds, "views": geometry.n_views, "warm_up": first}
             out.append(Measurement(case="paths", scene=scene, contender=name, note=notes[name], **timed))
-        out += absent(setup, "paths", scene, RTK)
+        out += left_out(setup, case, scene)
     return out
 
 
@@ -187,9 +198,10 @@ def voxelised(phantom: Phantom, geometry: Geometry, keep: tuple[Solid, ...]) -> 
 
 def exact(setup: Setup) -> list[Measurement]:
     """Case 2: relative RMS of line integrals at 50 keV of three rods in a water cylinder, central rays."""
-    geometry = setup.scanner(setup.views(30)).geometry
+    case = peer_catalogue.case("exact")
+    geometry = setup.scanner(setup.views(case)).geometry
     out = []
-    for metal in ("Al", "Fe"):
+    for metal in case.metals:
         phantom = build_recipe(Validation(n_voxel=(setup.n, setup.n, setup.n), size=SIZE, metal=metal), 1)
         mu = {m: float(attenuation(m, KEV)[0]) for m in ("water", metal)}
         water, *rods = phantom.solids
@@ -208,10 +220,10 @@ def exact(setup: Setup) -> list[Measurement]:
             name: _integrals(Tracer.of(p), geometry, weights) for name, p in variants.items()
         }
         volume = attenuation_volume(phantom, geometry, mu)
-        if RTK in setup.present:
+        if setup.measures(case, RTK):
             rtk = peer_rtk.Rtk(geometry, setup.threads)
             integrals[RTK] = rtk.project(rtk.volume(volume))
-        if XCIST in setup.present:
+        if setup.measures(case, XCIST):
             one = np.ones(1)
             integrals[XCIST] = peer_xcist.Xcist(geometry, [volume], one[:, None], KEV, one).project()
         shared = {"case": "exact", "scene": f"{metal} rods in water", "views": geometry.n_views}
@@ -221,7 +233,7 @@ def exact(setup: Setup) -> list[Measurement]:
             Measurement(contender=name, error=relative(p, truth), error_kind=kind, note=notes.get(name, ""), **shared)
             for name, p in integrals.items()
         ]
-        out += absent(setup, "exact", shared["scene"], RTK, XCIST)
+        out += left_out(setup, case, shared["scene"])
     return out
 
 
@@ -231,34 +243,31 @@ def _integrals(tracer: Tracer, geometry: Geometry, mu: NDArray[np.float64]) -> N
 
 # --- 3: a whole dataset ------------------------------------------------------------------------------
 
-_MAKE = """import sys
-from benchmarks import host, make_dataset
-code = make_dataset.main(sys.argv[1:])
-print(host.peak_memory())
-raise SystemExit(code)"""
-
 
 def paper(setup: Setup) -> list[Measurement]:
-    """Case 3: one scene of the `paper` suite by make-dataset in a process of its own, start included.
+    """Case 3: scenes of the `paper` suite by make-dataset in a process of its own, start included.
 
-    The process reads its own high-water mark, since the operating system's figure for children starts
-    at their parent's. A scene of the `quick` suite goes before, so that kernels are compiled and cached.
+    A scene of the `quick` suite goes before, so that kernels are compiled and cached.
     """
-    shared = {"case": "paper", "scene": "lung-Fe", "contender": OURS, "views": 720}
+    case = peer_catalogue.case("paper")
+    return [_made(scene, case.views) for scene in case.scenes]
+
+
+def _made(scene: str, views: int) -> Measurement:
+    shared = {"case": "paper", "scene": scene, "contender": OURS, "views": views}
     with tempfile.TemporaryDirectory(prefix="ctsim-peers-") as folder:
-        runs = []
+        runs, said = [], ""
         for suite in ("quick", "paper"):
-            command = [sys.executable, "-c", _MAKE, suite, str(Path(folder) / suite), "--only", "lung-Fe"]
             start = time.perf_counter()
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            done = apart.call(peer_paper.make, suite, str(Path(folder) / suite), scene)
             runs.append(time.perf_counter() - start)
             if done.returncode:
                 last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-                return [Measurement(status="error", reason=f"make-dataset {suite}: {last}", **shared)]
+                return Measurement(status="error", reason=f"make-dataset {suite}: {last}", **shared)
+            said = done.stdout
         size = sum(f.stat().st_size for f in (Path(folder) / "paper").rglob("*") if f.is_file())
-    peak = int(done.stdout.split()[-1])
     note = f"{size / 1e6:.0f} MB written, one run"
-    return [Measurement(seconds=(runs[1],), warm_up=runs[0], peak_bytes=peak, note=note, **shared)]
+    return Measurement(seconds=(runs[1],), warm_up=runs[0], peak_bytes=int(said.split()[-1]), note=note, **shared)
 
 
 # --- 4: FDK ------------------------------------------------------------------------------------------
@@ -266,9 +275,14 @@ def paper(setup: Setup) -> list[Measurement]:
 
 def fdk(setup: Setup) -> list[Measurement]:
     """Case 4: FDK of exact line integrals at 50 keV; RMSE against the truth where every view sees the voxel."""
-    geometry = setup.scanner(setup.views(180)).geometry
-    phantom = build_recipe(Validation(n_voxel=(setup.n, setup.n, setup.n), size=SIZE, metal="Al"), 1)
-    mu = {m: float(attenuation(m, KEV)[0]) for m in ("water", "Al")}
+    return [one for metal in peer_catalogue.case("fdk").metals for one in _fdk_of_rods(setup, metal)]
+
+
+def _fdk_of_rods(setup: Setup, metal: str) -> list[Measurement]:
+    case = peer_catalogue.case("fdk")
+    geometry = setup.scanner(setup.views(case)).geometry
+    phantom = build_recipe(Validation(n_voxel=(setup.n, setup.n, setup.n), size=SIZE, metal=metal), 1)
+    mu = {m: float(attenuation(m, KEV)[0]) for m in ("water", metal)}
     weights = np.array([mu.get(m, 0.0) for m in phantom.materials])
     p = _integrals(Tracer.of(phantom), geometry, weights).astype(np.float32)
     truth = attenuation_volume(phantom, geometry, mu)
@@ -281,7 +295,7 @@ def fdk(setup: Setup) -> list[Measurement]:
         last[OURS] = ours_fdk(torch.from_numpy(p), geometry).numpy()
 
     contenders: Mapping[str, Callable[[], object]] = {OURS: run_ours}
-    if RTK in setup.present:
+    if setup.measures(case, RTK):
         rtk = peer_rtk.Rtk(geometry, setup.threads)
         stack = rtk.stack(p)
 
@@ -289,9 +303,9 @@ def fdk(setup: Setup) -> list[Measurement]:
             last[RTK] = rtk.fdk(stack)
 
         contenders[RTK] = run_rtk
-    shared = {"case": "fdk", "scene": "Al rods in water", "views": geometry.n_views, "error_kind": "RMSE (1/mm)"}
+    shared = {"case": "fdk", "scene": f"{metal} rods in water", "views": geometry.n_views, "error_kind": "RMSE (1/mm)"}
     out = []
     for name, (first, seconds) in in_turns(contenders, setup.repeats).items():
         error = float(np.sqrt(np.mean((last[name][seen] - truth[seen]) ** 2, dtype=np.float64)))
         out.append(Measurement(contender=name, seconds=seconds, warm_up=first, error=error, **shared))
-    return out + absent(setup, "fdk", shared["scene"], RTK)
+    return out + left_out(setup, case, shared["scene"])

@@ -1,6 +1,5 @@
 """Case 5 of `run-benchmark peers`: polychromatic projections, against what a pixel of finite size measures."""
 
-import subprocess
 import sys
 from collections.abc import Callable
 
@@ -8,17 +7,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import host, peer_rtk, peer_xcist
+from benchmarks import apart, host, peer_catalogue, peer_rtk, peer_xcist
 from benchmarks.peer_cases import (
     OURS,
-    PEERS,
     RTK,
     SIZE,
     XCIST,
     Measurement,
     Setup,
-    absent,
     in_turns,
+    left_out,
     relative,
     voxelised,
 )
@@ -51,6 +49,9 @@ def poly_scene(n: int) -> Phantom:
     )
 
 
+SCENES = {"water, bone, Fe": poly_scene}
+
+
 def eighty_bins(rule: EnergyRule) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Gather a fine spectrum in at most 80 equal bins: mean energy (keV) and signal share of each."""
     bins = np.linspace(rule.energies[0], rule.energies[-1], BINS + 1)
@@ -81,9 +82,9 @@ def measured_pixel(phantom: Phantom, scanner: Scanner, views: tuple[int, ...]) -
 class Contenders:
     """The polychromatic contenders of one scene, each prepared as a function that measures all views: [view, v, u]."""
 
-    def __init__(self, setup: Setup) -> None:
-        self.setup, self.scanner = setup, setup.scanner(setup.views(30))
-        self.geometry, self.phantom = self.scanner.geometry, poly_scene(setup.n)
+    def __init__(self, setup: Setup, scene: str) -> None:
+        self.setup, self.scanner = setup, setup.scanner(setup.views(peer_catalogue.case("poly")))
+        self.geometry, self.phantom = self.scanner.geometry, SCENES[scene](setup.n)
 
     def ours(self, *, voxels: bool) -> Callable[[], NDArray[np.float32]]:
         """Prepare our measurement, the body in voxels or analytic as the metal always is."""
@@ -133,11 +134,9 @@ class Contenders:
         return energies, weights, np.stack([attenuation(m, energies) for m in self.phantom.materials[1:]], 1)
 
 
-POLY = (f"{OURS}, exact metal in voxels", f"{OURS}, exact solids", *PEERS)
-
 NOTES = {
-    POLY[0]: "water and bone from voxels, metal exact, sub-rays",
-    POLY[1]: "all solids exact, sub-rays",
+    f"{OURS}, exact metal in voxels": "water and bone from voxels, metal exact, sub-rays",
+    f"{OURS}, exact solids": "all solids exact, sub-rays",
     RTK: f"Joseph per material, {BINS} bins in NumPy",
     XCIST: f"distance-driven per material in one thread, {BINS} bins, no oversampling, our attenuation",
 }
@@ -145,10 +144,15 @@ NOTES = {
 
 def poly(setup: Setup) -> list[Measurement]:
     """Case 5: time, relative RMS of P against the measured pixel, and peak memory of each contender alone."""
-    contenders = Contenders(setup)
+    return [one for scene in peer_catalogue.case("poly").scenes for one in _poly(setup, scene)]
+
+
+def _poly(setup: Setup, scene: str) -> list[Measurement]:
+    case, contenders = peer_catalogue.case("poly"), Contenders(setup, scene)
     n_views = contenders.geometry.n_views
     checked = tuple(round((k + 0.5) * n_views / CHECKED) % n_views for k in range(CHECKED))
-    runs = {name: contenders.prepare(name) for name in POLY if name not in PEERS or name in setup.present}
+    names = [name for name in NOTES if name.startswith(OURS) or setup.measures(case, name)]
+    runs = {name: contenders.prepare(name) for name in names}
     timed = in_turns(runs, setup.repeats)
     oracle = measured_pixel(contenders.phantom, contenders.scanner, checked)
     out = []
@@ -157,37 +161,34 @@ def poly(setup: Setup) -> list[Measurement]:
         out.append(
             Measurement(
                 case="poly",
-                scene="water, bone, Fe",
+                scene=scene,
                 contender=name,
                 seconds=seconds,
                 views=n_views,
                 warm_up=first,
                 error=relative(run()[list(checked)], oracle),
                 error_kind="relative RMS of P",
-                peak_bytes=_alone(setup, name),
+                peak_bytes=_alone(setup, scene, name),
                 note=NOTES[name],
             )
         )
-    return out + absent(setup, "poly", "water, bone, Fe", *PEERS)
+    return out + left_out(setup, case, scene)
 
 
-def peak(n: int, threads: int, contender: str) -> int:
-    """Prepare a contender, then return the peak resident memory (bytes) of this process while it runs twice.
+def _tell_peak(setup: Setup, scene: str, contender: str) -> None:
+    """Be a process: prepare a contender, then say the peak resident memory (bytes) while it runs twice.
 
     It holds the interpreter and the libraries that are loaded, and the contender's volumes.
     """
-    import numba
-
-    numba.set_num_threads(min(threads, numba.get_num_threads()))
-    run = Contenders(Setup(n=n, threads=threads)).prepare(contender)
+    host.use_threads(setup.threads)
+    run = Contenders(setup, scene).prepare(contender)
     with host.measured() as usage:
         run()
         run()
-    return usage.peak_bytes
+    sys.stdout.write(f"\n{usage.peak_bytes}\n")
 
 
-def _alone(setup: Setup, contender: str) -> int | None:
-    """Measure `peak` in a process of its own; None where that failed."""
-    code = f"from benchmarks import peer_poly; print(peer_poly.peak({setup.n}, {setup.threads}, {contender!r}))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+def _alone(setup: Setup, scene: str, contender: str) -> int | None:
+    """Measure the peak memory in a process of its own; None where that failed."""
+    done = apart.call(_tell_peak, setup, scene, contender)
     return int(done.stdout.split()[-1]) if done.returncode == 0 else None

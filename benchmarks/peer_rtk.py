@@ -6,7 +6,7 @@ runs. Rit et al., J. Phys. Conf. Ser. 489, 2014, doi:10.1088/1742-6596/489/1/012
 """
 
 import warnings
-from importlib import import_module, metadata, util
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -15,19 +15,6 @@ from numpy.typing import NDArray
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.interop import Library, angles_to, volume_from, volume_to
-
-NAME = "itk-rtk"
-INSTALL = "itk-rtk is not installed (pip install 'ctsim[peers]')"
-
-
-def version() -> str | None:
-    """Return the version of itk-rtk, None where it is not installed."""
-    if util.find_spec("itk") is None:
-        return None
-    try:
-        return metadata.version("itk-rtk")
-    except metadata.PackageNotFoundError:
-        return None
 
 
 class Rtk:

@@ -4,30 +4,43 @@ from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import msgspec
 
 from benchmarks import lines
 from benchmarks.host import Host, certain
-from benchmarks.peer_cases import FULL, OURS, PEERS, Measurement
+from benchmarks.peer_cases import FAILED, FULL, MEASURED, OURS, RTK, XCIST, Measurement
 
 MEGA = 1e6
+ABSENT = "not installed"
+WHAT = "a record of run-benchmark peers"
+By = tuple[Host, str, dict[str, str]]
+"""Who measures: the machine, the commit, and the versions of the peers that are there."""
 
 
 class PeerRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One measurement with its provenance; `side` is that of the grids, `rtk` and `xcist` the peers' versions.
 
-    `run` is when the command was started: it tells the runs in one file apart.
+    `others` are the versions of peers that are installed and not measured; `run` is when the command was started: it
+    tells the runs in one file apart.
     """
 
     measurement: Measurement
     side: int
     rtk: str
     xcist: str = "not measured"
+    others: dict[str, str] = {}
     host: Host
     commit: str
     time: str
     run: str = ""
+
+    @property
+    def by(self) -> By:
+        """Who measured it."""
+        there = {RTK: self.rtk, XCIST: self.xcist, **self.others}
+        return self.host, self.commit, {name: version for name, version in there.items() if version != ABSENT}
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
@@ -48,13 +61,22 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
 
 def read(path: Path) -> list[PeerRecord]:
     """Read the records of a peers file (see `lines.read`)."""
-    return lines.read(path, PeerRecord, "a record of run-benchmark peers")
+    return lines.read(path, PeerRecord, WHAT)
 
 
-def known(stored: Sequence[PeerRecord], repeats: int, by: tuple[Host, str, str, str]) -> set[str]:
-    """Return the cases, of the records of `latest`, with so many runs, `by` = (host, commit, rtk, xcist).
+def recorded(measurements: Sequence[Measurement], by: By, **more: Any) -> list[PeerRecord]:
+    """Return the records of what was measured by `by`; `more` are the fields that neither says."""
+    here, commit, versions = by
+    others = {name: version for name, version in versions.items() if name not in MEASURED}
+    rtk, xcist = (versions.get(name, ABSENT) for name in (RTK, XCIST))
+    shared = {"rtk": rtk, "xcist": xcist, "others": others, "host": here, "commit": commit, **more}
+    return [PeerRecord(measurement=one, **shared) for one in measurements]
 
-    A case with an error is not known, and code that differs from its commit, or has none, knows nothing.
+
+def known(stored: Sequence[PeerRecord], repeats: int, by: By) -> set[str]:
+    """Return the cases, of the records of `latest`, with so many runs, measured by `by`.
+
+    A case that failed is not known, and code that differs from its commit, or has none, knows nothing.
     """
     if not certain(by[1]):
         return set()
@@ -62,11 +84,11 @@ def known(stored: Sequence[PeerRecord], repeats: int, by: tuple[Host, str, str, 
     return cases - {record.measurement.case for record in stored if not _counts(record, repeats, by)}
 
 
-def _counts(record: PeerRecord, repeats: int, by: tuple[Host, str, str, str]) -> bool:
+def _counts(record: PeerRecord, repeats: int, by: By) -> bool:
     """Say whether a record is what another run `by` the same would measure; the case paper has one run always."""
     m = record.measurement
     enough = m.case == "paper" or not m.seconds or len(m.seconds) >= repeats
-    return enough and m.status != "error" and (record.host, record.commit, record.rtk, record.xcist) == by
+    return enough and m.status not in FAILED and record.by == by
 
 
 def seconds(records: Sequence[PeerRecord], repeats: int) -> dict[str, float]:
@@ -83,7 +105,7 @@ def seconds(records: Sequence[PeerRecord], repeats: int) -> dict[str, float]:
             began = rows[-1].time
             timed = [r.measurement.seconds for r in rows if r.measurement.seconds and case != "paper"]
             more = sum(median(s) * (repeats - len(s)) for s in timed)
-            if all(record.measurement.status != "error" for record in rows):
+            if all(record.measurement.status not in FAILED for record in rows):
                 found[case] = max(took + more, 0.0)
     return found
 
@@ -115,10 +137,14 @@ def verdicts(measurements: Sequence[Measurement]) -> list[Verdict]:
     """
     out: list[Verdict] = []
     for m in measurements:
-        peers = [p for p in measurements if (p.case, p.scene) == (m.case, m.scene) and p.contender in PEERS]
-        if m.status == "ok" and m.contender not in PEERS:
-            out += _targets(m, [p for p in peers if p.status == "ok"])
+        beside = [p for p in measurements if (p.case, p.scene, p.status) == (m.case, m.scene, "ok")]
+        if m.status == "ok" and _is_ours(m):
+            out += _targets(m, [p for p in beside if not _is_ours(p)])
     return out
+
+
+def _is_ours(m: Measurement) -> bool:
+    return m.contender.partition(",")[0] == OURS
 
 
 def _targets(m: Measurement, peers: Sequence[Measurement]) -> list[Verdict]:
@@ -167,7 +193,7 @@ def _scaled(value: float | None, unit: float) -> float | None:
 def render(records: Sequence[PeerRecord]) -> str:
     """Render measurements and targets as Markdown."""
     measurements = [r.measurement for r in records]
-    out = [_provenance(records[-1]), "", "| case | scene | contender | s | ms/view | error | peak (MB) | note |"]
+    out = [*_provenances(records), "", "| case | scene | contender | s | ms/view | error | peak (MB) | note |"]
     out.append("|---|---|---|--:|--:|--:|--:|---|")
     out += ["| " + " | ".join(_cells(m)) + " |" for m in measurements]
     found = verdicts(measurements)
@@ -207,11 +233,26 @@ def _cells(m: Measurement) -> tuple[str, ...]:
     )
 
 
+def _provenances(records: Sequence[PeerRecord]) -> list[str]:
+    """Return who measured, on one line where that is one, else a line for each with its cases; and how."""
+    groups: dict[bytes, list[PeerRecord]] = {}
+    for record in records:
+        groups.setdefault(msgspec.json.encode(record.by), []).append(record)
+    how = (
+        f"grids of side {records[-1].side}. Medians of interleaved runs; ratios of time are medians over pairs, each "
+        "to the peer that is best in that quantity."
+    )
+    if len(groups) == 1:
+        return [f"{_provenance(records[-1])}; {how}"]
+    cases = [", ".join(dict.fromkeys(record.measurement.case for record in group)) for group in groups.values()]
+    parts = [f"- {names}: {_provenance(group[-1])}" for names, group in zip(cases, groups.values(), strict=True)]
+    return [f"Cases of several runs, on {how}", "", *parts]
+
+
 def _provenance(record: PeerRecord) -> str:
     h = record.host
     return (
         f"{record.time}, commit {record.commit[:12]}{'+changes' if record.commit.endswith('+changes') else ''}, "
         f"{h.cpu}, {h.cores} cores, {h.threads} threads, Python {h.python}, numba {h.versions.get('numba', '?')}, "
-        f"itk-rtk {record.rtk}, gecatsim {record.xcist}; grids of side {record.side}. Medians of interleaved runs; "
-        "ratios of time are medians over pairs, each to the peer that is best in that quantity."
+        f"itk-rtk {record.rtk}, gecatsim {record.xcist}"
     )

@@ -14,7 +14,7 @@ import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from importlib import import_module, metadata
+from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -24,18 +24,8 @@ from numpy.typing import NDArray
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 
-NAME = "xcist"
-INSTALL = "gecatsim is not installed (pip install 'ctsim[peers]')"
 _MODELS = ("detector", "source", "gantry", "ray_angles", "filters", "flux", "phantom")
 _NEVER = -1  # a view number that no view has: XCIST prepares at its first view and frees its memory at its last
-
-
-def version() -> str | None:
-    """Return the version of gecatsim, None where it is not installed."""
-    try:
-        return metadata.version("gecatsim")
-    except metadata.PackageNotFoundError:
-        return None
 
 
 class Xcist:

@@ -1,44 +1,42 @@
-"""`run-benchmark peers RESULTS`: speed and error side by side with RTK and XCIST, in one process, in turns.
+"""`run-benchmark peers RESULTS`: speed and error side by side with other libraries, in one process, in turns.
 
-Records go to RESULTS/peers.jsonl, one line per contender and scene; the table, RESULTS/peers.md, shows the
-last of each, so that cases can be measured one by one. What this commit recorded on this machine, beside the same
-versions of the peers, is not measured again.
+Cases and libraries are listed in `suites/peers.toml`. Records go to RESULTS/peers.jsonl, one line per contender and
+scene; the table, RESULTS/peers.md, shows the last of each, so that cases can be measured one by one. What this commit
+recorded on this machine, beside the same versions of the peers, is not measured again.
 """
 
 import dataclasses
 import sys
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from benchmarks import peer_catalogue
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:
-    from benchmarks.host import Host
+    from benchmarks.peer_cases import Measurement, Setup
+    from benchmarks.peer_tables import By
 
-Case = Literal["paths", "exact", "paper", "fdk", "poly"]
-CASES: tuple[Case, ...] = ("paths", "exact", "paper", "fdk", "poly")
-NAME, ABSENT = "peers.jsonl", "not installed"
-# seconds of each case on full grids beside both peers: those of a turn, and the rest, from the run in docs/speed.md
-SECONDS: dict[Case, tuple[float, float]] = {
-    "paths": (21.0, 22.0), "exact": (0.0, 53.0), "paper": (0.0, 54.0), "fdk": (16.3, 9.0), "poly": (17.6, 138.0),
-}  # fmt: skip
+NAME = "peers.jsonl"
 
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
     """Measure speed and error against itk-rtk and XCIST (pip install 'ctsim[peers]'), in one process, in turns.
 
-    Peers that are not installed are left out. The machine should have nothing else to do.
+    Peers that are not installed, or that there is no code for, have a row that says so. The machine should have
+    nothing else to do.
     """
 
     results: tyro.conf.Positional[Path]
     """The folder for peers.jsonl and peers.md; made if it is not there."""
     repeats: int = 5
     """Counted runs of each contender; the table shows medians."""
-    case: Annotated[tyro.conf.UseAppendAction[tuple[Case, ...]], tyro.conf.arg(metavar="CASE")] = ()
+    case: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="CASE")] = ()
     """Only this case (paths, exact, paper, fdk, poly); may be given several times (default: all)."""
     threads: int = 2
     """Threads of every contender; XCIST's voxelised projector has one."""
@@ -57,7 +55,7 @@ def main(argv: list[str]) -> int:
     given = tyro.cli(Arguments, prog="run-benchmark peers", args=argv)
     if given.repeats < 1 or given.threads < 1:
         raise InputError(f"--repeats and --threads must be at least 1, got {given.repeats} and {given.threads}")
-    wanted = tuple(dict.fromkeys(given.case)) or tuple(c for c in CASES if not (given.small and c == "paper"))
+    wanted = _wanted(given)
     if given.dry_run:
         sys.stdout.write(_planned(given, wanted))
         return 0
@@ -67,9 +65,15 @@ def main(argv: list[str]) -> int:
     return _report(given, wanted)
 
 
-def _report(given: Arguments, wanted: tuple[Case, ...]) -> int:
-    """Write and print the table of all records; return 1 if a wanted case has an error."""
-    from benchmarks import peer_tables
+def _wanted(given: Arguments) -> list[str]:
+    """Return the names of the cases asked for, all that have such grids where none is named."""
+    cases = [peer_catalogue.case(name) for name in dict.fromkeys(given.case)]
+    return [case.name for case in cases or peer_catalogue.load().case if case.small or case in cases or not given.small]
+
+
+def _report(given: Arguments, wanted: Sequence[str]) -> int:
+    """Write and print the table of all records; return 1 if a wanted case has failed."""
+    from benchmarks import peer_cases, peer_tables
 
     path, side = given.results / NAME, _side(given)
     stored = peer_tables.latest(peer_tables.read(path), side)
@@ -78,7 +82,7 @@ def _report(given: Arguments, wanted: tuple[Case, ...]) -> int:
     text = peer_tables.render(stored)
     (given.results / "peers.md").write_text(text, encoding="utf-8")
     sys.stdout.write(text + f"\nWritten: {given.results}/peers.md; records in {NAME}\n")
-    return 1 if any(r.measurement.status == "error" for r in stored if r.measurement.case in wanted) else 0
+    return 1 if any(r.measurement.status in peer_cases.FAILED for r in stored if r.measurement.case in wanted) else 0
 
 
 def _side(given: Arguments) -> int:
@@ -87,63 +91,66 @@ def _side(given: Arguments) -> int:
     return peer_cases.SMALL if given.small else peer_cases.FULL
 
 
-def _left(given: Arguments, wanted: tuple[Case, ...]) -> "tuple[list[Case], tuple[Host, str, str, str]]":
-    """Return the wanted cases that are not recorded, and who measures: (host, commit, RTK's and XCIST's version)."""
+def _left(given: Arguments, wanted: Sequence[str]) -> "tuple[list[str], By]":
+    """Return the wanted cases that are not recorded, and who measures."""
     from benchmarks import host
 
     host.use_threads(given.threads)
-    from benchmarks import peer_cases, peer_tables
+    from benchmarks import peer_tables
 
-    rtk, xcist = (peer_cases.PEERS[name].version() or ABSENT for name in (peer_cases.RTK, peer_cases.XCIST))
-    by = host.host(), host.commit(), rtk, xcist  # of the code that is loaded, whatever is committed meanwhile
+    # of the code that is loaded, whatever is committed meanwhile
+    by = host.host(), host.commit(), peer_catalogue.installed()
     stored = peer_tables.latest(peer_tables.read(given.results / NAME), _side(given))
     known = set() if given.force else peer_tables.known(stored, given.repeats, by)
     return [case for case in wanted if case not in known], by
 
 
-def _planned(given: Arguments, wanted: tuple[Case, ...]) -> str:
+def _planned(given: Arguments, wanted: Sequence[str]) -> str:
     """Return what --dry-run prints; seconds are from records of these grids, else from one run on full ones."""
     left, _ = _left(given, wanted)
     from benchmarks import costs, peer_tables
 
+    cases = {case.name: case for case in peer_catalogue.load().case}
     once: dict[str, float] = {}
     if not given.small:
-        once = {case: turn * (given.repeats + 1) + rest for case, (turn, rest) in SECONDS.items()}
+        once = {name: case.turn * (given.repeats + 1) + case.rest for name, case in cases.items()}
     records = [r for r in peer_tables.read(given.results / NAME) if r.side == _side(given)]
     once |= peer_tables.seconds(records, given.repeats)
     turns = f"{given.repeats + 1} runs of each contender"
-    rows = [(case, turns if SECONDS[case][0] else "one run", once.get(case)) for case in left]
+    rows = [(name, turns if cases[name].turn else "one run", once.get(name)) for name in left]
     return costs.listing(rows, len(wanted), "cases", "with what is prepared and checked, beside both peers")
 
 
-def _measure(given: Arguments, wanted: tuple[Case, ...]) -> None:
+def _measure(given: Arguments, wanted: Sequence[str]) -> None:
     """Measure the wanted cases that are not recorded; a case is stored as soon as it is measured."""
-    left, (here, now, rtk, xcist) = _left(given, wanted)
-    from benchmarks import lines, peer_cases, peer_poly, peer_tables
+    left, by = _left(given, wanted)
+    from benchmarks import lines, peer_cases, peer_tables
 
-    present = frozenset(
-        name for name, version in ((peer_cases.RTK, rtk), (peer_cases.XCIST, xcist)) if version != ABSENT
-    )
-    setup = peer_cases.Setup(n=_side(given), repeats=given.repeats, threads=here.threads, present=present)
-    cases = {
-        "paths": peer_cases.paths,
-        "exact": peer_cases.exact,
-        "paper": peer_cases.paper,
-        "fdk": peer_cases.fdk,
-        "poly": peer_poly.poly,
-    }
+    setup = peer_cases.Setup(n=_side(given), repeats=given.repeats, threads=by[0].threads, versions=by[2])
     began = datetime.now(UTC).isoformat(timespec="microseconds")
     for case in wanted:
         if case not in left:
             sys.stderr.write(f"{case}: recorded already\n")
             continue
         sys.stderr.write(f"{case} …\n")
-        measured = cases[case](setup)
+        measured = measure(case, setup)
         time = datetime.now(UTC).isoformat(timespec="seconds")
-        records = [
-            peer_tables.PeerRecord(
-                measurement=one, side=setup.n, rtk=rtk, xcist=xcist, host=here, commit=now, time=time, run=began
-            )
-            for one in measured
-        ]
+        records = peer_tables.recorded(measured, by, side=setup.n, time=time, run=began)
         lines.append(given.results / NAME, *records)
+
+
+def measure(case: str, setup: "Setup") -> "list[Measurement]":
+    """Measure a case in this process."""
+    from benchmarks import host
+
+    host.use_threads(setup.threads)
+    from benchmarks import peer_cases, peer_poly
+
+    cases: dict[str, Callable[[Setup], list[Measurement]]] = {
+        "paths": peer_cases.paths,
+        "exact": peer_cases.exact,
+        "paper": peer_cases.paper,
+        "fdk": peer_cases.fdk,
+        "poly": peer_poly.poly,
+    }
+    return cases[case](setup)

@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks import cli, host, lines, peer_cases, peer_poly, peer_rtk, peer_tables, peer_xcist, peers
-from benchmarks.peer_cases import OURS, PEERS, RTK, XCIST, Measurement
+from benchmarks import cli, host, lines, peer_cases, peer_catalogue, peer_poly, peer_rtk, peer_tables, peer_xcist, peers
+from benchmarks.peer_cases import OURS, RTK, XCIST, Measurement
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.project import Tracer, path_lengths
@@ -30,8 +30,10 @@ GEOMETRY = Geometry(
     off_origin=(1.0, 2.0, -1.5),
     off_detector=(1.1, -2.3),
 )
-NEEDS_RTK = pytest.mark.skipif(peer_rtk.version() is None, reason="itk-rtk is not installed")
-NEEDS_XCIST = pytest.mark.skipif(peer_xcist.version() is None, reason="gecatsim is not installed")
+INSTALLED = peer_catalogue.installed()
+NEEDS_RTK = pytest.mark.skipif(RTK not in INSTALLED, reason="itk-rtk is not installed")
+NEEDS_XCIST = pytest.mark.skipif(XCIST not in INSTALLED, reason="gecatsim is not installed")
+POLY_SCENE = "water, bone, Fe"
 # what XCIST can have: voxels square in x and y, a detector shifted along v only
 XCIST_GEOMETRY = msgspec.structs.replace(GEOMETRY, d_voxel=(1.5, 1.2, 1.2), off_detector=(1.1, 0.0))
 
@@ -143,7 +145,7 @@ def test_xcist_holds_one_phantom_and_says_so():
 @NEEDS_XCIST
 @NEEDS_RTK
 def test_both_peers_measure_the_same_quantity_in_poly():
-    contenders = peer_poly.Contenders(peer_cases.Setup(n=64))
+    contenders = peer_poly.Contenders(peer_cases.Setup(n=64), POLY_SCENE)
     theirs, rtk = contenders.prepare(XCIST)(), contenders.prepare(RTK)()
     # Joseph and distance-driven differ at edges, 0.7 % on this grid and less on finer ones; a pixel astray gives 9 %
     assert peer_cases.relative(theirs, rtk) < 0.02
@@ -199,7 +201,7 @@ def test_eighty_bins_keep_weight_and_mean_energy():
 
 def test_the_measured_pixel_averages_intensity_not_line_integrals():
     setup = peer_cases.Setup(n=16)
-    contenders = peer_poly.Contenders(setup)
+    contenders = peer_poly.Contenders(setup, POLY_SCENE)
     oracle = peer_poly.measured_pixel(contenders.phantom, contenders.scanner, (0,))
     assert oracle.shape == (1, 16, 16)
     ours = contenders.ours(voxels=False)()[:1]
@@ -235,7 +237,7 @@ def test_each_quantity_is_held_against_the_peer_that_is_best_in_it():
 
 
 def test_without_peers_only_our_own_limits_are_judged():
-    missing = peer_cases.absent(peer_cases.Setup(present=frozenset()), "poly", "s", *PEERS)
+    missing = peer_cases.left_out(peer_cases.Setup(), peer_catalogue.case("poly"), "s")
     assert [(m.contender, m.status) for m in missing] == [(RTK, "absent"), (XCIST, "absent")]
     assert all("pip install" in m.reason for m in missing)
     found = peer_tables.verdicts([measurement(f"{OURS}, exact solids", (1.0,), 1e-3, "poly", 4 * 10**8), *missing])
@@ -246,7 +248,7 @@ def test_records_of_before_xcist_can_be_read(tmp_path):
     old = peer_tables.PeerRecord(
         measurement=measurement(OURS), side=256, rtk="2.7", host=host.host(), commit="", time=""
     )
-    fields = {k: v for k, v in msgspec.to_builtins(old).items() if k != "xcist"}
+    fields = {k: v for k, v in msgspec.to_builtins(old).items() if k not in ("xcist", "others")}
     (tmp_path / peers.NAME).write_bytes(msgspec.json.encode(fields) + b"\n")
     assert peer_tables.read(tmp_path / peers.NAME) == [old]
 
@@ -254,7 +256,7 @@ def test_records_of_before_xcist_can_be_read(tmp_path):
 @NEEDS_XCIST
 def test_the_command_measures_xcist(tmp_path, capsys):
     assert peers.main([str(tmp_path), "--small", "--repeats", "1", "--case", "exact"]) == 0
-    assert f"gecatsim {peer_xcist.version()}" in capsys.readouterr().out
+    assert f"gecatsim {INSTALLED[XCIST]}" in capsys.readouterr().out
     errors = {(m.scene, m.contender): m.error for m in (r.measurement for r in peer_tables.read(tmp_path / peers.NAME))}
     for scene in {scene for scene, _ in errors}:
         # it sees voxels of 2 mm, like ours without solids, but with partial volumes
@@ -262,14 +264,16 @@ def test_the_command_measures_xcist(tmp_path, capsys):
 
 
 def test_the_command_without_peers_says_so_and_stores_records(tmp_path, monkeypatch, capsys):
-    for module in PEERS.values():
-        monkeypatch.setattr(module, "version", lambda: None)
+    monkeypatch.setattr(peer_catalogue, "installed", dict)
     assert peers.main([str(tmp_path / "new"), "--small", "--repeats", "2", "--case", "exact", "--case", "fdk"]) == 0
     table = capsys.readouterr().out
     assert "absent" in table and "itk-rtk is not installed" in table and "gecatsim is not installed" in table
     records = peer_tables.read(tmp_path / "new" / peers.NAME)
     assert {r.measurement.case for r in records} == {"exact", "fdk"}
-    assert {r.measurement.status for r in records if r.measurement.contender in PEERS} == {"absent"}
+    beside = [r.measurement for r in records if not r.measurement.contender.startswith(OURS)]
+    assert {m.status for m in beside} == {"absent"}
+    assert [m.contender for m in beside if m.case == "fdk"] == [RTK, "leap", "tigre", "r2-gaussian"]
+    assert "pytigre is not installed" in table and "https://github.com/LLNL/LEAP" in table
     timed = next(r.measurement for r in records if r.measurement.seconds)
     assert len(timed.seconds) == 2 and timed.warm_up is not None
     # closed form against float32 path lengths: a few roundings of 6e-8
@@ -288,8 +292,7 @@ def no_peers(monkeypatch, *, case="fdk", fails=False):
         status = {"status": "error", "reason": "it failed"} if fails else {"seconds": (2.0,) * setup.repeats}
         return [peer_cases.Measurement(case=case, scene="s", contender=OURS, **status)]
 
-    for module in PEERS.values():
-        monkeypatch.setattr(module, "version", lambda: None)
+    monkeypatch.setattr(peer_catalogue, "installed", dict)
     monkeypatch.setattr(host, "use_threads", lambda threads: None)  # those of this process are not ours to set
     monkeypatch.setattr(host, "commit", lambda: "a" * 40)
     monkeypatch.setattr(peer_cases, case, once)
@@ -315,11 +318,11 @@ def test_an_interrupted_command_goes_on_from_the_case_it_was_in(tmp_path, monkey
         before = len(done)
         peers.main([*words, *change])
         assert len(done) == before + 1, change
-    for name, value in (("version", "2.7"), ("version", None)):  # beside another peer nothing is known
+    for there in ({RTK: "2.7"}, {RTK: "2.8"}, {"leap": "1.26"}, {}):  # beside other peers nothing is known
         before = len(done)
-        monkeypatch.setattr(PEERS[RTK], name, lambda value=value: value)
+        monkeypatch.setattr(peer_catalogue, "installed", lambda there=there: there)
         peers.main(words)
-        assert len(done) == before + 1, value
+        assert len(done) == before + 1, there
     monkeypatch.setattr(host, "commit", lambda: "a" * 40 + "+changes")
     before = len(done)
     assert [peers.main(words), peers.main(words)] == [0, 0] and len(done) == before + 2
@@ -356,8 +359,8 @@ def test_a_dry_run_lists_what_is_left_and_what_it_takes(tmp_path, monkeypatch, c
     done = no_peers(monkeypatch)
     out = tmp_path / "out"
     listed = dry(str(out), "--repeats", "2")
-    assert tuple(peers.SECONDS) == peers.CASES and not out.exists()
-    assert [line.split()[0] for line in listed[:-1]] == list(peers.CASES)
+    assert not out.exists()
+    assert [line.split()[0] for line in listed[:-1]] == ["paths", "exact", "paper", "fdk", "poly"]
     assert listed[3].split() == ["fdk", "3", "runs", "of", "each", "contender", "58", "s"]  # 3 × 16.3 s + 9 s
     assert listed[-1].startswith("total: 5 of 5 cases, ")
     assert dry(str(out), "--small", "--case", "fdk")[0].endswith("unknown") and not done
@@ -365,7 +368,7 @@ def test_a_dry_run_lists_what_is_left_and_what_it_takes(tmp_path, monkeypatch, c
     def record(case, seconds, minute, side=256):
         return peer_tables.PeerRecord(
             measurement=peer_cases.Measurement(case=case, scene="s", contender=OURS, seconds=seconds), side=side,
-            rtk=peers.ABSENT, xcist=peers.ABSENT, host=host.host(), commit="a" * 40,
+            rtk=peer_tables.ABSENT, xcist=peer_tables.ABSENT, host=host.host(), commit="a" * 40,
             time=f"2026-01-01T00:0{minute}:00+00:00", run="2026-01-01T00:00:00+00:00",
         )  # fmt: skip
 
