@@ -5,9 +5,12 @@ scene; the table, RESULTS/peers.md, shows the last of each, so that cases can be
 recorded on this machine, beside the same versions of the peers, is not measured again.
 """
 
+import contextlib
 import dataclasses
+import math
 import sys
-from collections.abc import Callable, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -42,12 +45,16 @@ class Arguments:
     """Threads of every contender; XCIST's voxelised projector has one."""
     small: tyro.conf.FlagCreatePairsOff[bool] = False
     """Tiny grids that prove the command and say nothing about speed; leaves out the case paper."""
+    seconds: float | None = None
+    """Time limit of one case; what does not end in time is a row that says so, and the next case begins."""
     force: tyro.conf.FlagCreatePairsOff[bool] = False
     """Measure again what is recorded of this commit on this machine, beside these versions of the peers."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print what is left to measure and about how long it takes; measure nothing."""
     table: tyro.conf.FlagCreatePairsOff[bool] = False
     """Only render the table from the records, computing nothing."""
+    collect: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="OTHER [OTHER ...]")] = ()
+    """Take over what these results folders of other machines have and RESULTS lacks, then only render the table."""
 
 
 def main(argv: list[str]) -> int:
@@ -55,11 +62,15 @@ def main(argv: list[str]) -> int:
     given = tyro.cli(Arguments, prog="run-benchmark peers", args=argv)
     if given.repeats < 1 or given.threads < 1:
         raise InputError(f"--repeats and --threads must be at least 1, got {given.repeats} and {given.threads}")
+    if given.seconds is not None and not (math.isfinite(given.seconds) and given.seconds > 0):
+        raise InputError(f"--seconds must be positive, got {given.seconds}")
     wanted = _wanted(given)
     if given.dry_run:
         sys.stdout.write(_planned(given, wanted))
         return 0
-    if not given.table:
+    if given.collect:
+        _collect(given)
+    elif not given.table:
         given.results.mkdir(parents=True, exist_ok=True)
         _measure(given, wanted)
     return _report(given, wanted)
@@ -69,6 +80,14 @@ def _wanted(given: Arguments) -> list[str]:
     """Return the names of the cases asked for, all that have such grids where none is named."""
     cases = [peer_catalogue.case(name) for name in dict.fromkeys(given.case)]
     return [case.name for case in cases or peer_catalogue.load().case if case.small or case in cases or not given.small]
+
+
+def _collect(given: Arguments) -> None:
+    from benchmarks import lines, peer_tables
+
+    path, kind = given.results / NAME, peer_tables.PeerRecord
+    for other, count in lines.collect(path, given.collect, kind, peer_tables.WHAT).items():
+        sys.stderr.write(f"{other}: {count} records taken over\n")
 
 
 def _report(given: Arguments, wanted: Sequence[str]) -> int:
@@ -128,15 +147,39 @@ def _measure(given: Arguments, wanted: Sequence[str]) -> None:
 
     setup = peer_cases.Setup(n=_side(given), repeats=given.repeats, threads=by[0].threads, versions=by[2])
     began = datetime.now(UTC).isoformat(timespec="microseconds")
-    for case in wanted:
-        if case not in left:
-            sys.stderr.write(f"{case}: recorded already\n")
-            continue
-        sys.stderr.write(f"{case} …\n")
-        measured = measure(case, setup)
-        time = datetime.now(UTC).isoformat(timespec="seconds")
-        records = peer_tables.recorded(measured, by, side=setup.n, time=time, run=began)
-        lines.append(given.results / NAME, *records)
+    with _measuring(given.seconds) as measuring:
+        for case in wanted:
+            if case not in left:
+                sys.stderr.write(f"{case}: recorded already\n")
+                continue
+            sys.stderr.write(f"{case} …\n")
+            measured = measuring(case, setup)
+            time = datetime.now(UTC).isoformat(timespec="seconds")
+            records = peer_tables.recorded(measured, by, side=setup.n, time=time, run=began)
+            lines.append(given.results / NAME, *records)
+
+
+@contextlib.contextmanager
+def _measuring(seconds: float | None) -> "Iterator[Callable[[str, Setup], list[Measurement]]]":
+    """Yield what measures a case: here, or with a limit in a process that is then replaced."""
+    if seconds is None:
+        yield measure
+        return
+    from benchmarks.limited import Limited, Stopped
+    from benchmarks.peer_cases import Measurement
+
+    def within(case: str, setup: "Setup") -> list[Measurement]:
+        try:
+            return process.run(measure, case, setup)
+        except Stopped as end:
+            return [Measurement(case=case, scene="all", contender="all", status=end.status, reason=str(end))]
+
+    # what a process leaves behind that is killed goes with the folder
+    with (
+        tempfile.TemporaryDirectory(prefix="ctsim-peers-", ignore_cleanup_errors=True) as folder,
+        Limited(seconds, {"TMPDIR": folder}) as process,
+    ):
+        yield within
 
 
 def measure(case: str, setup: "Setup") -> "list[Measurement]":

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from typing import Any
 
 from benchmarks import host
 
@@ -23,3 +24,16 @@ def sleep_in_two(file: str) -> None:
         numbers.write(f"{os.getpid()} {other.pid}")
     os.rename(file + ".new", file)
     time.sleep(60)
+
+
+def die_in_exact(case: str, setup: Any) -> list:
+    """Measure as `run-benchmark peers` does, but for the case exact: leave a temporary folder and die."""
+    import tempfile
+    from pathlib import Path
+
+    from benchmarks.peer_cases import Measurement
+
+    if case == "exact":
+        Path(os.environ["CTSIM_TEST_MARK"]).write_text(tempfile.mkdtemp(), encoding="utf-8")
+        os._exit(3)
+    return [Measurement(case=case, scene="s", contender="ctsim", seconds=(1.0,), note=f"{setup.n} {os.getpid()}")]

@@ -1,11 +1,14 @@
-"""The catalogue of `run-benchmark peers`, and what becomes of peers that are not measured."""
+"""The catalogue of `run-benchmark peers`, and what becomes of cases and peers that are not measured."""
 
+import os
 from pathlib import Path
 
+import apart_jobs
+import msgspec
 import pytest
 
-from benchmarks import host, peer_cases, peer_catalogue, peer_poly, peers
-from benchmarks.peer_cases import MEASURED, RTK, Setup
+from benchmarks import cli, host, lines, peer_cases, peer_catalogue, peer_poly, peer_tables, peers
+from benchmarks.peer_cases import MEASURED, OURS, RTK, Measurement, Setup
 from ctsim.errors import InputError
 
 WHOLE = """
@@ -95,3 +98,69 @@ def test_a_peer_without_code_says_so_where_it_is_installed():
     ]
     assert rows[0].reason == "leapct 1.26 is installed, not measured: this command has no code for it"
     assert "not for commercial use" in rows[2].reason and "GPU" in rows[2].reason
+
+
+@pytest.fixture
+def commit(monkeypatch):
+    """Let the code be a commit's, and no peer be there."""
+    monkeypatch.setattr(peer_catalogue, "installed", dict)
+    monkeypatch.setattr(host, "use_threads", lambda threads: None)  # those of this process are not ours to set
+    monkeypatch.setattr(host, "commit", lambda: "a" * 40)
+
+
+def test_a_case_that_dies_or_overstays_is_a_row_and_the_next_begins(tmp_path, monkeypatch, capsys, commit):
+    monkeypatch.setattr(peers, "measure", apart_jobs.die_in_exact)
+    monkeypatch.setenv("CTSIM_TEST_MARK", str(tmp_path / "mark"))
+    words = [str(tmp_path / "r"), "--repeats", "1", "--small", "--case", "exact", "--case", "fdk"]
+    assert peers.main([*words, "--seconds", "60"]) == 1
+    died, whole = (r.measurement for r in peer_tables.read(tmp_path / "r" / peers.NAME))
+    assert (died.case, died.status, died.reason) == ("exact", "error", "the process died with exit code 3")
+    assert whole.status == "ok" and whole.note.startswith("32 ") and whole.note != f"32 {os.getpid()}"
+    assert not Path((tmp_path / "mark").read_text()).parent.exists()  # nor what it left there
+
+    assert peers.main([*words, "--seconds", "0.1", "--force"]) == 1
+    late = [r.measurement for r in peer_tables.read(tmp_path / "r" / peers.NAME)][2:]
+    assert [(m.case, m.status, m.reason) for m in late] == [
+        ("exact", "timeout", "did not end within 0.1 s"),
+        ("fdk", "timeout", "did not end within 0.1 s"),
+    ]
+    capsys.readouterr()
+    assert peers.main([*words, "--table"]) == 1  # it has failed, and is not known
+    assert "| fdk | all | all | timeout | – | – | – | did not end within 0.1 s |" in capsys.readouterr().out
+    assert peers.main([*words, "--dry-run"]) == 0 and "2 of 2 cases" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("seconds", ["0", "-1", "nan", "inf"])
+def test_a_limit_must_be_positive(tmp_path, seconds):
+    with pytest.raises(InputError, match="--seconds must be positive"):
+        peers.main([str(tmp_path / "r"), "--seconds", seconds])
+    assert not (tmp_path / "r").exists()
+
+
+def test_records_of_other_machines_are_taken_over_and_told_apart(tmp_path, monkeypatch, capsys):
+    def record(case, minute, cpu="ours"):
+        return peer_tables.PeerRecord(
+            measurement=Measurement(case=case, scene="s", contender=OURS, seconds=(1.0 + minute,)), side=256,
+            rtk="2.7", host=msgspec.structs.replace(host.host(), cpu=cpu), commit="a" * 40,
+            time=f"2026-01-01T00:0{minute}:00+00:00", run=f"2026-01-01T00:0{minute}:00+00:00",
+        )  # fmt: skip
+
+    here, there = tmp_path / "here", tmp_path / "there"
+    for folder in (here, there, tmp_path / "none"):
+        folder.mkdir()
+    lines.append(here / peers.NAME, record("fdk", 1), record("paths", 3))
+    lines.append(there / peers.NAME, record("fdk", 2, "theirs"), record("paths", 0, "theirs"))
+    assert peers.main([str(here), "--table"]) == 0
+    assert "Cases of several runs" not in capsys.readouterr().out
+    assert peers.main([str(here), "--collect", str(there)]) == 0
+    said = capsys.readouterr()
+    assert f"{there}: 2 records taken over" in said.err
+    # the newest of each case, and under whose name it was measured
+    assert "| fdk | s | ctsim | 3.000 |" in said.out and "| paths | s | ctsim | 4.000 |" in said.out
+    assert "- fdk: 2026-01-01T00:02:00+00:00, commit aaaaaaaaaaaa, theirs, " in said.out
+    assert "- paths: 2026-01-01T00:03:00+00:00, commit aaaaaaaaaaaa, ours, " in said.out
+    before = (here / peers.NAME).read_bytes()
+    monkeypatch.setattr("sys.argv", ["run-benchmark", "peers", str(here), "--collect", str(tmp_path / "none")])
+    assert cli.run_benchmark() == cli.EXIT_USER
+    assert "--collect" in (error := capsys.readouterr().err) and error.count("\n") == 1
+    assert (here / peers.NAME).read_bytes() == before
