@@ -45,8 +45,8 @@ class Effort:
 
     @property
     def kind(self) -> str:
-        """Its method's name: one warm-up does for all of its parameters."""
-        return self.method.name
+        """Its curve: one warm-up does for all values of a parameter, while presets have kernels of their own."""
+        return self.curve
 
 
 def efforts(suite: Suite, name: str) -> list[Effort]:
