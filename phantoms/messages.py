@@ -79,6 +79,8 @@ def _chosen(spec: inspect.Type, data: Any) -> inspect.Type:
     members = [t for t in spec.types if not isinstance(t, inspect.NoneType)]
     if isinstance(data, dict):
         members = [t for t in _structs(spec) if t.tag_field is None or data.get(t.tag_field) == t.tag] or members
+    elif isinstance(data, str):
+        members = [t for t in members if isinstance(t, inspect.LiteralType)] or members
     return members[0] if len(members) == 1 else spec
 
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import re
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,11 +14,9 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.settings import Simulation, Truth
 from ctsim.types import Phantom, Scanner
-from phantoms.messages import explain
 from phantoms.recipes import AnyRecipe, build_recipe
 from phantoms.scanners import REACH, ScannerSettings
-
-NULL = "null"  # how a scene file says None, which TOML lacks, where None is not the default
+from phantoms.suites import NULL, decode, parse_toml, read_toml, scenes_of
 
 
 class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -88,57 +85,18 @@ def load_suite(path: str | Path) -> tuple[Scene, ...]:
     Defaults are merged under every scene, table by table. The string "null" stands for a value left
     empty. Raises `InputError` with file, key and what was expected.
     """
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); expected a TOML file of scenes") from error
-    return parse_suite(text, str(path))
+    return _scenes(read_toml(Path(path)), str(path))
 
 
 def parse_suite(text: str, where: str = "scene") -> tuple[Scene, ...]:
     """Read scenes from TOML text; `where` names the file in messages. See `load_suite`."""
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{where}: not TOML: {error}") from error
+    return _scenes(parse_toml(text, where), where)
+
+
+def _scenes(data: dict[str, Any], where: str) -> tuple[Scene, ...]:
     if "scene" not in data and not set(data).isdisjoint(Scene.__struct_fields__):
-        return (_decode(data, where, ""),)
-    if extra := sorted(set(data) - {"defaults", "scene"}):
-        raise InputError(f"{where}: unknown key {extra[0]!r}; expected [defaults] and [[scene]]")
-    tables, defaults = data.get("scene", []), data.get("defaults", {})
-    if not isinstance(defaults, dict):
-        raise InputError(f"{where}: defaults must be a table")
-    if not isinstance(tables, list) or not tables or not all(isinstance(t, dict) for t in tables):
-        raise InputError(f"{where}: no scenes; expected at least one [[scene]] table")
-    scenes = tuple(_decode(_merge(defaults, t), where, f"scene[{k}]") for k, t in enumerate(tables))
-    names = [s.name for s in scenes]
-    if twice := sorted({n for n in names if names.count(n) > 1}):
-        raise InputError(f"{where}: two scenes are named {twice[0]!r}; names must differ")
-    return scenes
-
-
-def _decode(data: dict[str, Any], where: str, prefix: str) -> Scene:
-    try:
-        return msgspec.convert(_nulls(data), Scene)
-    except msgspec.ValidationError as error:
-        raise InputError(f"{where}: {explain(error, _nulls(data), Scene, prefix)}") from error
-
-
-def _merge(under: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    merged = dict(under)
-    for key, value in over.items():
-        old = merged.get(key)
-        merged[key] = _merge(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
-    return merged
-
-
-def _nulls(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _nulls(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [_nulls(v) for v in value]
-    return None if value == NULL else value
+        return (decode(data, Scene, where),)
+    return scenes_of(data, Scene, where)
 
 
 def _plain(value: Any) -> Any:
