@@ -48,6 +48,8 @@ class Arguments:
     """List the rows and what they are expected to cost, running nothing."""
     table: tyro.conf.FlagCreatePairsOff[bool] = False
     """Only render the table from the newest record of each row, running nothing."""
+    collect: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="OTHER [OTHER ...]")] = ()
+    """Take over what these results folders of other machines have and RESULTS lacks, then only render the table."""
 
 
 def main(argv: list[str]) -> int:
@@ -62,6 +64,9 @@ def main(argv: list[str]) -> int:
     cases = _chosen(catalogue(), given.case)
     wanted = [stress_records.identity_of(c, side) for c in cases]
     path = given.results / stress_records.NAME
+    if given.collect and not given.dry_run:
+        for other, count in stress_records.collect(path, given.collect).items():
+            sys.stderr.write(f"{other}: {count} records taken over\n")
     stored = stress_records.read(path)
     found = stress_records.latest(stored, wanted)
     done = set() if given.force else {r.identity for r in found if r.ok}
@@ -69,7 +74,7 @@ def main(argv: list[str]) -> int:
     if given.dry_run:
         _list(left, len(cases), short=given.short)
         return 0
-    if given.table:
+    if given.table or given.collect:
         shown = stress_records.newest(stored, [(c.name, c.subject) for c in cases], side)
         if old := sum(r.identity not in wanted for r in shown):
             sys.stderr.write(f"{path}: {old} of {len(shown)} rows are of other sources than those that are here\n")

@@ -12,6 +12,7 @@ from benchmarks.stress_cases import Case, Outcome
 from benchmarks.texts import escape
 
 NAME, TABLE_NAME = "stress.jsonl", "stress.md"
+A_ROW = "a row of run-benchmark stress"
 
 
 class StressRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -61,7 +62,12 @@ def record_of(case: Case, side: int, outcome: Outcome, by: tuple[Host, str, str]
 
 def read(path: Path) -> list[StressRecord]:
     """Read the rows of a stress file (see `lines.read`)."""
-    return lines.read(path, StressRecord, "a row of run-benchmark stress")
+    return lines.read(path, StressRecord, A_ROW)
+
+
+def collect(path: Path, others: Sequence[Path]) -> dict[Path, int]:
+    """Take over the rows that a stress file lacks (see `lines.collect`)."""
+    return lines.collect(path, others, StressRecord, A_ROW)
 
 
 def latest(records: Sequence[StressRecord], wanted: Sequence[str]) -> list[StressRecord]:

@@ -281,3 +281,17 @@ def test_the_table_is_rendered_from_the_newest_records_alone(command, tmp_path, 
     assert "3 of 3 rows are of other sources" in capsys.readouterr().err
     with pytest.raises(InputError, match="no such records"):
         stress.main([str(tmp_path / "out"), "--table"])  # of the larger grids
+
+
+def test_rows_of_other_machines_are_taken_over_and_shown(command, tmp_path, capsys):
+    command()
+    here, there = tmp_path / "out", tmp_path / "there"
+    here.rename(there)
+    capsys.readouterr()
+    assert command("--collect", str(there), "--dry-run") == 0 and not here.exists()
+    assert command("--collect", str(there)) == 1 and Here.ran == 3
+    assert f"{there}: 3 records taken over" in capsys.readouterr().err
+    assert (here / "stress.md").read_bytes() == (there / "stress.md").read_bytes()
+    assert command("--case", "fine") == 0 and Here.ran == 3  # it is here now
+    with pytest.raises(InputError, match=r"there are no records, expected a folder with stress\.jsonl"):
+        command("--collect", str(tmp_path))
