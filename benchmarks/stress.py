@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 SECONDS = {"simulator": (0.3, 0.6), "splat kernels": (0.1, 0.1)}
 SECONDS_OF_METHOD = (0.2, 0.5)
 CATALOGUE = "benchmarks.stress"
-"""The module whose `catalogue` the process that carries out the cases asks."""
+"""The module whose `catalogue` the process that carries out the cases asks, with suite and methods."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +40,11 @@ class Arguments:
     """Small grids; every case, in about two minutes on two cores."""
     case: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
     """Only this case; may be given several times (default: all)."""
+    suite: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None
+    """Scenes for the methods in place of the bundled ones; docs/stability.md says what a file may hold."""
+    method: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
+    """Only the rows of this method, such as fdk, or of module:function of your own; may be given several times
+    (default: all methods, simulator and splat kernels)."""
     seconds: float = 120.0
     """Time limit of one row, compilation included."""
     force: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -61,7 +66,7 @@ def main(argv: list[str]) -> int:
     from benchmarks.stress_cases import FULL, SHORT
 
     side = SHORT if given.short else FULL
-    cases = _chosen(catalogue(), given.case)
+    cases = _chosen(catalogue(given.suite, given.method), given.case)
     wanted = [stress_records.identity_of(c, side) for c in cases]
     path = given.results / stress_records.NAME
     if given.collect and not given.dry_run:
@@ -84,11 +89,17 @@ def main(argv: list[str]) -> int:
     return _report(stress_records.latest(stress_records.read(path), wanted), given)
 
 
-def catalogue() -> "list[Case]":
-    """Return all cases."""
+def catalogue(suite: Path | None = None, methods: tuple[str, ...] = ()) -> "list[Case]":
+    """Return all cases, those of methods with the scenes of a file; only those of `methods` where any are named.
+
+    Raises InputError for a file that is wrong and a method that does not exist.
+    """
     from benchmarks import stress_chain, stress_methods, stress_simulator, stress_splats
 
-    return stress_simulator.cases() + stress_splats.cases() + stress_chain.cases() + stress_methods.cases()
+    own, of_methods = stress_simulator.cases() + stress_splats.cases(), stress_methods.cases(suite, methods)
+    subjects = {c.subject for c in of_methods}
+    chain = [c for c in stress_chain.cases() if c.subject in subjects]
+    return chain + of_methods if methods else own + chain + of_methods
 
 
 def _chosen(cases: "list[Case]", names: Sequence[str]) -> "list[Case]":
@@ -109,7 +120,8 @@ def _work(left: "list[Case]", side: int, given: Arguments) -> None:
     from benchmarks.stress_worker import Worker
 
     commit, machine = host.commit(), host.host()  # of the code that is loaded, whatever is committed meanwhile
-    with Worker(CATALOGUE, given.seconds) as worker, tqdm(left, unit="row", disable=not left) as bar:
+    asked = (given.suite, given.method)
+    with Worker(CATALOGUE, given.seconds, *asked) as worker, tqdm(left, unit="row", disable=not left) as bar:
         for case in bar:
             bar.set_postfix_str(f"{case.name}, {case.subject}")
             outcome = worker.run(case, side)

@@ -3,9 +3,10 @@
 Lengths mm; a scene fits a cube of 60 mm unless its case says otherwise.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numba
@@ -15,7 +16,9 @@ from numpy.typing import NDArray
 
 from baselines.morphology import dilate
 from benchmarks.peer_cases import upright_chord
-from ctsim.geometry import Geometry
+from benchmarks.stress_cases import FULL, SHORT
+from ctsim.errors import InputError
+from ctsim.geometry import Count, Geometry, Pair, Triple
 from ctsim.materials import attenuation
 from ctsim.plan import make_plan
 from ctsim.quadrature import full_rule
@@ -30,34 +33,100 @@ from reconstruct.redundancy import ray_weights
 SIZE = 60.0
 BODY, HEIGHT = 24.0, 52.0  # radius and height of the water
 METALS = ("Ti", "Fe", "Sn", "W", "Au")
+Positive = Annotated[float, msgspec.Meta(gt=0)]
 Chords = Mapping[str, NDArray[np.float64]]
 """Length (mm) of every central ray in each material, [view, v, u]."""
 
 
+class OfSide(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A count that grows with the grid: so many times its side, rounded down, and so many more."""
+
+    times: Positive = 1.0
+    plus: int = 0
+
+
+Number = Count | OfSide
+
+
+class Circle(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A circular scan and its grid, for every side of grids; a desktop scanner whose pixels cover the cube.
+
+    Tuples are (z, y, x) or (v, u), as in `Geometry`. `field_mm` is the edge of the reconstructed cube, `detector_mm`
+    the detector's extent. Views lie at start + arc·(k/n)^crowding.
+    """
+
+    n_voxel: tuple[Number, Number, Number] = (OfSide(), OfSide(), OfSide())
+    field_mm: Positive = SIZE
+    n_detector: tuple[Number, Number] = (OfSide(times=1.5), OfSide(times=1.5))
+    detector_mm: tuple[Positive, Positive] = (150.0, 150.0)
+    n_views: Number = OfSide(times=2)
+    dso: float = 250.0
+    dsd: float = 500.0
+    off_origin: Triple = (0.0, 0.0, 0.0)
+    off_detector: Pair = (0.0, 0.0)
+    start_deg: float = 0.0
+    arc_deg: float = 360.0
+    crowding: Positive = 1.0
+
+    def __post_init__(self) -> None:
+        for side in (SHORT, FULL):
+            self.resolve(side)
+
+    def resolve(self, side: int) -> Geometry:
+        """Return the geometry on grids of so many voxels a side; raises InputError where there is none."""
+        n_views, *rest = (_count(n, side) for n in (self.n_views, *self.n_voxel, *self.n_detector))
+        if min(n_views, *rest) < 1:
+            raise InputError(f"counts must be at least 1, got {rest[:3]} voxels, {rest[3:]} pixels and {n_views} views")
+        (z, y, x), (v, u) = rest[:3], rest[3:]
+        high, wide = self.detector_mm
+        return Geometry(
+            dso=self.dso,
+            dsd=self.dsd,
+            n_voxel=(z, y, x),
+            d_voxel=(self.field_mm / z, self.field_mm / y, self.field_mm / x),
+            n_detector=(v, u),
+            d_detector=(high / v, wide / u),
+            n_views=n_views,
+            off_origin=self.off_origin,
+            off_detector=self.off_detector,
+            start_deg=self.start_deg,
+            arc_deg=self.arc_deg,
+            angles_deg=None if self.crowding == 1 else uneven(n_views, self.crowding, self.arc_deg, self.start_deg),
+        )
+
+
+def _count(n: Number, side: int) -> int:
+    return n if isinstance(n, int) else math.floor(n.times * side) + n.plus
+
+
+def uneven(n: int, crowding: float = 1.5, arc: float = 360.0, start: float = 0.0) -> tuple[float, ...]:
+    """Return n angles (degrees) that crowd where an arc begins."""
+    return tuple((start + arc * (np.arange(n) / n) ** crowding).tolist())
+
+
 def geometry(side: int, **changes: Any) -> Geometry:
-    """Return a desktop scanner's circle on side³ voxels; its pixels cover the cube."""
-    edge = 150.0 / (1.5 * side)
-    base = Geometry(
-        dso=250.0,
-        dsd=500.0,
-        n_voxel=(side, side, side),
-        d_voxel=(SIZE / side, SIZE / side, SIZE / side),
-        n_detector=(side + side // 2, side + side // 2),
-        d_detector=(edge, edge),
-        n_views=2 * side,
-    )
-    return msgspec.structs.replace(base, **changes)
+    """Return a desktop scanner's circle on side³ voxels, with changes of what `Geometry` says."""
+    return msgspec.structs.replace(Circle().resolve(side), **changes)
 
 
 def scaled_by(of: Geometry, factor: float) -> Geometry:
     """Return the geometry of a machine and a grid of so many times the size."""
-    names = ("dso", "dsd", "d_voxel", "d_detector")
-    return msgspec.structs.replace(of, **{n: np.multiply(getattr(of, n), factor).tolist() for n in names})
+    (z, y, x), (v, u) = of.d_voxel, of.d_detector
+    return msgspec.structs.replace(
+        of,
+        dso=of.dso * factor,
+        dsd=of.dsd * factor,
+        d_voxel=(z * factor, y * factor, x * factor),
+        d_detector=(v * factor, u * factor),
+    )
 
 
-def rod(material: str, radius: float, *, at: tuple[float, float] = (0.0, 0.0), height: float = HEIGHT) -> Solid:
-    """Return an upright rod through (x, y) = `at`."""
-    return cylinder(f"{material} at {at}", material, (radius, height), centre=(*at, 0.0), metal=material in METALS)
+def rod(
+    material: str, radius: float, *, at: Pair = (0.0, 0.0), height: float = HEIGHT, metal: bool | None = None
+) -> Solid:
+    """Return an upright rod through (x, y) = `at`, a metal insert if it is of `METALS` or `metal` says so."""
+    metal = material in METALS if metal is None else metal
+    return cylinder(f"{material} at {at}", material, (radius, height), centre=(*at, 0.0), metal=metal)
 
 
 WATER = rod("water", BODY)
@@ -83,11 +152,6 @@ def block_phantom(density: float | None, edge: float) -> Phantom:
         d_voxel=(edge / n, edge / n, edge / n),
         density=None if density is None else np.full((n, n, n), density, np.float32),
     )
-
-
-def uneven(n: int) -> tuple[float, ...]:
-    """Return n angles (degrees) that crowd on one side of the turn."""
-    return tuple((360.0 * (np.arange(n) / n) ** 1.5).tolist())
 
 
 def chords(of: Geometry, outer: Solid, *inner: Solid) -> dict[str, NDArray[np.float64]]:

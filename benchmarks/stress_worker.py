@@ -6,6 +6,7 @@ A process a case would start five hundred times.
 import functools
 import importlib
 import os
+from collections.abc import Hashable
 from typing import Self
 
 from benchmarks.limited import Limited, Stopped
@@ -15,14 +16,14 @@ THREADS = "NUMBA_NUM_THREADS"
 
 
 class Worker:
-    """Carries out the cases of a catalogue, a module with `catalogue() -> list[Case]`, in a process of its own.
+    """Carries out the cases of a catalogue, a module with `catalogue(*asked) -> list[Case]`, in a process of its own.
 
     A case takes at most `seconds`. The process can have two threads at least, so that one can be compared with two.
     """
 
-    def __init__(self, catalogue: str, seconds: float) -> None:
+    def __init__(self, catalogue: str, seconds: float, *asked: Hashable) -> None:
         self.seconds = seconds
-        self._catalogue = catalogue
+        self._catalogue = (catalogue, *asked)
         self._threads = int(os.environ.get(THREADS, len(os.sched_getaffinity(0))))
         self._process = Limited(seconds, {THREADS: str(max(2, self._threads))})
 
@@ -41,14 +42,16 @@ class Worker:
             return Outcome(ok=False, found=f"NOT EXPECTED: {end}")
 
 
-def _carry_out(catalogue: str, threads: int, name: str, subject: str, side: int) -> Outcome:
+def _carry_out(
+    catalogue: tuple[str, *tuple[Hashable, ...]], threads: int, name: str, subject: str, side: int
+) -> Outcome:
     """Do, in the process, what `Worker.run` asks for, on so many threads."""
     import numba
 
     numba.set_num_threads(threads)
-    return carry_out(_cases(catalogue)[name, subject], side)
+    return carry_out(_cases(*catalogue)[name, subject], side)
 
 
 @functools.lru_cache
-def _cases(catalogue: str) -> dict[tuple[str, str], Case]:
-    return {(c.name, c.subject): c for c in importlib.import_module(catalogue).catalogue()}
+def _cases(catalogue: str, *asked: Hashable) -> dict[tuple[str, str], Case]:
+    return {(c.name, c.subject): c for c in importlib.import_module(catalogue).catalogue(*asked)}

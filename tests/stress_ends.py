@@ -49,5 +49,5 @@ ENDS = {
 }
 
 
-def catalogue():
-    return [Case(name=f.__name__, subject="test", what="w", expected="e", run=f) for f in ENDS]
+def catalogue(subject="test"):
+    return [Case(name=f.__name__, subject=subject, what="w", expected="e", run=f) for f in ENDS]

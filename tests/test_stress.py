@@ -12,6 +12,7 @@ from benchmarks import stress, stress_chain, stress_methods, stress_records, str
 from benchmarks.methods import TABLE, find
 from benchmarks.stress_cases import Findings, carry_out
 from benchmarks.stress_scans import BONE, USUAL, WATER, example, geometry, in_air, rod
+from benchmarks.stress_suite import load
 from benchmarks.stress_worker import Worker
 from ctsim import plan
 from ctsim.errors import InputError
@@ -31,8 +32,9 @@ from reconstruct.splat.project import Projector
 from reconstruct.splat.published_settings import Settings
 
 SMALLEST = 12
+SUBJECTS = [method.label for method in stress_methods.subjects()]
 # every scene meets a third of the methods here and every method a third of the scenes; the command runs all
-METHODS = [c for k, c in enumerate(stress_methods.cases()) if (k // len(TABLE) + k % len(TABLE)) % 3 == 0]
+METHODS = [c for k, c in enumerate(stress_methods.cases()) if (k // len(SUBJECTS) + k % len(SUBJECTS)) % 3 == 0]
 CASES = [*stress_simulator.cases(), *stress_splats.cases(), *stress_chain.cases(), *METHODS]
 
 
@@ -46,10 +48,10 @@ def test_every_method_and_kernel_has_its_cases():
     by_subject = {}
     for case in stress.catalogue():
         by_subject.setdefault(case.subject, []).append(case.name)
-    assert set(by_subject) == {"simulator", "splat kernels", *TABLE}
+    assert set(by_subject) == {"simulator", "splat kernels", *SUBJECTS} and {*TABLE} <= {*SUBJECTS}
     assert all(len(names) == len(set(names)) for names in by_subject.values())
-    assert {case.subject for case in METHODS} == set(TABLE)
-    assert {case.name for case in METHODS} == {*stress_methods.SCENES, "threads"}
+    assert {case.subject for case in METHODS} == set(SUBJECTS)
+    assert {case.name for case in METHODS} == {*(scene.name for scene in load()), "threads"}
 
 
 # --- a case whose remedy is taken out ----------------------------------------------------------------
@@ -86,8 +88,8 @@ def test_a_volume_that_depends_on_the_number_of_threads_is_reported(monkeypatch)
 
 def test_a_hang_a_crash_and_a_warning_are_failed_rows_and_the_rest_goes_on():
     ends = {run.__name__: end for run, end in ENDS.items()}
-    with Worker("stress_ends", seconds=60.0) as worker:
-        for case in catalogue():
+    with Worker("stress_ends", 60.0, "asked") as worker:
+        for case in catalogue("asked"):
             worker.seconds = 1.0 if case.name == "hanging" else 60.0
             outcome = worker.run(case, 12)
             ok, words = ends[case.name]
@@ -125,7 +127,7 @@ class Here:
 @pytest.fixture
 def command(monkeypatch, tmp_path):
     monkeypatch.setattr("benchmarks.stress_worker.Worker", Here)
-    monkeypatch.setattr(stress, "catalogue", lambda: catalogue()[:3])
+    monkeypatch.setattr(stress, "catalogue", lambda *_: catalogue()[:3])
     Here.ran = 0
     return lambda *words: stress.main([str(tmp_path / "out"), "--short", *words])
 
@@ -274,7 +276,7 @@ def test_the_table_is_rendered_from_the_newest_records_alone(command, tmp_path, 
     assert command("--table", "--case", "fine") == 0
     # other sources change nothing of what was found, and are named
     others = [dataclasses.replace(case, code="other") for case in catalogue()[:3]]
-    monkeypatch.setattr(stress, "catalogue", lambda: others)
+    monkeypatch.setattr(stress, "catalogue", lambda *_: others)
     capsys.readouterr()
     assert command("--table") == 1 and Here.ran == 3
     assert (tmp_path / "out" / "stress.md").read_bytes() == (tmp_path / "first.md").read_bytes()
