@@ -32,7 +32,10 @@ NEAR = 0.7
 SAME = 1e-3  # of the greatest value: float32
 SAME_BY_DESCENT = 0.03
 BOUNDS = {"ibhc": 10.0}  # adds to P what its own volume says of hardening, streaks included
-VARIANTS: dict[str, tuple[dict[str, Any], ...]] = {}
+STEPS = 100  # of the published methods, whose own 20000 are hours; they add splats from the 500th on
+VARIANTS: dict[str, tuple[dict[str, Any], ...]] = {
+    "splat": ({"response": "known"}, {"preset": "paper", "steps": STEPS}, {"preset": "r2", "steps": STEPS})
+}
 """Parameters with which a method runs beside its defaults."""
 THREADS = Scene(name="usual", what="1, 2 and all threads")
 
