@@ -23,7 +23,7 @@ from ctsim.spectrum import Tube
 from ctsim.types import Scanner
 from reconstruct import log
 from reconstruct.log import line_integrals
-from reconstruct.splat import level, ordered
+from reconstruct.splat import course, level, ordered
 from reconstruct.splat.kernels.lanes import WIDTH
 from reconstruct.splat.learner import seed_splats
 from reconstruct.splat.loss import l1_ssim
@@ -262,6 +262,20 @@ def test_the_step_is_that_of_a_majoriser(monkeypatch):
     monkeypatch.setattr(ordered.Fit, "_move", jacobi)
     found = misfit()
     assert diagonals and falling < 0.06 and found > 3 * falling, (falling, found)
+
+
+def test_a_fit_begins_on_one_side_of_waters_kink(monkeypatch):
+    """Water is a knot of the materials' curve: rounded to either side of it, all splats take another first step."""
+    began, fit = [], course.Course._fit
+
+    def spied(self, k, support, start):
+        began.append(start[support].max() < self.curve.water)
+        return fit(self, k, support, start)
+
+    monkeypatch.setattr(course.Course, "_fit", spied)
+    for kvp in (60.0, 70.0, 80.0, 90.0, 100.0, 110.0):
+        find("splat", {"passes": (1, 0)}).reconstruct(scan_of(WATER, side=8, tube=Tube(kvp=kvp)).scan, "cpu")
+    assert began == [True] * 6
 
 
 def test_the_table_is_rendered_from_the_newest_records_alone(command, tmp_path, monkeypatch, capsys):

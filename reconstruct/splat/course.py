@@ -70,7 +70,8 @@ class Course:
         level, water = self.levels[k], self.curve.water
         if before is None:
             support = carve(level, self.met)
-            start = np.where(support, water, 0).astype(np.float32)
+            thin = np.nextafter(np.float32(water), np.float32(0))  # not on the curve's knot, by rounding on either side
+            start = np.where(support, thin, np.float32(0))
         else:
             start = refined(before.volume(), level.geometry)
             support = start > EMPTY * water
