@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ctsim.types import Phantom, Scanner
     from phantoms.scene import Scene
 
+OF_COMMANDS = ("pareto", "peers", "stress")  # what run-benchmark's commands measure: suites, but none of datasets
 _SPARE = 64 * 2**20  # bytes left free for the file system's own needs
 
 
@@ -93,10 +94,10 @@ def load(suite: str) -> "tuple[Scene, ...]":
 
 
 def bundled() -> "dict[str, Traversable]":
-    """Return the bundled suites by name: the files with `[[scene]]` tables, beside which commands have theirs."""
+    """Return the bundled suites by name, those of `OF_COMMANDS` apart."""
     folder = resources.files("benchmarks") / "suites"
     files = {entry.name.removesuffix(".toml"): entry for entry in folder.iterdir() if entry.name.endswith(".toml")}
-    return {name: entry for name, entry in files.items() if "\n[[scene]]\n" in entry.read_text(encoding="utf-8")}
+    return {name: entry for name, entry in files.items() if name not in OF_COMMANDS}
 
 
 def select(scenes: "tuple[Scene, ...]", only: tuple[str, ...], seeds: tuple[int, ...]) -> "tuple[Scene, ...]":

@@ -1,4 +1,4 @@
-"""Scenes that are hard on methods, as a TOML file says them: `benchmarks/data/stress.toml`, or one of the user's own.
+"""Scenes that are hard on methods, as a TOML file says them: `benchmarks/suites/stress.toml`, or one of the user's own.
 
 `docs/stability.md` lists the keys. Lengths mm.
 """
@@ -159,5 +159,5 @@ def load(path: Path | None = None) -> tuple[Scene, ...]:
     """Read a file of scenes, by default the bundled one; raises InputError with file, key and what was expected."""
     if path is not None:
         return scenes_of(read_toml(path), Scene, str(path))
-    with resources.as_file(resources.files("benchmarks") / "data" / "stress.toml") as bundled:
+    with resources.as_file(resources.files("benchmarks") / "suites" / "stress.toml") as bundled:
         return load(bundled)
