@@ -50,8 +50,9 @@ class Arguments:
     isolate: tyro.conf.FlagCreatePairsOff[bool] = False
     """Run each method in a process of its own: exact peak memory, and a crash ends only that run."""
     seconds: float | None = None
-    """Time of one run; implies --isolate. A method with a parameter seconds, as splat, is told it and ends with what it
-    has by then; others, their start included, end with the status timeout."""
+    """Time of one run; implies --isolate. A method with a parameter seconds, as splat, is told it, another run as with
+    --set, and ends with what it has by then, at most 120 s late. Others, their start included, end with the status
+    timeout."""
     keep_volumes: bool = True
     """Keep reconstructions as TIFF stacks; pictures are drawn from them."""
     anchor: bool = True

@@ -4,7 +4,10 @@ What a job has loaded, compiled or cached stays for the next. The process is rep
 it or overstayed.
 """
 
+import contextlib
 import math
+import os
+import signal
 from collections.abc import Callable, Mapping
 from typing import Any, Self
 
@@ -45,7 +48,7 @@ class Limited:
 
         Raises Stopped where it does not end in time, the process's start included, or its process dies.
         """
-        worker = self._worker = self._worker or workers.start(self._environment)
+        worker = self._worker = self._worker or workers.start(self._environment, apart=True)
         try:
             worker.pipe.send((_called, (function, given)))
             answered = worker.pipe.recv() if worker.pipe.poll(self.seconds) else None
@@ -67,7 +70,9 @@ class Limited:
 
     def _end(self) -> None:
         if self._worker is not None:
-            self._worker.process.kill()
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self._worker.process.pid, signal.SIGKILL)  # with what jobs have started
+            self._worker.process.kill()  # it may not lead its group yet
             self._worker.process.join()
             self._worker.pipe.close()
         self._worker = None

@@ -45,8 +45,8 @@ class Effort:
 
     @property
     def kind(self) -> str:
-        """Its curve: one warm-up does for all values of a parameter, while presets have kernels of their own."""
-        return self.curve
+        """Its own: other values of a parameter may take other kernels, as presets do."""
+        return f"{self.curve}, {self.label}"
 
 
 def efforts(suite: Suite, name: str) -> list[Effort]:

@@ -107,7 +107,8 @@ def runs(found: Sequence[Timed]) -> Counter[str]:
 
 def latest(found: Sequence[Timed]) -> list[Timed]:
     """Keep what a table shows: of each choice the runs of its newest identity, on the machine its scene was last on."""
-    machine = {(t.setting.part, t.setting.scene): t.setting.machine for t in found}
+    ended = sorted(found, key=lambda t: t.status == OK)  # a failure says nothing where there is a time
+    machine = {(t.setting.part, t.setting.scene): t.setting.machine for t in ended}
     mine = [
         t
         for t in found

@@ -69,7 +69,7 @@ def choices(asked: Choices) -> list[Choice]:
     usual = Simulation()
     found = [
         Choice(
-            curve=f"tolerance {tolerance:.0e}",
+            curve=f"tolerance {_short(tolerance)}",
             label=f"{subrays} sub-ray{'s' * (subrays > 1)}",
             simulation=Simulation(tolerance=tolerance, subrays=subrays),
             default=(tolerance, subrays) == (usual.tolerance, usual.subrays),
@@ -82,11 +82,25 @@ def choices(asked: Choices) -> list[Choice]:
     found += [
         Choice(curve=curve, label=f"{round(grid * asked.side)}³ labels", grid=grid, metal=metal, default=default)
         for curve, metal in ((BODY, False), (VOXELS, True))
-        for grid in asked.grids
+        for grid in _different(asked.grids, asked.side)
         for default in (grid == USUAL and not metal,)
     ]
     level = Scatter().level
     return found + [Choice(curve=SCATTER, label=f"level {k}", level=k, default=k == level) for k in asked.levels]
+
+
+def _short(tolerance: float) -> str:
+    """Return a tolerance as briefly as it is told from others: 1e-04, 1.2e-04."""
+    mantissa, exponent = f"{tolerance:e}".split("e")
+    return f"{mantissa.rstrip('0').rstrip('.')}e{exponent}"
+
+
+def _different(grids: tuple[float, ...], side: int) -> list[float]:
+    """Return the grids, one of those that have the same number of labels: the default, or else the first."""
+    found: dict[int, float] = {}
+    for grid in (*(g for g in grids if g == USUAL), *grids):
+        found.setdefault(round(grid * side), grid)
+    return [grid for grid in grids if grid in found.values()]
 
 
 USUALLY = Choice(curve=EXACT, label="default")

@@ -88,8 +88,9 @@ def estimated(task: Task) -> float | None:
 
     geometry = task.stored.geometry
     fdks = in_fdks(task.method, geometry)
-    told = task.method.params.get("seconds") or math.inf
-    return None if fdks is None else min(fdks * fdk_seconds(geometry), told)
+    told = task.method.params.get("seconds")
+    limit = told if isinstance(told, int | float) else math.inf
+    return None if fdks is None else min(fdks * fdk_seconds(geometry), limit)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,6 +10,7 @@ import importlib
 import logging
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
 import time
@@ -153,14 +154,15 @@ def threads_of(n: int) -> dict[str, str]:
     return {name: str(min(share, int(given)) if given.isdecimal() else share) for name, given in before.items()}
 
 
-def start(environment: Mapping[str, str]) -> Worker:
+def start(environment: Mapping[str, str], *, apart: bool = False) -> Worker:
     """Start a worker with these variables, such as `threads_of` a number of workers: libraries read them on import.
 
-    It does not hear Ctrl-C: the parent decides what that means.
+    It does not hear Ctrl-C: the parent decides what that means. With `apart` it leads a process group, which can be
+    ended whole.
     """
     context = multiprocessing.get_context("spawn")
     mine, its = context.Pipe()
-    process = context.Process(target=_serve, args=(its,))
+    process = context.Process(target=_serve, args=(its, apart))
     before = {name: os.environ.get(name) for name in environment}
     heard = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited, so that it holds from the first instruction
     os.environ.update(environment)
@@ -177,8 +179,10 @@ def start(environment: Mapping[str, str]) -> Worker:
     return Worker(process, mine)
 
 
-def _serve(pipe: connection.Connection) -> None:
+def _serve(pipe: connection.Connection, apart: bool) -> None:
     """Be a worker: answer jobs until the pipe closes or the parent ends."""
+    if apart:
+        os.setpgid(0, 0)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # a job can so write down where it stopped
     threading.Thread(target=_follow_parent, daemon=True).start()
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
@@ -195,7 +199,16 @@ def _attempt(function: Function, job: Any) -> tuple[bool, Any]:
         return True, InputError(str(error))
     except Exception as error:
         error.add_note("".join(traceback.format_exception(error)))  # where it was raised does not cross processes
-        return True, error
+        return True, error if _travels(error) else RuntimeError("".join(traceback.format_exception(error)))
+
+
+def _travels(error: Exception) -> bool:
+    """Say whether an exception can be pickled and made again, which its own arguments may not suffice for."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return False
+    return True
 
 
 def _follow_parent() -> None:

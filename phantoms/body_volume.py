@@ -29,7 +29,7 @@ class CtVolume(Recipe, frozen=True, kw_only=True, tag="ct_volume"):
     `path` is a TIFF stack or .npy array [z, y, x], z upwards, of voxels of `spacing` mm (z, y, x), whose value v is
     v·rescale[0] + rescale[1] HU. Its middle comes to that of the cube of `size`; what lies beyond the object's reach
     is cut off. At `kev` every voxel has the attenuation of its HU. `at` are the inserts' centres (x, y, z) in mm from
-    the middle. `sha256` is the file's, filled in where it is empty; another file is refused.
+    the middle. `sha256` is the file's, filled in where it is empty, and `path` made absolute; another file is refused.
     """
 
     path: str
@@ -48,8 +48,11 @@ class CtVolume(Recipe, frozen=True, kw_only=True, tag="ct_volume"):
             raise InputError(f"rescale must be a positive slope and an intercept in HU, got {self.rescale}")
         if self.at and self.n_inserts not in (None, len(self.at)):
             raise InputError(f"n_inserts is {self.n_inserts}, but at has {len(self.at)} places; give one of them")
+        if not np.isfinite(self.at).all():
+            raise InputError(f"at must be finite places in mm, got {self.at}")
         if not self.sha256:
             msgspec.structs.force_setattr(self, "sha256", _digest(self.path))
+            msgspec.structs.force_setattr(self, "path", str(Path(self.path).resolve()))
 
 
 def ct_volume(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: CtVolume) -> Phantom:
@@ -90,23 +93,34 @@ def _read(params: CtVolume) -> NDArray[np.float32]:
             values = tifffile.imread(params.path)
     except Exception as error:  # whatever a decoder says of a file that is not one
         raise InputError(f"path: {params.path} is no TIFF stack or .npy array: {error}") from None
-    if values.ndim != 3 or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
-        raise InputError(
-            f"path: {params.path} holds {values.dtype} of shape {values.shape}, expected finite numbers [z, y, x]"
-        )
+    if not isinstance(values, np.ndarray) or values.ndim != 3 or not values.size or values.dtype.kind not in "iuf":
+        what = f"{values.dtype} of shape {values.shape}" if isinstance(values, np.ndarray) else "several arrays"
+        raise InputError(f"path: {params.path} holds {what}, expected one array of numbers [z, y, x]")
     slope, intercept = params.rescale
-    return values.astype(np.float32) * np.float32(slope) + np.float32(intercept)
+    with np.errstate(over="ignore", invalid="ignore"):
+        hu = values.astype(np.float32) * np.float32(slope) + np.float32(intercept)
+    if not np.isfinite(hu).all():
+        raise InputError(f"path: {params.path} holds values that are no finite HU under rescale = {params.rescale}")
+    return hu
 
 
 def _resampled(hu: NDArray[np.float32], params: CtVolume, n: Shape, d_voxel: Triple) -> NDArray[np.float32]:
-    """Return HU on the label grid, middle on middle; −1000 outside the volume."""
+    """Return mean HU over the voxels of the label grid, middle on middle; −1000 outside the volume.
+
+    HU are interpolated at as many places in a voxel as it takes that none of the file's is passed over.
+    """
     from scipy import ndimage
 
-    step = np.divide(d_voxel, params.spacing)
-    first: Any = (0.5 - np.divide(n, 2)) * step + np.divide(hu.shape, 2) - 0.5
-    out = np.empty(n, np.float32)
-    ndimage.affine_transform(hu, step, first, output=out, order=1, mode="constant", cval=-1000.0)
-    return out
+    times = np.ceil(np.divide(d_voxel, params.spacing) - 1e-9).astype(int)
+    fine, step = np.multiply(n, times), np.divide(d_voxel, params.spacing) / times
+    first: Any = (0.5 - fine / 2) * step + np.divide(hu.shape, 2) - 0.5
+    out = np.empty(fine, np.float32)
+    ndimage.affine_transform(hu, step, first, output=out, order=1, mode="nearest")
+    for axis, (count_fine, size) in enumerate(zip(fine, hu.shape, strict=True)):
+        at = first[axis] + step[axis] * np.arange(count_fine)  # in the file's voxels, whose middles are whole numbers
+        np.moveaxis(out, axis, 0)[(at < -0.5) | (at > size - 0.5)] = -1000
+    blocks = out.reshape(n[0], times[0], n[1], times[1], n[2], times[2])
+    return blocks.mean((1, 3, 5), dtype=np.float32)
 
 
 def _tissues(hu: NDArray[np.float32], kev: float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
@@ -143,7 +157,8 @@ def _drawn(
     near = (np.abs(z)[:, None, None] <= limit) & (np.hypot(y[:, None], x) <= limit)
     for least in (FROM_HU[-1], FROM_HU[0]):
         if (found := np.flatnonzero((hu >= least) & near)).size:
-            k, j, i = np.unravel_index(of[0].choice(found, of[1]), hu.shape)
+            rng, n = of
+            k, j, i = np.unravel_index(rng.choice(found, n, replace=n > found.size), hu.shape)
             return np.stack([x[i], y[j], z[k]], 1)
     raise InputError(
         f"path: {params.path} has no voxel above {FROM_HU[0]:g} HU within {limit:.4g} mm; is rescale right?"

@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+import shutil
 
 import msgspec
 import numpy as np
@@ -16,7 +17,7 @@ from ctsim.store import list_scans, open_scan
 from ctsim.voxelise import attenuation_volume
 from phantoms.body_volume import TISSUES, CtVolume
 from phantoms.recipes import build_recipe
-from phantoms.scene import parse_suite, scene_id, scene_to_toml
+from phantoms.scene import parse_suite, scene_id, scene_to_toml, stream_id
 
 SPACING = (2.0, 1.5, 1.0)
 
@@ -29,7 +30,7 @@ def head(tmp_path):
     r = np.sqrt(x**2 + y**2 + z**2)
     hu = np.full(r.shape, -1000, np.int16)
     hu[r < 23], hu[r < 19], hu[r < 14] = -100, 900, 35
-    hu[(np.abs(x - 5) < 4) & (np.abs(y) < 5) & (np.abs(z) < 6)] = -700
+    hu[(np.abs(x - 5) < 4) & (np.abs(y + 3) < 5) & (np.abs(z - 4) < 6)] = -700
     tifffile.imwrite(tmp_path / "head.tif", (hu + 1024).astype(np.uint16))
     return hu
 
@@ -70,6 +71,22 @@ def test_the_same_place_is_bone_on_every_grid(head, tmp_path):
         assert labels[n // 2, n // 2, n // 3] == TISSUES.index("soft_tissue")
 
 
+def test_no_voxel_of_the_file_is_cut_off_or_passed_over(tmp_path):
+    noise = np.random.default_rng(1).integers(-100, 100, (12, 20, 24)).astype(np.int16)
+    np.save(tmp_path / "block.npy", noise)
+    given = {"path": str(tmp_path / "block.npy"), "rescale": (1.0, 0.0), "metal": "none"}
+    fine = build_recipe(recipe(tmp_path, **given, spacing=(2.0, 1.0, 1.0), n_voxel=(120,) * 3), 0)
+    z, y, x = (np.flatnonzero(fine.labels.any(axis)) for axis in ((1, 2), (0, 2), (0, 1)))
+    assert [(a[0], a[-1] + 1) for a in (z, y, x)] == [(36, 84), (40, 80), (36, 84)]  # of 0.5 mm
+    # labels of 4 mm, an odd number of them: the inner ones hold blocks of 2 x 4 x 4 whole voxels
+    coarse = build_recipe(recipe(tmp_path, **given, spacing=(2.0, 1.0, 1.0), n_voxel=(15,) * 3), 0)
+    mu = np.array([float(attenuation(name, np.array([70.0]))[0]) for name in ("water", *TISSUES)])
+    inner = (slice(5, 10),) * 3
+    hu = 1000 * (coarse.density[inner] * mu[1:][coarse.labels[inner]] / mu[0] - 1)
+    expected = noise[1:11, :, 2:22].reshape(5, 2, 5, 4, 5, 4).mean((1, 3, 5))
+    np.testing.assert_allclose(hu, expected, atol=1e-3)
+
+
 def test_metal_lies_in_bone_or_where_it_is_said_whatever_the_grid(head, tmp_path):
     drawn = [build_recipe(recipe(tmp_path, n_voxel=(n,) * 3), 5).solids for n in (24, 60)]
     assert drawn[0] == drawn[1] and len(drawn[0]) == 2
@@ -94,6 +111,9 @@ scanner = {{ n_voxel = [16, 16, 16], n_detector = [24, 24], n_views = 4 }}
     tifffile.imwrite(tmp_path / "head.tif", (head + 1000).astype(np.uint16))
     (other,) = parse_suite(text)
     assert scene_id(other) != scene_id(scene)
+    shutil.copy(tmp_path / "head.tif", tmp_path / "copy.tif")
+    (moved,) = parse_suite(text.replace("head.tif", "copy.tif"))
+    assert (scene_id(moved), stream_id(moved)) == (scene_id(other), stream_id(other))
     (stale,) = parse_suite(kept)  # the file has changed since: its scene can be read, not built
     assert scene_id(stale) == scene_id(scene)
     with pytest.raises(InputError, match=r"head\.tif has the SHA-256 .*, the scene was made of"):
@@ -125,6 +145,8 @@ scanner = {{ n_voxel = [16, 16, 16], n_detector = [24, 24], n_views = 4 }}
         ({"rescale": (0.0, 0.0)}, "rescale must be a positive slope"),
         ({"kev": 5.0}, "kev must be within 20 to 200"),
         ({"at": ((0.0, 0.0, 0.0),), "n_inserts": 2}, "n_inserts is 2, but at has 1 places"),
+        ({"at": ((float("nan"), 0.0, 0.0),)}, "at must be finite places in mm"),
+        ({"rescale": (1e38, 0.0)}, "holds values that are no finite HU under rescale"),
         ({"at": ((29.0, 0.0, 0.0),)}, "at: inserts 12 mm long must be centred within 21.6 mm"),
         ({"rescale": (1.0, -9000.0)}, "has no voxel above -900 HU within 21.6 mm; is rescale right?"),
     ],
@@ -137,8 +159,9 @@ def test_what_makes_no_sense_is_one_sentence(head, tmp_path, changes, words):
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (np.zeros((3, 4)), r"holds float64 of shape (3, 4), expected finite numbers [z, y, x]"),
-        (np.full((3, 4, 5), np.nan), "expected finite numbers"),
+        (np.zeros((3, 4)), "holds float64 of shape (3, 4), expected one array of numbers [z, y, x]"),
+        (np.zeros((0, 4, 5)), "expected one array of numbers"),
+        (np.full((3, 4, 5), np.nan), "no finite HU"),
     ],
 )
 def test_a_file_of_something_else_is_refused(tmp_path, data, words):

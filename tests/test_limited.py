@@ -3,6 +3,7 @@
 import atexit
 import os
 import signal
+import subprocess
 import time
 from pathlib import Path
 
@@ -16,6 +17,15 @@ WHOLE = 60.0  # seconds that a process has to start beside other work
 
 def fail(words: str) -> None:
     raise InputError(words)
+
+
+def fail_oddly() -> None:
+    raise Stopped("error", "its arguments are not those of its making")
+
+
+def wait_for_a_child(path: str) -> None:
+    with subprocess.Popen(["sleep", "3600"]) as child:
+        Path(path).write_text(str(child.pid), encoding="utf-8")
 
 
 @pytest.fixture
@@ -67,12 +77,34 @@ def test_a_process_without_a_job_ends_by_itself_and_cleans_up(tmp_path):
     assert (tmp_path / "cleaned").exists()
 
 
+def test_an_exception_that_cannot_be_made_again_is_told_in_words(limited):
+    with pytest.raises(RuntimeError, match="its arguments are not those of its making"):
+        limited.run(fail_oddly)
+
+
+def test_what_a_job_started_ends_with_it(limited, tmp_path):
+    limited.run(os.getpid)
+    limited.seconds = 2.0
+    with pytest.raises(Stopped, match="did not end"):
+        limited.run(wait_for_a_child, str(tmp_path / "pid"))
+    pid = int((tmp_path / "pid").read_text(encoding="utf-8"))
+    for _ in range(100):  # it is the system's to reap now
+        if not Path(f"/proc/{pid}/cmdline").exists() or not Path(f"/proc/{pid}/cmdline").read_bytes():
+            break
+        time.sleep(0.05)
+    else:
+        pytest.fail("the child lives on")
+
+
 def test_ctrl_c_ends_the_job_with_its_process(limited):
     pid = limited.run(os.getpid)
-    signal.signal(signal.SIGALRM, signal.default_int_handler)
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
     signal.setitimer(signal.ITIMER_REAL, 0.3)
-    with pytest.raises(KeyboardInterrupt):
-        limited.run(time.sleep, 3600)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            limited.run(time.sleep, 3600)
+    finally:
+        signal.signal(signal.SIGALRM, before)
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
 

@@ -224,6 +224,8 @@ def test_a_method_that_has_so_many_seconds_is_guessed_to_take_no_more(monkeypatc
     stored = SimpleNamespace(geometry=CIRCLE)
     told, free = (SimpleNamespace(method=find("splat", given), stored=stored) for given in ({"seconds": 9.0}, {}))
     assert schedule.estimated(told) == 9.0 < schedule.estimated(free)
+    wrong = SimpleNamespace(method=find("splat", {"seconds": "soon"}), stored=stored)
+    assert schedule.estimated(wrong) == schedule.estimated(free)  # it is the method that refuses that
 
 
 def test_every_method_of_the_table_has_a_guess_and_others_have_none():
