@@ -108,6 +108,18 @@ def punctual(scan, *, device, seconds=None):
     return good(scan, device=device)
 
 
+CALLS = []
+
+
+def compiling(scan, *, device, seconds=None):
+    """Take three calls until nothing is left to compile, as a method that stops when its seconds are over."""
+    import time
+
+    CALLS.append(seconds)
+    time.sleep(2.5 if len(CALLS) < 3 else 0)
+    return good(scan, device=device)
+
+
 def crash(scan, *, device):
     os._exit(7)
 
@@ -171,6 +183,12 @@ def test_a_method_that_can_be_told_its_seconds_ends_by_itself(tmp_path):
     assert outcome.status == "ok" and outcome.cost.wall > 0.5
     mine = methods.find("test_run:punctual", {"seconds": 0.1})
     assert methods.within(mine, 0.5) == mine and methods.within(methods.find("fdk"), 0.5) == methods.find("fdk")
+
+
+def test_a_warm_up_goes_on_until_nothing_is_left_to_compile(tmp_path):
+    CALLS.clear()
+    seconds = run.warm_up(methods.find("test_run:compiling"), double(tmp_path).scan, "cpu")
+    assert CALLS == [run.WARM] * 3 and seconds > 4 * run.WARM
 
 
 def test_a_rerun_does_only_what_is_missing(tmp_path):
