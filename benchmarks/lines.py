@@ -1,6 +1,7 @@
 """Files of records, one JSON line each, of commands that append as they measure and go on after they were stopped."""
 
 import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol, TypeVar, cast
@@ -68,3 +69,14 @@ def collect(path: Path, others: Sequence[Path], kind: type[R], what: str) -> dic
     path.parent.mkdir(parents=True, exist_ok=True)
     write_synced(path, b"".join(line + b"\n" for line in ordered))
     return counts
+
+
+def take_over(path: Path, others: Sequence[Path], kind: type[R], what: str, *, dry_run: bool) -> None:
+    """Do what --collect asks for and say how many records came from each folder; nothing without folders.
+
+    Raises InputError with --dry-run, which promises to write nothing.
+    """
+    if others and dry_run:
+        raise InputError("--collect writes records, --dry-run writes nothing: expected one of them")
+    for other, count in collect(path, others, kind, what).items() if others else ():
+        sys.stderr.write(f"{other}: {count} records taken over\n")

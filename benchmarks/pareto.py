@@ -70,9 +70,7 @@ def main(argv: list[str]) -> int:
         raise InputError(f"--repeats and --threads must be at least 1, got {given.repeats} and {given.threads}")
     suite = pareto_suite.load(given.suite)
     wanted = _scenes(given, suite)
-    if given.collect:
-        for other, count in lines.collect(given.out / NAME, given.collect, Timed, WHAT).items():
-            sys.stderr.write(f"{other}: {count} records taken over\n")
+    lines.take_over(given.out / NAME, given.collect, Timed, WHAT, dry_run=given.dry_run)
     if given.table or given.collect:
         _report(given.out)
         return 0

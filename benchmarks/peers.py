@@ -65,12 +65,12 @@ def main(argv: list[str]) -> int:
     if given.seconds is not None and not (math.isfinite(given.seconds) and given.seconds > 0):
         raise InputError(f"--seconds must be positive, got {given.seconds}")
     wanted = _wanted(given)
+    if given.collect:
+        _collect(given)
     if given.dry_run:
         sys.stdout.write(_planned(given, wanted))
         return 0
-    if given.collect:
-        _collect(given)
-    elif not given.table:
+    if not given.table and not given.collect:
         given.results.mkdir(parents=True, exist_ok=True)
         _measure(given, wanted)
     return _report(given, wanted)
@@ -85,9 +85,8 @@ def _wanted(given: Arguments) -> list[str]:
 def _collect(given: Arguments) -> None:
     from benchmarks import lines, peer_tables
 
-    path, kind = given.results / NAME, peer_tables.PeerRecord
-    for other, count in lines.collect(path, given.collect, kind, peer_tables.WHAT).items():
-        sys.stderr.write(f"{other}: {count} records taken over\n")
+    kind, what = peer_tables.PeerRecord, peer_tables.WHAT
+    lines.take_over(given.results / NAME, given.collect, kind, what, dry_run=given.dry_run)
 
 
 def _report(given: Arguments, wanted: Sequence[str]) -> int:

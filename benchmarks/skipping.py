@@ -72,10 +72,10 @@ def main(argv: list[str]) -> int:
     wanted = tuple(dict.fromkeys(given.case)) or CASES
     if given.collect:
         _collect(given)
-    elif given.dry_run:
+    if given.dry_run:
         sys.stdout.write(_planned(given, wanted))
         return 0
-    elif not given.table:
+    if not given.table and not given.collect:
         _measure(given, wanted)
     return _report(given, wanted)
 
@@ -83,9 +83,8 @@ def main(argv: list[str]) -> int:
 def _collect(given: Arguments) -> None:
     from benchmarks import lines, skipping_tables
 
-    path, kind = given.results / NAME, skipping_tables.SkipRecord
-    for other, count in lines.collect(path, given.collect, kind, skipping_tables.WHAT).items():
-        sys.stderr.write(f"{other}: {count} records taken over\n")
+    kind, what = skipping_tables.SkipRecord, skipping_tables.WHAT
+    lines.take_over(given.results / NAME, given.collect, kind, what, dry_run=given.dry_run)
 
 
 def _report(given: Arguments, wanted: tuple[Case, ...]) -> int:

@@ -62,16 +62,14 @@ def main(argv: list[str]) -> int:
     given = tyro.cli(Arguments, prog="run-benchmark stress", args=argv)
     if not given.seconds > 0:
         raise InputError(f"--seconds must be positive, got {given.seconds:g}")
-    from benchmarks import stress_records
+    from benchmarks import lines, stress_records
     from benchmarks.stress_cases import FULL, SHORT
 
     side = SHORT if given.short else FULL
     cases = _chosen(catalogue(given.suite, given.method), given.case)
     wanted = [stress_records.identity_of(c, side) for c in cases]
     path = given.results / stress_records.NAME
-    if given.collect and not given.dry_run:
-        for other, count in stress_records.collect(path, given.collect).items():
-            sys.stderr.write(f"{other}: {count} records taken over\n")
+    lines.take_over(path, given.collect, stress_records.StressRecord, stress_records.A_ROW, dry_run=given.dry_run)
     stored = stress_records.read(path)
     found = stress_records.latest(stored, wanted)
     done = set() if given.force else {r.identity for r in found if r.ok}

@@ -65,11 +65,6 @@ def read(path: Path) -> list[StressRecord]:
     return lines.read(path, StressRecord, A_ROW)
 
 
-def collect(path: Path, others: Sequence[Path]) -> dict[Path, int]:
-    """Take over the rows that a stress file lacks (see `lines.collect`)."""
-    return lines.collect(path, others, StressRecord, A_ROW)
-
-
 def latest(records: Sequence[StressRecord], wanted: Sequence[str]) -> list[StressRecord]:
     """Return the last record of each identity, in the order in which they are `wanted`."""
     last = {record.identity: record for record in records}

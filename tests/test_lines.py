@@ -39,6 +39,18 @@ def test_files_of_several_machines_are_one_in_the_order_of_time(tmp_path):
     assert [found.time[11:13] for found in lines.read(path, Row, "a row")] == ["01", "02", "03", "04", "04"]
 
 
+def test_what_was_taken_over_is_said_and_nothing_is_written_on_a_dry_run(tmp_path, capsys):
+    path, there = tmp_path / "rows.jsonl", tmp_path / "there"
+    lines.take_over(path, (), Row, "a row", dry_run=True)
+    there.mkdir()
+    lines.append(there / "rows.jsonl", row(1))
+    with pytest.raises(InputError, match="--collect writes records, --dry-run writes nothing"):
+        lines.take_over(path, (there,), Row, "a row", dry_run=True)
+    assert not path.exists()
+    lines.take_over(path, (there,), Row, "a row", dry_run=False)
+    assert capsys.readouterr().err == f"{there}: 1 records taken over\n"
+
+
 def test_a_folder_without_records_changes_nothing(tmp_path):
     lines.append(tmp_path / "rows.jsonl", row(1))
     before = (tmp_path / "rows.jsonl").read_bytes()

@@ -304,7 +304,9 @@ def test_rows_of_other_machines_are_taken_over_and_shown(command, tmp_path, caps
     here, there = tmp_path / "out", tmp_path / "there"
     here.rename(there)
     capsys.readouterr()
-    assert command("--collect", str(there), "--dry-run") == 0 and not here.exists()
+    with pytest.raises(InputError, match="--dry-run writes nothing"):
+        command("--collect", str(there), "--dry-run")
+    assert not here.exists()
     assert command("--collect", str(there)) == 1 and Here.ran == 3
     assert f"{there}: 3 records taken over" in capsys.readouterr().err
     assert (here / "stress.md").read_bytes() == (there / "stress.md").read_bytes()
