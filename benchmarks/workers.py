@@ -6,6 +6,7 @@ job must be one that can be repeated.
 """
 
 import contextlib
+import gc
 import importlib
 import logging
 import multiprocessing
@@ -235,14 +236,17 @@ class Cluster:
             raise InputError("--scheduler needs the package distributed: pip install 'ctsim[cluster]'") from None
         for name in ("distributed", "distributed.client"):
             logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters is said by our errors
-        self._address = address
+        self._address, reason = address, ""
         try:
             self._client = self._dask.Client(address, timeout=CONNECT)
         except (OSError, ValueError) as error:
             reason = " ".join(str(error).split()) or type(error).__name__
+        if reason:
+            # the client that failed closes itself when it is collected; while another is made that waits for ever
+            gc.collect()
             raise InputError(
                 f"--scheduler {address}: no Dask scheduler answers there, expected tcp://host:port ({reason})"
-            ) from None
+            )
 
     def __enter__(self) -> Self:
         return self

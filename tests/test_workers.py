@@ -1,5 +1,6 @@
 """Several processes and a Dask cluster give what one process gives, also when one of them is killed at work."""
 
+import gc
 import json
 import os
 import signal
@@ -278,6 +279,19 @@ def test_workers_that_cannot_be_had_are_one_sentence(serial, tmp_path, monkeypat
         error = capsys.readouterr().err
         assert said in error and error.count("\n") == 1
     assert not (tmp_path / "data").exists() and not (tmp_path / "results").exists()
+
+
+def test_a_client_that_found_no_scheduler_is_gone_before_the_next():
+    """Collected while another client is made, it would wait for a lock that is held then."""
+    distributed = pytest.importorskip("distributed")
+    gc.disable()
+    try:
+        before = {id(o) for o in gc.get_objects() if type(o) is distributed.Client}
+        with pytest.raises(InputError, match="no Dask scheduler answers there"):
+            Cluster("tcp://127.0.0.1:9")
+        assert {id(o) for o in gc.get_objects() if type(o) is distributed.Client} <= before
+    finally:
+        gc.enable()
 
 
 def test_a_scheduler_that_goes_is_one_sentence(tmp_path):
