@@ -46,3 +46,20 @@ def beaten_by(pairs: Sequence[Pair], k: int) -> tuple[int, float]:
     rivals = [i for i, (_, e) in enumerate(pairs) if e <= error]
     best = min(rivals, key=lambda i: (pairs[i], i != k))
     return best, pairs[best][0] / pairs[k][0]
+
+
+def faster(a: Sequence[float], b: Sequence[float]) -> bool:
+    """Return whether runs of `a` seconds are faster than those of `b` beyond the spread of both.
+
+    The 95 % intervals of their medians do not meet: between order statistics, whatever the distribution is; of less
+    than six runs the interval is their range.
+    """
+    return _interval(a)[1] < _interval(b)[0]
+
+
+def _interval(runs: Sequence[float]) -> Pair:
+    from scipy.stats import binom
+
+    at = max(int(binom.ppf(0.025, len(runs), 0.5)) - 1, 0)
+    ordered = sorted(runs)
+    return ordered[at], ordered[-1 - at]

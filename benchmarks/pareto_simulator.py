@@ -85,8 +85,8 @@ def choices(asked: Choices) -> list[Choice]:
         for grid in _different(asked.grids, asked.side)
         for default in (grid == USUAL and not metal,)
     ]
-    level = Scatter().level
-    return found + [Choice(curve=SCATTER, label=f"level {k}", level=k, default=k == level) for k in asked.levels]
+    # scatter is the scanner's to have: here it has, and what has it is simulated with the highest level
+    return found + [Choice(curve=SCATTER, label=f"level {k}", level=k, default=k == HIGHEST) for k in asked.levels]
 
 
 def _short(tolerance: float) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from benchmarks.pareto_front import beaten_by, front
+from benchmarks.pareto_front import beaten_by, faster, front
 from benchmarks.pareto_records import (
     ERROR,
     NEAR,
@@ -101,27 +101,33 @@ def _front(group: Sequence[Point]) -> Iterator[str]:
 
 def _defaults(group: Sequence[Point]) -> Iterator[str]:
     """Yield a line for every default: on the front, or what beats it, in an error alone and in all at once."""
-    keys = LOWER[group[0].setting.part]
-    for k, p in enumerate(group):
+    part = group[0].setting.part
+    keys = LOWER[part]
+    for p in group:
         if p.default:
-            better = [q for q in group if q is not p and _beats(q, p, keys)]
-            joint = f"beaten by {_short(better[0])}" if better else "beaten by none"
-            yield f"- Default {_short(p)}: {_beaten(group, k, keys[0])}; in all errors at once {joint}."
+            alone, joint = (_verdict(group, p, of) for of in (keys[:1], keys))
+            yield f"- Default {_short(p)}: in {HEADS[part][keys[0]]} {alone}; in all errors at once {joint}."
 
 
-def _beaten(group: Sequence[Point], k: int, key: str) -> str:
-    name = HEADS[group[k].setting.part][key]
-    pairs = _pairs(group, key)
-    if k in front(pairs):
-        return f"on the front in {name}"
-    best, share = beaten_by(pairs, k)
-    return f"off the front in {name} ({_short(group[best])} is no worse in {share:.2f} of the time)"
+def _verdict(group: Sequence[Point], p: Point, keys: Sequence[str]) -> str:
+    better = [q for q in group if q is not p and _beats(q, p, keys)]
+    if not better:
+        return "on the front"
+    clear = [q for q in better if _clearly(q, p, keys)]
+    best = min(clear or better, key=lambda q: q.pair)
+    where = "off the front" if clear else "on the front within the spread of the rounds"
+    return f"{where} ({_short(best)} is no worse in {best.pair[0] / p.pair[0]:.2f} of the time)"
 
 
 def _beats(q: Point, p: Point, keys: Sequence[str]) -> bool:
     """Whether `q` is no slower than `p` and no worse in any error, and better in one of these."""
     pairs = [(q.pair[0], p.pair[0]), *((q.values[key], p.values[key]) for key in keys)]
     return all(a <= b for a, b in pairs) and any(a < b for a, b in pairs)
+
+
+def _clearly(q: Point, p: Point, keys: Sequence[str]) -> bool:
+    """Whether `q`, which beats `p`, is faster beyond the spread of their rounds, or has an error that is far less."""
+    return faster(q.seconds, p.seconds) or any(q.values[key] * (1 + NEAR) < p.values[key] for key in keys)
 
 
 def _curves(group: Sequence[Point]) -> Iterator[str]:

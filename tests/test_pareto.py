@@ -34,7 +34,7 @@ from benchmarks import (
 from benchmarks.host import host
 from benchmarks.limited import Limited
 from benchmarks.methods import TABLE
-from benchmarks.pareto_front import beaten_by, front, knee
+from benchmarks.pareto_front import beaten_by, faster, front, knee
 from benchmarks.pareto_records import (
     Mark,
     Setting,
@@ -75,6 +75,16 @@ def test_what_beats_a_point_is_the_fastest_that_is_no_worse(pairs):
         assert pairs[best][0] == min(s for s, e in pairs if e <= error)
         assert share == pairs[best][0] / seconds
         assert (pairs[best] == pairs[k]) == (k in front(pairs))
+
+
+def test_runs_are_faster_where_the_intervals_of_their_medians_do_not_meet():
+    # of fifteen runs the interval lies between the 4th and the 12th: P(B(15, ½) ≤ 3) = 576/2¹⁵ = 0.018, ≤ 4: 0.059
+    base = [float(k) for k in range(1, 16)]
+    assert not faster(base, [12.0] * 15) and faster(base, [12.1] * 15)
+    assert not faster([4.0] * 15, base) and faster([3.9] * 15, base)
+    # of five it is their range, and one run has no spread
+    assert not faster([1, 1, 1, 1, 2], [2, 3, 3, 3, 3]) and faster([1, 1, 1, 1, 2], [2.1, 3, 3, 3, 3])
+    assert faster([1], [2]) and not faster([1], [1])
 
 
 def curve(x, y):
@@ -364,13 +374,14 @@ def test_methods_end_to_end(tmp_path, monkeypatch, capsys):
     assert pareto.main([*common, *chosen]) == 0
     text = capsys.readouterr().out
     assert "### methods, smallest: counts only" in text and "### methods, smallest: metal mask" in text
-    assert "| fdk | defaults (default) |" in text
     first = (out / "pareto.jsonl").read_bytes()
     assert len(first.splitlines()) == 6
     assert left() == {"fdk": 0, "cgls": 0, "limar": 0}
     assert pareto.main([*common, *chosen]) == 0 and pareto.main([*common, "--table"]) == 0
     assert (out / "pareto.jsonl").read_bytes() == first
-    assert (out / "pareto.md").read_text().count("| cgls | 15 iterations (default) |") >= 1
+    every = (out / "pareto.md").read_text(encoding="utf-8").split("every point", 1)[1]
+    for default in ("fdk | defaults", "cgls | 15 iterations", "limar | defaults"):
+        assert every.count(f"| {default} (default) |") == 1
     assert (out / "pareto.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -454,7 +465,7 @@ def test_scatter_is_judged_with_scatter(bench):
 
 def test_simulator_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(pareto, "use_threads", lambda threads: None)
-    choices = "tolerances = [1e-4]\nsubrays = [4]\ngrids = [1.5]\nlevels = [0]"
+    choices = "tolerances = [1e-4]\nsubrays = [4]\ngrids = [1.5]\nlevels = [0, 1]"
     path = suite_file(tmp_path, f"[simulator]\nside = 16\nviews = 2\n{choices}")
     assert pareto.main([str(tmp_path), "--suite", str(path), "--part", "simulator", "--repeats", "1"]) == 0
     text = capsys.readouterr().out
@@ -462,28 +473,47 @@ def test_simulator_end_to_end(tmp_path, monkeypatch, capsys):
     # each default has its verdict in each error: of solids, of voxels, of scatter
     verdicts = [line for line in text.splitlines() if line.startswith("- Default ")]
     assert len(verdicts) == 3
-    assert all(line.count("the front in relative RMS") == line.count("in all errors at once") == 1 for line in verdicts)
+    assert all(line.count("the front") == 2 for line in verdicts)
+    # a scanner with scatter is simulated with it: no other level is as good
+    assert any(line.startswith("- Default scatter, level 1") and line.count("on the front") == 2 for line in verdicts)
     assert "body in voxels, metal exact, 24³ labels" in text
 
 
-def test_verdicts_name_what_beats_a_default():
-    def row(label, seconds, rms, worst):
-        mark = Mark(label=label, seconds=seconds, default=True, values={"rms": rms, "worst": worst, "off_edges": 1.0})
-        return msgspec.structs.replace(timed(setting(label, part="simulator", curve="x")), marks=(mark,))
+def verdicts(*rows):
+    """The verdicts on defaults whose rows are (label, seconds of the rounds, rms, worst)."""
+    found = []
+    for label, rounds, rms, worst in rows:
+        values = {"rms": rms, "worst": worst, "off_edges": 1.0}
+        for seconds in rounds:
+            mark = Mark(label=label, seconds=seconds, default=True, values=values)
+            of = timed(setting(label, part="simulator", curve="x"))
+            found.append(msgspec.structs.replace(of, marks=(mark,)))
+    assert pareto_figure.draw(points(found)).axes
+    lines = [line for line in pareto_table.summary(found).splitlines() if line.startswith("- Default")]
+    return [re.fullmatch("- Default x, .: in relative RMS of P (.*); in all errors at once (.*).", s) for s in lines]
 
+
+def test_verdicts_name_what_beats_a_default():
     # e is a again; b is as good as a but slower; c is better than all; d is beaten in rms alone
-    of = [row("a", 1.0, 0.5, 0.5), row("b", 2.0, 0.5, 0.5), row("c", 4.0, 0.1, 0.4), row("d", 5.0, 0.2, 0.3)]
-    of.append(row("e", 1.0, 0.5, 0.5))
-    lines = [line for line in pareto_table.summary(of).splitlines() if line.startswith("- Default")]
-    name = "the front in relative RMS of P"
-    assert lines == [
-        f"- Default x, a: on {name}; in all errors at once beaten by none.",
-        f"- Default x, b: off {name} (x, a is no worse in 0.50 of the time); in all errors at once beaten by x, a.",
-        f"- Default x, c: on {name}; in all errors at once beaten by none.",
-        f"- Default x, d: off {name} (x, c is no worse in 0.80 of the time); in all errors at once beaten by none.",
-        f"- Default x, e: on {name}; in all errors at once beaten by none.",
-    ]
-    assert pareto_figure.draw(points(of)).axes
+    of = [("a", [1], 0.5, 0.5), ("b", [2], 0.5, 0.5), ("c", [4], 0.1, 0.4), ("d", [5], 0.2, 0.3), ("e", [1], 0.5, 0.5)]
+    on = "on the front"
+    by_a, by_c = (f"off {on[3:]} (x, {k} is no worse in {n} of the time)" for k, n in (("a", "0.50"), ("c", "0.80")))
+    assert [found.groups() for found in verdicts(*of)] == [(on, on), (by_a, by_a), (on, on), (by_c, on), (on, on)]
+
+
+def test_a_default_is_off_the_front_only_beyond_the_spread_of_its_rounds():
+    usual = ("b", [1.0, 1.02, 1.04, 1.06, 1.08], 0.1, 0.5)
+
+    def verdict(rounds, rms):
+        return verdicts(usual, ("a", rounds, rms, 0.5))[0].group(1)
+
+    within = "on the front within the spread of the rounds (x, a is no worse in"
+    assert verdict([0.9, 0.98, 1.0, 1.01, 1.05], 0.1).startswith(within)
+    assert verdict([0.9, 0.95, 0.97, 0.98, 0.99], 0.1).startswith("off the front (x, a is no worse in")
+    # an error that is far less needs no time to be saved
+    assert verdict([0.9, 0.98, 1.0, 1.01, 1.05], 0.096).startswith(within)
+    assert verdict([0.9, 0.98, 1.0, 1.01, 1.05], 0.095).startswith("off the front")
+    assert verdict([0.9, 0.95, 0.97, 0.98, 0.99], 0.11) == "on the front"
 
 
 # --- the command -------------------------------------------------------------------------------------
