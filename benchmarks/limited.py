@@ -16,6 +16,12 @@ from benchmarks.isolate import how_it_ended
 from ctsim.errors import InputError
 
 
+def refuse_unless_positive(seconds: float | None) -> None:
+    """Raise InputError for a time limit (--seconds) that is none; None stands for no limit."""
+    if seconds is not None and not (math.isfinite(seconds) and seconds > 0):
+        raise InputError(f"--seconds must be positive, got {seconds:g}")
+
+
 class Stopped(RuntimeError):
     """A job that did not end within its limit or whose process died: `status` as of a record, and the sentence."""
 
@@ -28,8 +34,7 @@ class Limited:
     """Does jobs in a process of its own, each within `seconds`, None for no limit; `environment` is added to ours."""
 
     def __init__(self, seconds: float | None, environment: Mapping[str, str] | None = None) -> None:
-        if seconds is not None and not (math.isfinite(seconds) and seconds > 0):
-            raise InputError(f"seconds must be positive, got {seconds}")
+        refuse_unless_positive(seconds)
         self.seconds = seconds
         self._environment = environment or {}
         self._worker: workers.Worker | None = None

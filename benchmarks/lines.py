@@ -1,6 +1,5 @@
 """Files of records, one JSON line each, of commands that append as they measure and go on after they were stopped."""
 
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import Protocol, TypeVar, cast
 
 import msgspec
 
-from ctsim.durable import write_synced
+from ctsim.durable import append_synced, cut_torn, locked, write_synced
 from ctsim.errors import InputError
 
 R = TypeVar("R", bound=msgspec.Struct)
@@ -20,12 +19,9 @@ class _Dated(Protocol):
 
 def append(path: Path, *records: msgspec.Struct) -> None:
     """Append records in one write, forced to the disk; a line whose writing was interrupted is cut off first."""
-    if path.exists() and (whole := _whole(data := path.read_bytes())) < len(data):
-        os.truncate(path, whole)
-    with path.open("ab") as file:
-        file.write(b"".join(msgspec.json.encode(record) + b"\n" for record in records))
-        file.flush()
-        os.fsync(file.fileno())
+    with locked(path) as handle:
+        cut_torn(handle)
+        append_synced(handle, b"".join(msgspec.json.encode(record) + b"\n" for record in records))
 
 
 def _whole(data: bytes) -> int:
@@ -56,18 +52,20 @@ def collect(path: Path, others: Sequence[Path], kind: type[R], what: str) -> dic
     The file is replaced whole, all records in the order of their `time`, so that the newest is the last.
     Raises InputError for a folder without records.
     """
-    held = {msgspec.json.encode(record): record for record in read(path, kind, what)}
-    counts = {}
-    for other in others:
-        found = read(other / path.name, kind, what)
+    brought = {other: read(other / path.name, kind, what) for other in others}
+    for other, found in brought.items():
         if not found:
             raise InputError(f"--collect {other}: there are no records, expected a folder with {path.name}")
-        lacked = {line: record for record in found if (line := msgspec.json.encode(record)) not in held}
-        held |= lacked
-        counts[other] = len(lacked)
-    ordered = sorted(held, key=lambda line: cast(_Dated, held[line]).time)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_synced(path, b"".join(line + b"\n" for line in ordered))
+    counts = {}
+    with locked(path):  # what another command appends meanwhile would be lost
+        held = {msgspec.json.encode(record): record for record in read(path, kind, what)}
+        for other, found in brought.items():
+            lacked = {line: record for record in found if (line := msgspec.json.encode(record)) not in held}
+            held |= lacked
+            counts[other] = len(lacked)
+        ordered = sorted(held, key=lambda line: cast(_Dated, held[line]).time)
+        write_synced(path, b"".join(line + b"\n" for line in ordered))
     return counts
 
 

@@ -65,9 +65,12 @@ class Arguments:
 
 def main(argv: list[str]) -> int:
     """Run the command; 0 if every setting was measured or skipped with a reason, 1 if one failed."""
+    from benchmarks.limited import refuse_unless_positive
+
     given = tyro.cli(Arguments, prog="run-benchmark pareto", args=argv)
     if given.repeats < 1 or given.threads < 1:
         raise InputError(f"--repeats and --threads must be at least 1, got {given.repeats} and {given.threads}")
+    refuse_unless_positive(given.seconds)
     suite = pareto_suite.load(given.suite)
     wanted = _scenes(given, suite)
     lines.take_over(given.out / NAME, given.collect, Timed, WHAT, dry_run=given.dry_run)

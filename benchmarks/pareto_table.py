@@ -196,5 +196,6 @@ def _provenance(found: Sequence[Timed]) -> str:
     threads = f"{h.threads} thread{'s' * (h.threads > 1)}"
     return (
         f"{last.time}, commit {last.commit[:12]}{changed}, {h.cpu}, {h.cores} cores, {threads}, Python {h.python}, "
-        f"numba {h.versions.get('numba', '?')}. Seconds are medians of {of} interleaved runs."
+        f"numba {h.versions.get('numba', '?')}. Seconds are "
+        + (f"medians of {of} interleaved runs." if counts[-1:] > [1] else "those of one run.")
     )

@@ -7,7 +7,6 @@ recorded on this machine, beside the same versions of the peers, is not measured
 
 import contextlib
 import dataclasses
-import math
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -59,11 +58,12 @@ class Arguments:
 
 def main(argv: list[str]) -> int:
     """Run the command; 0 if every case was measured, 1 if one failed."""
+    from benchmarks.limited import refuse_unless_positive
+
     given = tyro.cli(Arguments, prog="run-benchmark peers", args=argv)
     if given.repeats < 1 or given.threads < 1:
         raise InputError(f"--repeats and --threads must be at least 1, got {given.repeats} and {given.threads}")
-    if given.seconds is not None and not (math.isfinite(given.seconds) and given.seconds > 0):
-        raise InputError(f"--seconds must be positive, got {given.seconds}")
+    refuse_unless_positive(given.seconds)
     wanted = _wanted(given)
     if given.collect:
         _collect(given)

@@ -5,11 +5,9 @@ SHA-256 over them. Of a run that was recorded several times the last record coun
 to the command that started them, which alone appends; the lock on the file is for two commands on one folder.
 """
 
-import contextlib
-import fcntl
 import hashlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,7 @@ import msgspec
 from benchmarks.host import Host
 from benchmarks.methods import TABLE
 from benchmarks.protocol import VERSION, Score
+from ctsim.durable import append_synced, locked
 from ctsim.errors import InputError
 
 NAME = "records.jsonl"
@@ -105,26 +104,10 @@ def append(path: Path, record: Record) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with locked(path) as descriptor:
         _mend(path, descriptor)  # another command may have been killed while it wrote
-        size = os.fstat(descriptor).st_size
         try:
-            written = 0
-            while written < len(line):
-                written += os.write(descriptor, line[written:])
-            os.fsync(descriptor)
+            append_synced(descriptor, line)
         except OSError as error:
-            os.ftruncate(descriptor, size)
             raise OSError(error.errno, error.strerror, str(path)) from error
-
-
-@contextlib.contextmanager
-def locked(path: Path) -> Iterator[int]:
-    """Open a records file for appending, made if it is not there, alone among processes; yield its descriptor."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield descriptor
-    finally:
-        os.close(descriptor)
 
 
 def read(path: Path) -> tuple[list[Record], Torn | None]:

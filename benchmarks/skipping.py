@@ -66,9 +66,12 @@ class Arguments:
 
 def main(argv: list[str]) -> int:
     """Run the command; 0 if every difference is within what is stated, 1 if one is not or was not measured."""
+    from benchmarks.limited import refuse_unless_positive
+
     given = tyro.cli(Arguments, prog="run-benchmark skipping", args=argv)
     if given.repeats < 1:
         raise InputError(f"--repeats must be at least 1, got {given.repeats}")
+    refuse_unless_positive(given.seconds)
     wanted = tuple(dict.fromkeys(given.case)) or CASES
     if given.collect:
         _collect(given)

@@ -59,9 +59,10 @@ class Arguments:
 
 def main(argv: list[str]) -> int:
     """Run the command; 0 if every row is as expected, 1 if one is not."""
+    from benchmarks.limited import refuse_unless_positive
+
     given = tyro.cli(Arguments, prog="run-benchmark stress", args=argv)
-    if not given.seconds > 0:
-        raise InputError(f"--seconds must be positive, got {given.seconds:g}")
+    refuse_unless_positive(given.seconds)
     from benchmarks import lines, stress_records
     from benchmarks.stress_cases import FULL, SHORT
 

@@ -1,11 +1,13 @@
 """Files that survive: locks between processes, flushing, and putting a finished folder in its place."""
 
+import contextlib
 import ctypes
 import errno
 import fcntl
 import os
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 from ctsim.errors import InputError
@@ -47,6 +49,45 @@ def unlock(path: Path, handle: int) -> None:
     """Remove the lock file while it is still held, then let go."""
     path.unlink(missing_ok=True)
     os.close(handle)
+
+
+@contextlib.contextmanager
+def locked(path: Path) -> Iterator[int]:
+    """Open a file of lines for appending, made if it is not there, alone among processes; yield its descriptor.
+
+    Whoever replaces the file whole holds it locked, too.
+    """
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            if os.fstat(handle).st_ino == path.stat().st_ino:  # else it was replaced between our open and our lock
+                yield handle
+                return
+        finally:
+            os.close(handle)
+
+
+def cut_torn(handle: int) -> None:
+    """Cut off a last line whose writing was interrupted, of a file that is `locked`."""
+    size = os.fstat(handle).st_size
+    if size and os.pread(handle, 1, size - 1) != b"\n":
+        os.ftruncate(handle, os.pread(handle, size, 0).rfind(b"\n") + 1)
+
+
+def append_synced(handle: int, data: bytes) -> None:
+    """Append to a file that is `locked` and flush it to the disk.
+
+    Raises OSError where it cannot be written; the file is then as it was before.
+    """
+    size, written = os.fstat(handle).st_size, 0
+    try:
+        while written < len(data):
+            written += os.write(handle, data[written:])
+        os.fsync(handle)
+    except OSError:
+        os.ftruncate(handle, size)
+        raise
 
 
 def sync(path: Path) -> None:

@@ -4,17 +4,14 @@ Every scene folder has a `manifest.json` with the size and SHA-256 of each of it
 has an `index.jsonl` with one line per finished scene (the last line of a name counts).
 """
 
-import contextlib
-import fcntl
 import hashlib
 import math
-import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import msgspec
 
-from ctsim.durable import write_synced
+from ctsim.durable import append_synced, cut_torn, locked, write_synced
 from ctsim.errors import InputError
 
 MANIFEST = "manifest.json"
@@ -119,16 +116,10 @@ def read_index(data_dir: Path) -> dict[str, IndexLine]:
 def append_index(data_dir: Path, entry: IndexLine) -> None:
     """Append a line to the index unless it is already the last word on that name."""
     line = msgspec.json.encode(entry) + b"\n"
-    with _locked_index(data_dir / INDEX) as handle:
-        size = os.fstat(handle).st_size
-        if size:
-            if os.pread(handle, 1, size - 1) != b"\n":
-                whole = os.pread(handle, size, 0)
-                os.ftruncate(handle, whole.rfind(b"\n") + 1)
-            if read_index(data_dir).get(entry.name) == entry:
-                return
-        os.write(handle, line)
-        os.fsync(handle)
+    with locked(data_dir / INDEX) as handle:
+        cut_torn(handle)
+        if read_index(data_dir).get(entry.name) != entry:
+            append_synced(handle, line)
 
 
 def arrange_index(data_dir: Path, names: Sequence[str]) -> None:
@@ -136,26 +127,12 @@ def arrange_index(data_dir: Path, names: Sequence[str]) -> None:
 
     Tables show scenes in the index's order, which so does not depend on which worker was faster.
     """
-    with _locked_index(data_dir / INDEX):
+    with locked(data_dir / INDEX):
         index = read_index(data_dir)
         inner = iter([name for name in names if name in index])
         ordered = [next(inner) if name in names else name for name in index]
         if ordered != list(index):
             write_synced(data_dir / INDEX, b"".join(msgspec.json.encode(index[name]) + b"\n" for name in ordered))
-
-
-@contextlib.contextmanager
-def _locked_index(path: Path) -> Iterator[int]:
-    """Open the index for appending, alone among processes; yield its handle."""
-    while True:
-        handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX)
-            if os.fstat(handle).st_ino == path.stat().st_ino:  # else it was replaced between our open and our lock
-                yield handle
-                return
-        finally:
-            os.close(handle)
 
 
 def list_scans(data_dir: str | Path) -> tuple[Path, ...]:

@@ -1,5 +1,10 @@
 """Files of records that commands append to, and what comes of several of them."""
 
+import errno
+import multiprocessing
+import os
+from pathlib import Path
+
 import msgspec
 import pytest
 
@@ -37,6 +42,47 @@ def test_files_of_several_machines_are_one_in_the_order_of_time(tmp_path):
     lines.append(path, row(3))
     assert lines.collect(path, (there,), Row, "a row") == {there: 0}
     assert [found.time[11:13] for found in lines.read(path, Row, "a row")] == ["01", "02", "03", "04", "04"]
+
+
+def keep_appending(path: Path, who: int) -> None:
+    """What another process does meanwhile."""
+    for k in range(APPENDED):
+        lines.append(path, row(who, k))
+
+
+APPENDED = 60
+
+
+def test_no_record_is_lost_where_processes_append_and_collect_at_once(tmp_path):
+    path, there = tmp_path / "rows.jsonl", tmp_path / "there"
+    there.mkdir()
+    lines.append(there / "rows.jsonl", row(0))
+    spawn = multiprocessing.get_context("spawn")
+    others = [spawn.Process(target=keep_appending, args=(path, who)) for who in (1, 2)]
+    for other in others:
+        other.start()
+    while any(other.is_alive() for other in others):
+        lines.collect(path, (there,), Row, "a row")
+    lines.collect(path, (there,), Row, "a row")
+    assert [other.exitcode for other in others] == [0, 0]
+    expected = [row(0), *(row(who, k) for who in (1, 2) for k in range(APPENDED))]
+    assert sorted(lines.read(path, Row, "a row"), key=lambda r: (r.time, r.value["error"])) == expected
+
+
+def test_a_full_disk_leaves_the_file_as_it_was(tmp_path, monkeypatch):
+    path = tmp_path / "rows.jsonl"
+    lines.append(path, row(1))
+    write, before = os.write, path.read_bytes()
+
+    def full(handle, data):
+        if len(data) < 20:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(handle, data[: len(data) // 2])
+
+    monkeypatch.setattr(os, "write", full)
+    with pytest.raises(OSError, match="No space left"):
+        lines.append(path, row(2))
+    assert path.read_bytes() == before
 
 
 def test_what_was_taken_over_is_said_and_nothing_is_written_on_a_dry_run(tmp_path, capsys):
