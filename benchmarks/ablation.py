@@ -65,7 +65,10 @@ class Variant:
 
 def main(arguments: list[str]) -> int:
     """Run the command; 0 if every run ended well, 1 if one failed."""
+    from benchmarks.limited import refuse_unless_positive
+
     given = tyro.cli(Arguments, prog="run-benchmark ablation", args=arguments)
+    refuse_unless_positive(given.seconds)
     listed = variants(given.table)
     if given.dry_run:
         sys.stdout.write(estimate(listed, given.data, given.results))

@@ -76,6 +76,8 @@ def main(arguments: list[str]) -> int:
     given = tyro.cli(Arguments, prog="run-benchmark", args=arguments)
     from benchmarks import records, tables
 
+    if given.collect and given.dry_run:
+        raise InputError("--collect writes records, --dry-run writes nothing: expected one of them")
     for folder in (given.results, *given.collect):
         for rest in records.read_all(folder)[1]:
             log.warning("%s", rest)

@@ -21,7 +21,7 @@ def append(path: Path, *records: msgspec.Struct) -> None:
     """Append records in one write, forced to the disk; a line whose writing was interrupted is cut off first."""
     with locked(path) as handle:
         cut_torn(handle)
-        append_synced(handle, b"".join(msgspec.json.encode(record) + b"\n" for record in records))
+        append_synced(path, handle, b"".join(msgspec.json.encode(record) + b"\n" for record in records))
 
 
 def _whole(data: bytes) -> int:

@@ -34,7 +34,8 @@ from reconstruct.watch import watch
 class Effort:
     """One run to time: a method with its parameters, what the run and its curve are called.
 
-    A run that is `watched` has a mark at each stop, if the method shows its volume.
+    A run that is `watched` has a mark at each stop, if the method shows its volume. A run by `default` passes, if it
+    is watched, what the method does when it is told nothing.
     """
 
     method: Method
@@ -57,7 +58,8 @@ def efforts(suite: Suite, name: str) -> list[Effort]:
     usual, listed = find(name), suite.listed(name) or Listed(name=name)
     main = _by_value(usual, listed) if listed.parameter else [_whole(usual, listed.times, suite.iterations.times)]
     return main + [
-        Effort(method=find(name, run.set), label=run.label, curve=run.curve, watched=True) for run in listed.run
+        Effort(method=find(name, run.set), label=run.label, curve=run.curve, default=False, watched=True)
+        for run in listed.run
     ]
 
 
@@ -146,7 +148,7 @@ class Bench:
                 label=f"{k} iteration{'s' * (k > 1)}",
                 seconds=seconds + around,
                 values=values,
-                default=k == min(usual or marks.count, marks.count),
+                default=effort.default and k == min(usual or marks.count, marks.count),
             )
             for k, seconds, values in passed
         )

@@ -20,7 +20,7 @@ from benchmarks.pareto_front import Pair, knee
 from benchmarks.records import OK
 
 NAME, WHAT = "pareto.jsonl", "a record of run-benchmark pareto"
-VERSION = 1
+VERSION = 2
 """Part of every identity: a change of what is measured counts it up."""
 
 Part = Literal["simulator", "methods"]

@@ -33,7 +33,7 @@ from phantoms.scanners import preset
 
 SCENE = "rods"
 CHECKED = 2  # views that are held against the reference
-USUAL = 1.5  # label voxels for a pixel in the bundled suites
+USUAL = 1.0  # label voxels for a pixel, which the bundled suites have 0.5 to 1.2 of
 FINER, FINEST = 16, 64
 """Of the reference: finer pixels along a side of a pixel, and rays in each."""
 CALM = 1e-4  # |ΔP| of the central ray alone, below which a pixel has no edge
@@ -85,7 +85,7 @@ def choices(asked: Choices) -> list[Choice]:
         for grid in _different(asked.grids, asked.side)
         for default in (grid == USUAL and not metal,)
     ]
-    # scatter is the scanner's to have: here it has, and what has it is simulated with the highest level
+    # whether there is scatter is the scanner's matter: here there is, and then the highest level is what is computed
     return found + [Choice(curve=SCATTER, label=f"level {k}", level=k, default=k == HIGHEST) for k in asked.levels]
 
 

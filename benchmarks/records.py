@@ -104,10 +104,7 @@ def append(path: Path, record: Record) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with locked(path) as descriptor:
         _mend(path, descriptor)  # another command may have been killed while it wrote
-        try:
-            append_synced(descriptor, line)
-        except OSError as error:
-            raise OSError(error.errno, error.strerror, str(path)) from error
+        append_synced(path, descriptor, line)
 
 
 def read(path: Path) -> tuple[list[Record], Torn | None]:

@@ -75,19 +75,19 @@ def cut_torn(handle: int) -> None:
         os.ftruncate(handle, os.pread(handle, size, 0).rfind(b"\n") + 1)
 
 
-def append_synced(handle: int, data: bytes) -> None:
-    """Append to a file that is `locked` and flush it to the disk.
+def append_synced(path: Path, handle: int, data: bytes) -> None:
+    """Append to the file `path`, which is `locked`, and flush it to the disk.
 
-    Raises OSError where it cannot be written; the file is then as it was before.
+    Raises OSError with its name where it cannot be written; the file is then as it was before.
     """
     size, written = os.fstat(handle).st_size, 0
     try:
         while written < len(data):
             written += os.write(handle, data[written:])
         os.fsync(handle)
-    except OSError:
+    except OSError as error:
         os.ftruncate(handle, size)
-        raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def sync(path: Path) -> None:
@@ -107,13 +107,21 @@ def sync_tree(folder: Path) -> None:
 
 
 def write_synced(path: Path, data: bytes) -> None:
-    """Replace a small file whole: after a crash it holds the old or the new bytes."""
+    """Replace a small file whole: after a crash it holds the old or the new bytes.
+
+    Raises OSError with its name where it cannot be written, and leaves nothing beside it.
+    """
     aside = path.with_name(path.name + ".new")
-    with aside.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    aside.replace(path)
+    try:
+        with aside.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        aside.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            aside.unlink()
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def put_in_place(new: Path, final: Path) -> None:

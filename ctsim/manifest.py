@@ -119,7 +119,7 @@ def append_index(data_dir: Path, entry: IndexLine) -> None:
     with locked(data_dir / INDEX) as handle:
         cut_torn(handle)
         if read_index(data_dir).get(entry.name) != entry:
-            append_synced(handle, line)
+            append_synced(data_dir / INDEX, handle, line)
 
 
 def arrange_index(data_dir: Path, names: Sequence[str]) -> None:

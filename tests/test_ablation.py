@@ -162,7 +162,14 @@ def test_a_time_limit_ends_a_run_with_a_record(command, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "arguments", [("--table", "3"), ("--table", "3", "--dry-run"), ("--seconds", "-1"), ("--workers", "0")]
+    "arguments",
+    [
+        ("--table", "3"),
+        ("--table", "3", "--dry-run"),
+        ("--seconds", "-1"),
+        ("--seconds", "-1", "--dry-run"),
+        ("--workers", "0"),
+    ],
 )
 def test_what_makes_no_sense_is_one_sentence(command, arguments):
     code, shown = command(*arguments)

@@ -163,7 +163,11 @@ def test_results_of_several_machines_are_collected_once(tmp_path):
 def test_collecting_renders_the_tables(tmp_path, capsys):
 
     records.append(tmp_path / "there" / records.NAME, record("fdk"))
-    assert cli_run.main([str(tmp_path / "data"), str(tmp_path / "here"), "--collect", str(tmp_path / "there")]) == 0
+    collect = [str(tmp_path / "data"), str(tmp_path / "here"), "--collect", str(tmp_path / "there")]
+    with pytest.raises(InputError, match="--collect writes records, --dry-run writes nothing"):
+        cli_run.main([*collect, "--dry-run"])
+    assert not (tmp_path / "here").exists()
+    assert cli_run.main(collect) == 0
     assert "| counts only | fdk |" in capsys.readouterr().out and (tmp_path / "here/table.csv").exists()
 
 
