@@ -332,7 +332,7 @@ def test_scatter_is_judged_with_scatter(bench):
 
 def test_simulator_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(pareto, "use_threads", lambda threads: None)
-    choices = "tolerances = [1e-4]\nsubrays = [4]\ngrids = [1.5]\nlevels = [0, 1]"
+    choices = "tolerances = [1e-4]\nsubrays = [4]\ngrids = [1.0]\nlevels = [0, 1]"
     path = suite_file(tmp_path, f"[simulator]\nside = 16\nviews = 2\n{choices}")
     assert pareto.main([str(tmp_path), "--suite", str(path), "--part", "simulator", "--repeats", "1"]) == 0
     text = capsys.readouterr().out
@@ -343,7 +343,7 @@ def test_simulator_end_to_end(tmp_path, monkeypatch, capsys):
     assert all(line.count("the front") == 2 for line in verdicts)
     # a scanner with scatter is simulated with it: no other level is as good
     assert any(line.startswith("- Default scatter, level 1") and line.count("on the front") == 2 for line in verdicts)
-    assert "body in voxels, metal exact, 24³ labels" in text
+    assert "body in voxels, metal exact, 16³ labels" in text
 
 
 # --- the command -------------------------------------------------------------------------------------
