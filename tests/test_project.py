@@ -192,7 +192,8 @@ def test_the_exponential_is_accurate_to_its_bound():
     each(x, out)
     want = np.exp(-np.minimum(x.astype(np.float64), 80))
     assert np.all(np.abs(out / want - 1) < 4e-7 * np.maximum(1, x / 4))
-    assert out[0] == 1.0 and out[-1] > 0
+    # denormals, which slow a kernel many times, cannot arise
+    assert out[0] == 1.0 and out.min() >= np.finfo(np.float32).tiny
 
 
 def test_skipping_changes_nothing():
