@@ -1,5 +1,6 @@
 """What the pages say is true: examples run, links lead somewhere, suites and recipes exist."""
 
+import importlib
 import re
 import shlex
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+import tyro
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
@@ -44,27 +46,48 @@ def test_links_lead_to_files(page):
             assert (page.parent / link).exists(), link
 
 
-def test_commands_in_the_pages_are_understood():
-    """Every make-dataset and run-benchmark line parses: its flags exist."""
-    import tyro
+def commands(text: str) -> list[str]:
+    """List what a page has the user type: lines of bash, indented lines, and code within the text."""
+    prose = BLOCK.sub("", text)
+    typed = [block for kind, block in BLOCK.findall(text) if kind == "bash"]
+    typed += re.findall(r"^    ((?:make-dataset|run-benchmark)\b.*)$", prose, re.M)
+    typed += [" ".join(code.split()) for code in re.findall(r"`((?:make-dataset|run-benchmark)\s[^`]*)`", prose)]
+    return [line for block in typed for line in re.split(r"\n|&&", block.replace("\\\n", " "))]
 
+
+def arguments_of(name: str, words: list[str]) -> tuple[type, list[str]] | None:
+    """Return the form and the words of a command of ours, None for another, and where it is but named."""
+    from benchmarks.cli import OTHERS
     from benchmarks.cli_run import Arguments
-    from benchmarks.inspector import Arguments as Inspect
     from benchmarks.make_dataset import Options
-    from benchmarks.reproduce import Arguments as Reproduce
 
-    parsed = 0
-    for kind, text in (p.values for p in BLOCKS):
-        for line in re.split(r"\n|&&", text.replace("\\\n", " ")) if kind == "bash" else ():
-            name, *words = shlex.split(line, comments=True) or [""]
-            form = {"make-dataset": Options, "run-benchmark": Arguments}.get(name.rpartition("/")[2])
-            others = {"inspect": Inspect, "reproduce": Reproduce}
-            if form is Arguments and words and words[0] in others:
-                form, words = others[words[0]], words[1:]
-            if form and words[:1] != ["peers"]:
-                tyro.cli(form, args=words)
-                parsed += 1
-    assert parsed >= 4
+    if name.rpartition("/")[2] not in ("make-dataset", "run-benchmark"):
+        return None
+    form = Options if name.endswith("make-dataset") else Arguments
+    if form is Arguments and words and (module := OTHERS.get(words[0])):
+        form, words = importlib.import_module(module if "." in module else f"benchmarks.{module}").Arguments, words[1:]
+    return (form, words) if any(not word.startswith("-") for word in words) else None
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_commands_in_the_pages_are_understood(page):
+    """Every make-dataset and run-benchmark line parses: its flags exist."""
+    for line in commands(page.read_text(encoding="utf-8")):
+        name, *words = shlex.split(line, comments=True) or [""]
+        if (understood := arguments_of(name, words)) is not None:
+            tyro.cli(understood[0], args=understood[1])
+
+
+def test_commands_are_found_wherever_they_stand():
+    code = "`run-benchmark data/ results/\n--such`"
+    block = "```bash\nmake-dataset core \\\n  d/\n```"
+    found = commands(f"So {code}.\n\n    run-benchmark pareto out/\n\n{block}\n")
+    assert [" ".join(line.split()) for line in found if line] == [
+        "make-dataset core d/",
+        "run-benchmark pareto out/",
+        "run-benchmark data/ results/ --such",
+    ]
+    assert sum(len(commands(page.read_text(encoding="utf-8"))) for page in PAGES) > 80
 
 
 def test_the_readme_names_every_recipe_and_suite():
