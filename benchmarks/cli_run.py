@@ -75,9 +75,12 @@ def main(arguments: list[str]) -> int:
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     given = tyro.cli(Arguments, prog="run-benchmark", args=arguments)
     from benchmarks import records, tables
+    from benchmarks.limited import refuse_unless_positive
 
-    if given.collect and given.dry_run:
-        raise InputError("--collect writes records, --dry-run writes nothing: expected one of them")
+    refuse_unless_positive(given.seconds)
+    if given.dry_run and (given.collect or given.table):
+        what = "--collect writes records" if given.collect else "--table writes tables"
+        raise InputError(f"{what}, --dry-run writes nothing: expected one of them")
     for folder in (given.results, *given.collect):
         for rest in records.read_all(folder)[1]:
             log.warning("%s", rest)

@@ -18,7 +18,10 @@ class _Dated(Protocol):
 
 
 def append(path: Path, *records: msgspec.Struct) -> None:
-    """Append records in one write, forced to the disk; a line whose writing was interrupted is cut off first."""
+    """Append records and force them to the disk, alone among processes.
+
+    A line whose writing was interrupted is cut off first.
+    """
     with locked(path) as handle:
         cut_torn(handle)
         append_synced(path, handle, b"".join(msgspec.json.encode(record) + b"\n" for record in records))

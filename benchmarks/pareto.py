@@ -74,7 +74,7 @@ def main(argv: list[str]) -> int:
     suite = pareto_suite.load(given.suite)
     wanted = _scenes(given, suite)
     lines.take_over(given.out / NAME, given.collect, Timed, WHAT, dry_run=given.dry_run)
-    if given.table or given.collect:
+    if (given.table or given.collect) and not given.dry_run:
         _report(given.out)
         return 0
     if "methods" in wanted:
@@ -250,9 +250,11 @@ def _report(out: Path) -> None:
     from benchmarks import pareto_figure, pareto_table
     from benchmarks.pareto_records import points
 
-    shown = latest(read(out / NAME))
+    found = read(out / NAME)
+    shown = latest(found)
     if not shown:
-        raise InputError(f"{out / NAME}: there are no records; run without --table first")
+        which = f"there are {len(found)} records of another version only" if found else "there are no records"
+        raise InputError(f"{out / NAME}: {which}; run without --table first")
     summary = pareto_table.summary(shown)
     (out / "pareto.md").write_text(summary + pareto_table.every_point(shown), encoding="utf-8")
     written = "pareto.md, with every point"

@@ -107,13 +107,10 @@ def runs(found: Sequence[Timed]) -> Counter[str]:
 
 def latest(found: Sequence[Timed]) -> list[Timed]:
     """Keep what a table shows: of each choice the runs of its newest identity, on the machine its scene was last on."""
-    ended = sorted(found, key=lambda t: t.status == OK)  # a failure says nothing where there is a time
+    known = [t for t in found if t.setting.version == VERSION]
+    ended = sorted(known, key=lambda t: t.status == OK)  # a failure says nothing where there is a time
     machine = {(t.setting.part, t.setting.scene): t.setting.machine for t in ended}
-    mine = [
-        t
-        for t in found
-        if t.setting.version == VERSION and t.setting.machine == machine[t.setting.part, t.setting.scene]
-    ]
+    mine = [t for t in known if t.setting.machine == machine[t.setting.part, t.setting.scene]]
     newest = {_place(t.setting): t.setting.identity for t in mine}
     return [t for t in mine if newest[_place(t.setting)] == t.setting.identity]
 

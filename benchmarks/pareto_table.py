@@ -116,7 +116,9 @@ def _verdict(group: Sequence[Point], p: Point, keys: Sequence[str]) -> str:
     clear = [q for q in better if _clearly(q, p, keys)]
     best = min(clear or better, key=lambda q: q.pair)
     where = "off the front" if clear else "on the front within the spread of the rounds"
-    return f"{where} ({_short(best)} is no worse in {best.pair[0] / p.pair[0]:.2f} of the time)"
+    heads = HEADS[p.setting.part]
+    less = [f"{best.values[k] / p.values[k]:.2f} of the {heads[k]}" for k in keys if _far(best.values[k], p.values[k])]
+    return f"{where} ({_short(best)} has {' and '.join([f'{best.pair[0] / p.pair[0]:.2f} of the time', *less])})"
 
 
 def _beats(q: Point, p: Point, keys: Sequence[str]) -> bool:
@@ -127,7 +129,11 @@ def _beats(q: Point, p: Point, keys: Sequence[str]) -> bool:
 
 def _clearly(q: Point, p: Point, keys: Sequence[str]) -> bool:
     """Whether `q`, which beats `p`, is faster beyond the spread of their rounds, or has an error that is far less."""
-    return faster(q.seconds, p.seconds) or any(q.values[key] * (1 + NEAR) < p.values[key] for key in keys)
+    return faster(q.seconds, p.seconds) or any(_far(q.values[key], p.values[key]) for key in keys)
+
+
+def _far(less: float, error: float) -> bool:
+    return less * (1 + NEAR) < error
 
 
 def _curves(group: Sequence[Point]) -> Iterator[str]:
@@ -192,7 +198,7 @@ def _provenance(found: Sequence[Timed]) -> str:
     last = found[-1]
     h, changed = last.host, "+changes" if last.commit.endswith("+changes") else ""
     counts = sorted({len(p.seconds) for p in points(found)})
-    of = "–".join(map(str, dict.fromkeys((counts[0], counts[-1])))) if counts else "0"
+    of = "–".join(map(str, dict.fromkeys((*counts[:1], *counts[-1:]))))
     threads = f"{h.threads} thread{'s' * (h.threads > 1)}"
     return (
         f"{last.time}, commit {last.commit[:12]}{changed}, {h.cpu}, {h.cores} cores, {threads}, Python {h.python}, "

@@ -149,7 +149,7 @@ def _mend(path: Path, descriptor: int) -> Torn | None:
         return None
     _, torn = read(path)
     if torn is None:
-        os.write(descriptor, b"\n")
+        append_synced(path, descriptor, b"\n")
     else:
         path.with_suffix(".torn").write_bytes(os.pread(descriptor, torn.length, torn.offset))
         os.ftruncate(descriptor, torn.offset)

@@ -259,13 +259,16 @@ class Cluster:
         try:
             yield from self._answers(function, jobs)
         except (CancelledError, self._dask.comm.CommClosedError) as error:
-            raise InputError(f"--scheduler {self._address}: it is gone; the same command goes on from here") from error
+            raise self._gone() from error
+
+    def _gone(self) -> InputError:
+        return InputError(f"--scheduler {self._address}: it is gone; the same command goes on from here")
 
     def _answers(self, function: Function, jobs: Sequence[Any]) -> Answers:
         waiting, running = deque(range(len(jobs))), {}
         while waiting or running:
             # no more jobs than workers: Dask gives each to an idle one, and moves it when that is lost
-            for _ in range(min(len(waiting), len(self._client.nthreads()) - len(running))):
+            for _ in range(min(len(waiting), self._workers() - len(running))):
                 number = waiting.popleft()
                 running[self._client.submit(_alone, function, jobs[number], pure=False)] = number
             done = self._done(list(running))
@@ -273,6 +276,12 @@ class Cluster:
                 yield None
             for future in done:
                 yield running.pop(future), self._answer(future)
+
+    def _workers(self) -> int:
+        try:
+            return len(self._client.nthreads())
+        except OSError as error:  # it does not answer in time
+            raise self._gone() from error
 
     def _done(self, futures: list[Any]) -> set[Any]:
         """Wait a little for one of the futures; return those that have ended."""

@@ -86,7 +86,8 @@ def append_synced(path: Path, handle: int, data: bytes) -> None:
             written += os.write(handle, data[written:])
         os.fsync(handle)
     except OSError as error:
-        os.ftruncate(handle, size)
+        with contextlib.suppress(OSError):  # what is left is cut off by the next to append
+            os.ftruncate(handle, size)
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 

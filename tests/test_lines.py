@@ -3,12 +3,14 @@
 import errno
 import multiprocessing
 import os
+import time
 from pathlib import Path
 
 import msgspec
 import pytest
 
 from benchmarks import lines
+from ctsim.durable import write_synced
 from ctsim.errors import InputError
 
 
@@ -61,8 +63,13 @@ def test_no_record_is_lost_where_processes_append_and_collect_at_once(tmp_path):
     others = [spawn.Process(target=keep_appending, args=(path, who)) for who in (1, 2)]
     for other in others:
         other.start()
-    while any(other.is_alive() for other in others):
+    end = time.monotonic() + 120
+    while any(other.is_alive() for other in others) and time.monotonic() < end:
         lines.collect(path, (there,), Row, "a row")
+        time.sleep(0.002)
+    for other in others:
+        other.kill()  # none is left, or the test has failed
+        other.join()
     lines.collect(path, (there,), Row, "a row")
     assert [other.exitcode for other in others] == [0, 0]
     expected = [row(0), *(row(who, k) for who in (1, 2) for k in range(APPENDED))]
@@ -83,6 +90,19 @@ def test_a_full_disk_leaves_the_file_as_it_was(tmp_path, monkeypatch):
     with pytest.raises(OSError, match=r"No space left on device: '.*rows.jsonl'"):
         lines.append(path, row(2))
     assert path.read_bytes() == before
+
+
+def test_a_file_that_cannot_be_replaced_stays_and_nothing_is_left_beside_it(tmp_path, monkeypatch):
+    path = tmp_path / "table.md"
+    write_synced(path, b"before")
+
+    def full(handle):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match=r"No space left on device: '.*table.md'"):
+        write_synced(path, b"after")
+    assert path.read_bytes() == b"before" and [p.name for p in tmp_path.iterdir()] == ["table.md"]
 
 
 def test_what_was_taken_over_is_said_and_nothing_is_written_on_a_dry_run(tmp_path, capsys):

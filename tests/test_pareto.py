@@ -28,9 +28,7 @@ from benchmarks import (
 )
 from benchmarks.limited import Limited
 from benchmarks.methods import TABLE
-from benchmarks.pareto_records import (
-    read,
-)
+from benchmarks.pareto_records import read
 from benchmarks.peer_cases import relative
 from ctsim.settings import Simulation
 from ctsim.types import Volume
@@ -270,7 +268,7 @@ def test_ctrl_c_ends_a_run_with_its_process_and_keeps_the_records(tmp_path, monk
     path = tmp_path / "out" / "pareto.jsonl"
 
     def interrupt():
-        while not path.exists():
+        while not (path.exists() and path.read_bytes().endswith(b"\n")):
             time.sleep(0.05)
         os.kill(os.getpid(), signal.SIGINT)
 

@@ -192,7 +192,7 @@ def test_the_exponential_is_accurate_to_its_bound():
     each(x, out)
     want = np.exp(-np.minimum(x.astype(np.float64), 80))
     assert np.all(np.abs(out / want - 1) < 4e-7 * np.maximum(1, x / 4))
-    # denormals, which slow a kernel many times, cannot arise
+    # no denormal, which would slow a kernel many times
     assert out[0] == 1.0 and out.min() >= np.finfo(np.float32).tiny
 
 

@@ -154,8 +154,8 @@ def cluster():
     import dask.config
     from distributed import Client, LocalCluster
 
-    # as many as there are workers: a job may be moved from one that is killed to the other before that is, too
-    dask.config.set({"distributed.scheduler.allowed-failures": 2})
+    # a job may be moved from a worker that is killed to the other before that is, too; twice that on a busy machine
+    dask.config.set({"distributed.scheduler.allowed-failures": 4})
     with (
         LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL") as found,
         Client(found, set_as_default=False) as client,
@@ -227,6 +227,8 @@ def job(given: str) -> str:
         os.kill(os.getpid(), signal.SIGKILL)
     if given == "refuse":
         raise InputError("not this one")
+    if given == "fails":
+        raise OSError("its own")
     return f"{given} with {os.environ.get('NUMBA_NUM_THREADS')}"
 
 
@@ -312,6 +314,18 @@ def test_a_scheduler_that_goes_is_one_sentence(tmp_path):
             scheduler.kill()
             with pytest.raises(InputError, match="it is gone"):
                 list(answers)
+
+
+def test_a_scheduler_that_does_not_answer_is_one_sentence_but_a_jobs_own_error_is_not(cluster, monkeypatch):
+    def timed_out():
+        raise OSError("Timed out trying to connect")
+
+    with Cluster(cluster[0]) as pool:
+        with pytest.raises(OSError, match="its own"):
+            list(pool.answers(job, ["fails"]))
+        monkeypatch.setattr(pool._client, "nthreads", timed_out)
+        with pytest.raises(InputError, match="it is gone"):
+            list(pool.answers(job, ["one"]))
 
 
 def test_a_cluster_without_the_package_is_one_sentence(monkeypatch):
