@@ -34,8 +34,8 @@ from reconstruct.watch import watch
 class Effort:
     """One run to time: a method with its parameters, what the run and its curve are called.
 
-    A run that is `watched` has a mark at each stop, if the method shows its volume. A run by `default` passes, if it
-    is watched, what the method does when it is told nothing.
+    A run that is `watched` has a mark at each stop, if the method shows its volume. With `default` the run, or one mark
+    of it if it is watched, is what the method does when it is told nothing.
     """
 
     method: Method

@@ -33,7 +33,7 @@ from phantoms.scanners import preset
 
 SCENE = "rods"
 CHECKED = 2  # views that are held against the reference
-USUAL = 1.0  # label voxels for a pixel, which the bundled suites have 0.5 to 1.2 of
+USUAL = 1.0  # label voxels along an axis for each pixel along one; the bundled suites have 0.5 to 1.2
 FINER, FINEST = 16, 64
 """Of the reference: finer pixels along a side of a pixel, and rays in each."""
 CALM = 1e-4  # |ΔP| of the central ray alone, below which a pixel has no edge

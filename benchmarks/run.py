@@ -8,7 +8,6 @@ only it.
 import dataclasses
 import datetime
 import logging
-import math
 import time
 import tomllib
 from collections.abc import Iterator
@@ -23,6 +22,7 @@ from benchmarks import artefact, details, intermediates, records
 from benchmarks.host import commit, host, measured
 from benchmarks.isolate import Outcome, run_apart
 from benchmarks.judge import Judge, Twin
+from benchmarks.limited import refuse_unless_positive
 from benchmarks.methods import Method
 from benchmarks.protocol import Score, Stored
 from benchmarks.records import Cost, Record, Run
@@ -56,8 +56,7 @@ class Options:
     store: str = STORE
 
     def __post_init__(self) -> None:
-        if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds > 0):
-            raise InputError(f"seconds must be positive, got {self.seconds}")
+        refuse_unless_positive(self.seconds)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,12 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks import (
-    lines,
-    pareto,
-    pareto_figure,
-    pareto_table,
-)
+from benchmarks import lines, pareto, pareto_figure, pareto_table
 from benchmarks.host import host
 from benchmarks.pareto_front import beaten_by, faster, front, knee
 from benchmarks.pareto_records import (
