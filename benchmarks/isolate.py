@@ -21,13 +21,15 @@ from benchmarks.records import Cost
 if TYPE_CHECKING:
     from benchmarks.methods import Method
 
-_RESULT, _VALUES, _SHOWN = "outcome.json", "values.npy", "intermediates.npz"
+_RESULT, _SHOWN = "outcome.json", "intermediates.npz"
+_VOLUMES = ("values", "at_50kev")
 
 
 @dataclass(slots=True, kw_only=True)
 class Outcome:
     """How a run ended: its status and reason, the volume [z, y, x] float32 in 1/mm if any, and its cost.
 
+    `at_50kev` is the volume at 50 keV of a method that knows energies.
     `intermediates` are what the method worked with, for pictures (`benchmarks.intermediates`); `details` what it says
     of its result, for the record (`benchmarks.details`).
     """
@@ -35,6 +37,7 @@ class Outcome:
     status: str
     reason: str = ""
     values: NDArray[np.float32] | None = None
+    at_50kev: NDArray[np.float32] | None = None
     cost: Cost | None = None
     intermediates: Intermediates = field(default_factory=dict)
     details: dict[str, Any] = field(default_factory=dict)
@@ -56,8 +59,9 @@ def _work(store: str, folder: str, variant: str, method: "Method", device: str, 
     stored = pkgutil.resolve_name(store)(folder)
     warm = warm_up(method, scan_for(method, stored, "metal"), device)
     outcome = attempt(method, scan_for(method, stored, variant), device, warm)
-    if outcome.values is not None:
-        np.save(Path(out) / _VALUES, outcome.values)
+    for name in _VOLUMES:
+        if (volume := getattr(outcome, name)) is not None:
+            np.save(Path(out) / f"{name}.npy", volume)
     if outcome.intermediates:
         intermediates.write(Path(out) / _SHOWN, outcome.intermediates, "")
     cost = None if outcome.cost is None else msgspec.structs.replace(outcome.cost, isolated=True)
@@ -95,13 +99,13 @@ def _collect(out: Path, exit_code: int) -> Outcome:
             )
         return Outcome(status="error", reason=f"the process died with {how_it_ended(exit_code)}")
     ended = msgspec.json.decode((out / _RESULT).read_bytes(), type=_Ended)
-    values = np.load(out / _VALUES) if (out / _VALUES).exists() else None
+    volumes = {name: np.load(path) for name in _VOLUMES if (path := out / f"{name}.npy").exists()}
     shown = intermediates.read(out / _SHOWN, "")
     return Outcome(
         status=ended.status,
         reason=ended.reason,
-        values=values,
         cost=ended.cost,
         intermediates=shown,
         details=ended.details,
+        **volumes,
     )

@@ -34,11 +34,16 @@ class Judge:
         views = with_floor(held_out(stored), truth)
         return cls(truth=truth, layout=layout_of(stored, truth), views=views)
 
-    def scores(self, values: NDArray[Any], variant: str, twin: Twin) -> dict[str, Score]:
-        """Score a volume under every protocol; of the metal-free `variant` only what compares has a meaning."""
-        scores = evaluate(values, self.truth, anchor=variant != "metal")
+    def scores(
+        self, values: NDArray[Any], variant: str, twin: Twin, at_50kev: NDArray[Any] | None = None
+    ) -> dict[str, Score]:
+        """Score a volume under every protocol; of the metal-free `variant` only what compares has a meaning.
+
+        `at_50kev` is what a method that knows energies makes of 50 keV.
+        """
+        scores = evaluate(values, self.truth, at_50kev=at_50kev, anchor=variant != "metal")
         if variant == "metal":
-            scores["projection"] = projection_score(values, self.views)
+            scores["projection"] = projection_score(values, self.views, at_50kev)
         if variant == "metal" and self.truth.metal.any():
             scores["artefact"] = artefact_score(values, twin.values, self.layout, self.truth, twin.reason)
         return scores

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.protocol import Score, Stored, Truth
+from benchmarks.protocol import AS_RETURNED, AT_50KEV, Score, Stored, Truth
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 
@@ -122,15 +122,18 @@ def _simulated(scene: Any, geometry: Geometry, stored: Stored) -> HeldOut:
     )
 
 
-def rmse_by_target(values: NDArray[Any], held: HeldOut) -> dict[str, float | None]:
-    """Return the RMSE of a volume's line integrals, "target/region", and of P each view's, "target/region:angle"."""
-    from reconstruct.projector import forward_columns
+def rmse_by_target(
+    values: NDArray[Any], held: HeldOut, at_50kev: NDArray[Any] | None = None
+) -> dict[str, float | None]:
+    """Return the RMSE of a volume's line integrals, "target/region", and of P each view's, "target/region:angle".
 
-    columns = np.ascontiguousarray(values.transpose(1, 2, 0), np.float32)
-    found = forward_columns(columns, held.geometry)
+    Those at 50 keV are held against the volume `at_50kev` where there is one.
+    """
+    found = _projected(values, held)
+    own = {"50kev": found if at_50kev is None else _projected(at_50kev, held)}
     scores: dict[str, float | None] = {}
     for target in TARGETS:
-        squared = np.square(found - held.truths[target], dtype=np.float64)
+        squared = np.square(own.get(target, found) - held.truths[target], dtype=np.float64)
         for region in REGIONS:
             mask = held.regions[region]
             scores[f"{target}/{region}"] = _root(squared[mask])
@@ -140,12 +143,21 @@ def rmse_by_target(values: NDArray[Any], held: HeldOut) -> dict[str, float | Non
     return scores
 
 
+def _projected(values: NDArray[Any], held: HeldOut) -> NDArray[np.float32]:
+    from reconstruct.projector import forward_columns
+
+    return forward_columns(np.ascontiguousarray(values.transpose(1, 2, 0), np.float32), held.geometry)
+
+
 def _root(squared: NDArray[np.float64]) -> float | None:
     return float(np.sqrt(squared.mean())) if squared.size else None
 
 
-def projection_score(values: NDArray[Any], held: HeldOut | str) -> Score:
-    """Score a volume's line integrals; where there are no held-out views the numbers are None and the note says why."""
+def projection_score(values: NDArray[Any], held: HeldOut | str, at_50kev: NDArray[Any] | None = None) -> Score:
+    """Score a volume's line integrals, of 50 keV those of `at_50kev` where there is one.
+
+    Where there are no held-out views the numbers are None and the note says why.
+    """
     if isinstance(held, str):
         names = [f"{target}/{region}" for target in TARGETS for region in REGIONS]
         return Score(
@@ -163,8 +175,9 @@ def projection_score(values: NDArray[Any], held: HeldOut | str) -> Score:
         alignment="none",
         data_range=None,
         n_voxels=int(held.regions["body"].sum()),
-        values=rmse_by_target(values, held),
+        values=rmse_by_target(values, held, at_50kev),
         note=held.note,
+        volume=AS_RETURNED if at_50kev is None else f"as returned, for 50 keV {AT_50KEV}",
     )
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from benchmarks import metrics
@@ -24,13 +25,15 @@ VERSION = 3
 """Part of every run's identity: a change of the protocol's meaning counts it up.
 
 1: tissue, aligned, paper, metal, cost. 2: every method runs on the metal-free twin too, for `artefact`.
-3: `projection`, and `rmse` of `artefact`.
+3: `projection`, and `rmse` of `artefact`. That what is held against 50 keV is read there counted nothing up: a method
+that can be read there is of newer code than those that were held against it otherwise.
 """
 
 METAL_MARGIN = 2
 BODY_MARGIN = 4
 RANGE_PERCENTILE = 99.9
 ReferenceKind = Literal["effective", "50kev"]
+AS_RETURNED, AT_50KEV = "as returned", "read at 50 keV"
 TISSUE = "inside the body dilated by 4 voxels, outside the metal dilated by 2"
 
 
@@ -100,7 +103,8 @@ class Stored(Protocol):
 class Score(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The scores under one protocol, with all that is needed to read them.
 
-    `data_range` is 1/mm; `values` maps a metric to its number, or to None where it does not exist.
+    `data_range` is 1/mm; `values` maps a metric to its number, or to None where it does not exist; `volume` says which
+    of a method's volumes was scored.
     """
 
     region: str
@@ -111,6 +115,7 @@ class Score(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     values: dict[str, float | None]
     identical: bool = False
     note: str = ""
+    volume: str = AS_RETURNED
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -237,22 +242,26 @@ def metal_score(values: NDArray[Any], truth: Truth) -> Score:
     )
 
 
-def evaluate(values: NDArray[Any], truth: Truth, *, anchor: bool = False) -> dict[str, Score]:
+def evaluate(
+    values: NDArray[Any], truth: Truth, *, at_50kev: NDArray[Any] | None = None, anchor: bool = False
+) -> dict[str, Score]:
     """Score a volume [z, y, x] in 1/mm under every protocol that applies.
 
-    `anchor` is for a scan taken without the metal: only `tissue` and `aligned` have a meaning then.
-    The volume must be finite; the caller has given a volume that is not its own status.
+    What is held against 50 keV is `at_50kev` where the method knows it. `anchor` is for a scan taken without the metal:
+    only `tissue` and `aligned` have a meaning then. The volumes must be finite; the caller has given a volume that is
+    not its own status.
     """
     if values.shape != truth.metal.shape:
         raise InputError(f"the volume has shape {values.shape}, the reference {truth.metal.shape}")
+    mono, which = (values, AS_RETURNED) if at_50kev is None else (at_50kev, AT_50KEV)
     scores = {
         "tissue": tissue_score(values, truth),
         "aligned": aligned_score(values, truth, "effective"),
-        "aligned_50kev": aligned_score(values, truth, "50kev"),
+        "aligned_50kev": replace(aligned_score(mono, truth, "50kev"), volume=which),
     }
     if anchor:
         return scores
-    scores["paper"] = paper_score(values, truth)
+    scores["paper"] = replace(paper_score(mono, truth), volume=which)
     if truth.metal.any():
         scores["metal"] = metal_score(values, truth)
     return scores

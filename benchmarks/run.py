@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks import artefact, details, intermediates, records
 from benchmarks.host import commit, host, measured
@@ -26,10 +27,12 @@ from benchmarks.limited import refuse_unless_positive
 from benchmarks.methods import Method
 from benchmarks.protocol import Score, Stored
 from benchmarks.records import Cost, Record, Run
-from benchmarks.volumes import identity_of, read_volume, write_volume
+from benchmarks.volumes import at_50kev_of, identity_of, read_volume, write_volume
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:
+    import torch
+
     from ctsim.types import Scan
 
 log = logging.getLogger(__name__)
@@ -252,13 +255,16 @@ def describe(error: BaseException) -> str:
 
 def attempt(method: Method, scan: "Scan", device: str, warm_up_seconds: float) -> Outcome:
     """Run a method in this process and turn whatever happens into an outcome."""
+    from ctsim.simulate import REFERENCE_KEV
+
     cost: dict[str, Any] = {"device": device, "warm_up": warm_up_seconds}
-    values, shown, said = None, {}, {}
+    values, at_50kev, shown, said = None, None, {}, {}
     with measured() as usage:
         try:
             volume = method.reconstruct(scan, device)
             status, reason = str(volume.status), volume.reason
-            values = np.asarray(volume.values.detach().cpu().numpy(), np.float32)
+            values = _array(volume.values)
+            at_50kev = None if volume.at_energy is None else _array(volume.at_energy(REFERENCE_KEV))
             cost["view_updates"] = int(volume.details.get("view_updates", scan.geometry.n_views))
             shown = intermediates.taken(volume.details, scan.geometry)
             said = details.kept(volume.details)
@@ -268,23 +274,27 @@ def attempt(method: Method, scan: "Scan", device: str, warm_up_seconds: float) -
             log.debug("method %s failed", method.name, exc_info=True)
             out_of_memory = type(error).__name__ == "OutOfMemoryError"  # torch's, for devices
             status, reason = "out_of_memory" if out_of_memory else "error", describe(error)
-    outcome = Outcome(status=status, reason=reason, values=values, intermediates=shown, details=said)
+    outcome = Outcome(status=status, reason=reason, values=values, at_50kev=at_50kev, intermediates=shown, details=said)
     outcome.cost = Cost(wall=usage.wall, cpu=usage.cpu, peak_bytes=usage.peak_bytes, **{"view_updates": 0, **cost})
     return checked(outcome, scan.geometry.n_voxel)
 
 
 def checked(outcome: Outcome, shape: tuple[int, int, int]) -> Outcome:
     """Turn a volume of another shape into an error and one that is not finite into that status."""
-    values = outcome.values
-    if values is None or outcome.status not in ("ok", "diverged"):
-        return outcome
-    if values.shape != shape:
-        outcome.status, outcome.values = "error", None
-        outcome.reason = f"the volume has shape {values.shape}, the geometry says {shape}"
-    elif not np.isfinite(values).all():
-        outcome.status = "nonfinite"
-        outcome.reason = f"{int(values.size - np.isfinite(values).sum())} of {values.size} voxels are not finite"
+    for what, values in (("volume", outcome.values), ("volume at 50 keV", outcome.at_50kev)):
+        if values is None or outcome.status not in ("ok", "diverged"):
+            continue
+        if values.shape != shape:
+            outcome.status, outcome.values, outcome.at_50kev = "error", None, None
+            outcome.reason = f"the {what} has shape {values.shape}, the geometry says {shape}"
+        elif not (finite := np.isfinite(values)).all():
+            outcome.status = "nonfinite"
+            outcome.reason = f"{int((~finite).sum())} of {values.size} voxels of the {what} are not finite"
     return outcome
+
+
+def _array(volume: "torch.Tensor") -> NDArray[np.float32]:
+    return np.asarray(volume.detach().cpu().numpy(), np.float32)
 
 
 def warm_up(method: Method, scan: "Scan", device: str) -> float:
@@ -336,12 +346,14 @@ def _record(task: Task, outcome: Outcome, by: tuple[Judge, Twin], results: Path,
     scores, kept, identity = {}, None, task.run.identity
     if outcome.values is not None and outcome.status in ("ok", "diverged"):
         try:
-            scores = by[0].scores(outcome.values, task.variant, by[1])
+            scores = by[0].scores(outcome.values, task.variant, by[1], outcome.at_50kev)
         except MemoryError as error:
             outcome.status, outcome.reason = "out_of_memory", f"while scoring: {describe(error)}"
     if outcome.values is not None and options.keep_volumes:
         kept = f"volumes/{task.file_name}"
         write_volume(results / kept, outcome.values, identity)
+        if outcome.at_50kev is not None:
+            write_volume(at_50kev_of(results / kept), outcome.at_50kev, identity)
         if outcome.intermediates:
             beside = intermediates.path_of(results / kept)
             intermediates.write(beside, outcome.intermediates, identity)

@@ -14,6 +14,7 @@ import pandas as pd
 from benchmarks import latex
 from benchmarks.columns import COLUMNS, Column
 from benchmarks.compare import NMAR, derived, harm, row_of
+from benchmarks.protocol import AS_RETURNED
 from benchmarks.records import OK, Record, latest, outdated
 from benchmarks.texts import escape, ranked
 from ctsim.durable import write_synced
@@ -164,7 +165,11 @@ def caption(records: list[Record], protocol: str) -> str:
     text = f"Protocol {protocol}: region {score.region}; reference {merged(references)}; alignment {alignment}"
     if ranges:
         text += "; data range " + ", ".join(f"{_span(v)} ({s})" for s, v in ranges.items()) + " 1/mm"
-    return text + "."
+    read: dict[str, list[str]] = {}
+    for r in (r for r in records if protocol in r.scores and r.run.variant == "metal"):
+        read.setdefault(r.scores[protocol].volume, []).append(r.label)
+    others = [f"{', '.join(dict.fromkeys(who))} {how}" for how, who in read.items() if how != AS_RETURNED]
+    return text + "".join(f"; {other}" for other in others) + "."
 
 
 def _span(numbers: list[float]) -> str:

@@ -39,6 +39,11 @@ def write_volume(path: Path, values: NDArray[np.float32], identity: str = "") ->
             aside.unlink(missing_ok=True)
 
 
+def at_50kev_of(path: Path) -> Path:
+    """Return where the volume at 50 keV of a kept volume's run lies."""
+    return path.with_name(f"{path.stem}__50kev{path.suffix}")
+
+
 def identity_of(path: Path) -> str | None:
     """Return the identity of the run that wrote `path`; None where there is no such volume or it does not say."""
     import tifffile

@@ -2,6 +2,7 @@
 
 import enum
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -144,9 +145,13 @@ class Status(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Volume:
-    """A reconstruction: `values` float32 [z, y, x] in 1/mm on the geometry's grid, and how it ended."""
+    """A reconstruction: `values` float32 [z, y, x] in 1/mm on the geometry's grid, and how it ended.
+
+    `at_energy` gives the attenuation at an energy (keV), as `values`, where the method knows how it depends on energy.
+    """
 
     values: torch.Tensor
     status: Status = Status.OK
     reason: str = ""
     details: dict[str, Any] = field(default_factory=dict)
+    at_energy: Callable[[float], torch.Tensor] | None = None

@@ -39,14 +39,14 @@ class Denoiser:
         if tau == 0:
             _primal(b, self.dual, np.float32(0), self.ratios, self.support, self.positivity, x)
             return x
-        ahead, t = self.dual.copy(), 1.0
+        ahead, start, t = np.empty_like(self.dual), self.dual, 1.0
         # ‖D‖² ≤ 4 Σ ratio², Beck and Teboulle's lemma 4.2 with a third axis
         step = np.float32(1 / (4 * float((self.ratios**2).sum()) * tau))
         for _ in range(iterations):
             after = (1 + math.sqrt(1 + 4 * t * t)) / 2
-            _primal(b, ahead, np.float32(tau), self.ratios, self.support, self.positivity, x)
-            _ascend(x, ahead, self.dual, step, np.float32((t - 1) / after), self.ratios)
-            t = after
+            _primal(b, start, np.float32(tau), self.ratios, self.support, self.positivity, x)
+            _ascend(x, start, ahead, self.dual, step, np.float32((t - 1) / after), self.ratios)
+            start, t = ahead, after
         _primal(b, self.dual, np.float32(tau), self.ratios, self.support, self.positivity, x)
         return x
 
@@ -112,13 +112,16 @@ def _primal(b, field, tau, ratios, support, positivity, x):
 
 
 @njit(parallel=True, cache=True)
-def _ascend(x, ahead, dual, step, momentum, ratios):
-    """Step the dual field from `ahead` up the slopes of x, back into the unit balls, and on by its momentum."""
+def _ascend(x, start, ahead, dual, step, momentum, ratios):
+    """Step the dual field from `start` up the slopes of x, back into the unit balls, and on by its momentum: `ahead`.
+
+    `start` may be one of the two that are written.
+    """
     for i in prange(x.shape[0]):
         for j in range(x.shape[1]):
             for k in range(x.shape[2]):
                 a, b, c = _slope(x, i, j, k, ratios)
-                a, b, c = ahead[0, i, j, k] + step * a, ahead[1, i, j, k] + step * b, ahead[2, i, j, k] + step * c
+                a, b, c = start[0, i, j, k] + step * a, start[1, i, j, k] + step * b, start[2, i, j, k] + step * c
                 shrink = np.float32(1) / max(np.float32(1), np.sqrt(a * a + b * b + c * c))
                 a, b, c = a * shrink, b * shrink, c * shrink
                 ahead[0, i, j, k] = a + momentum * (a - dual[0, i, j, k])

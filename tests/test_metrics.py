@@ -8,7 +8,7 @@ from scipy import ndimage
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from benchmarks import metrics
-from benchmarks.protocol import Truth, evaluate, tissue_range
+from benchmarks.protocol import AS_RETURNED, AT_50KEV, Truth, evaluate, tissue_range
 from benchmarks.ssim import window
 from ctsim.errors import InputError
 
@@ -288,6 +288,18 @@ def test_a_pure_energy_scale_is_what_alignment_removes():
     assert scores["tissue"].data_range == pytest.approx(0.02)
     assert scores["paper"].data_range == pytest.approx(0.55)
     assert scores["metal"].values["core_ratio"] == pytest.approx(0.8, rel=1e-5)
+
+
+def test_a_method_that_knows_energies_is_held_against_50_kev_by_its_volume_at_50_kev():
+    t = truth()
+    delivered, true = t.references["effective"], t.references["50kev"]
+    own, both = evaluate(delivered, t), evaluate(delivered, t, at_50kev=true)
+    assert both["paper"].identical and both["aligned_50kev"].identical
+    assert {name for name, score in both.items() if score.volume == AT_50KEV} == {"paper", "aligned_50kev"}
+    assert {score.volume for score in own.values()} == {AS_RETURNED}
+    assert own["paper"].values["psnr3d"] < 60
+    assert {name for name in both if both[name] != own[name]} == {"paper", "aligned_50kev"}
+    assert evaluate(delivered, t, at_50kev=true, anchor=True)["aligned_50kev"].identical
 
 
 def test_a_perfect_volume_is_named_identical():

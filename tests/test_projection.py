@@ -8,7 +8,7 @@ import torch
 from conftest import SMALLEST
 
 from benchmarks import make_dataset, projection
-from benchmarks.projection import HeldOut, half_way, held_out, projection_score, with_floor
+from benchmarks.projection import REGIONS, HeldOut, half_way, held_out, projection_score, with_floor
 from benchmarks.protocol import truth_of
 from ctsim.geometry import Geometry
 from ctsim.store import list_scans, open_scan
@@ -120,6 +120,9 @@ def test_scores_are_the_rmse_in_each_region():
     pixels = np.array([4.0, 8 * 4.0])
     assert score.values["50kev/body"] == pytest.approx(np.sqrt(pixels @ [0.25, 0.01] / pixels.sum()), **near)
     assert score.values["effective/body"] == 0 and score.n_voxels == 6 * 36
+    spectral = projection_score(volume, held_double(volume, (0.5, 0.1)), np.zeros_like(volume))
+    assert {k for k, v in spectral.values.items() if v != score.values[k]} == {f"50kev/{r}" for r in REGIONS}
+    assert spectral.volume == "as returned, for 50 keV read at 50 keV"
     held = held_double(volume, (0.0, 0.0))
     empty = dataclasses.replace(held, regions=held.regions | {"trace": np.zeros_like(held.regions["trace"])})
     assert projection_score(volume, empty).values["noise_free/trace"] is None

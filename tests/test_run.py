@@ -1,3 +1,5 @@
+import dataclasses
+import math
 import os
 import subprocess
 import sys
@@ -11,7 +13,8 @@ import torch
 from benchmarks import artefact, cli, cli_run, intermediates, methods, records, run
 from benchmarks.panels import Row, cut, draw, write_panels
 from benchmarks.protocol import truth_of
-from benchmarks.volumes import write_volume
+from benchmarks.tables import caption
+from benchmarks.volumes import at_50kev_of, identity_of, read_volume, write_volume
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.types import Scan, Volume
@@ -89,6 +92,13 @@ def misshapen(scan, *, device):
 
 def hungry(scan, *, device):
     raise MemoryError("no room for 1 TB")
+
+
+def spectral(scan, *, device, flaw=None):
+    """Know the attenuation at any energy, or return something else there."""
+    at = {None: lambda kev: torch.full(scan.geometry.n_voxel, 1 / kev), "shape": lambda kev: torch.zeros(2, 3, 4)}
+    at["nan"] = lambda kev: torch.full(scan.geometry.n_voxel, math.nan)
+    return dataclasses.replace(good(scan, device=device), at_energy=at[flaw])
 
 
 def broken(scan, *, device):
@@ -265,6 +275,27 @@ def test_panels_show_every_kept_volume(tmp_path):
     assert cut(np.asarray(double(tmp_path).metal) > 0, np.ones(GEOMETRY.n_voxel, bool)) == (5, 6, 7)
     write_volume(tmp_path / record.volume, np.zeros(GEOMETRY.n_voxel, np.float32), "another run")
     assert write_panels([record], [double(tmp_path)], tmp_path) == []
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_what_a_method_knows_of_50_kev_is_scored_there_and_kept(tmp_path, isolate):
+    record, plain = once("spectral", tmp_path, isolate=isolate), once("good", tmp_path)
+    assert record.status == "ok" and record.volume is not None
+    own = read_volume(at_50kev_of(tmp_path / record.volume))
+    assert (own == np.float32(1 / 50)).all() and identity_of(at_50kev_of(tmp_path / record.volume)) == record.identity
+    assert {k for k in plain.scores if record.scores[k] != plain.scores[k]} == {"aligned_50kev", "paper"}
+    error = double(tmp_path).reference("50kev") - own
+    assert record.scores["paper"].values["rmse"] == pytest.approx(np.sqrt(np.mean(error.astype(np.float64) ** 2)))
+    for protocol, said in (("paper", True), ("tissue", False)):
+        assert ("; test_run:spectral read at 50 keV." in caption([record, plain], protocol)) == said
+    assert not at_50kev_of(tmp_path / str(plain.volume)).exists()
+
+
+@pytest.mark.parametrize(("flaw", "status"), [("shape", "error"), ("nan", "nonfinite")])
+def test_a_volume_at_50_kev_that_is_none_is_the_runs_failure(tmp_path, flaw, status):
+    method = methods.find("test_run:spectral", {"flaw": flaw})
+    outcome = run.attempt(method, double(tmp_path).scan, "cpu", 0.0)
+    assert outcome.status == status and "volume at 50 keV" in outcome.reason
 
 
 @pytest.mark.parametrize("isolate", [False, True])

@@ -344,6 +344,8 @@ def test_time_that_ran_out_can_be_given_later_also_for_another_read_out(small, t
     assert 0 < early.details["view_updates"] < 20 and len(list(tmp_path.iterdir())) == 1
     late = reconstruct(small.scan, readout=60.0, **told)
     assert torch.equal(late.values, reconstruct(small.scan, passes=(1, 1), readout=60.0).values)
+    assert late.at_energy is not None and torch.equal(late.at_energy(60.0), late.values)
+    assert torch.equal(late.at_energy(50.0), reconstruct(small.scan, passes=(1, 1), readout=50.0).values)
     assert not list(tmp_path.iterdir())
 
 

@@ -117,19 +117,20 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         blind = bool(clamped.all())
         details["limitation"] = f"{'no reading is of use' if blind else 'no ray met anything'}: the volume is empty"
         return Volume(values=torch.zeros(scan.geometry.n_voxel), details=details)
-    values, (rho_a, rho_b), how = _read(fit, settings, scan.geometry)
+    values, rho, how = _read(fit, settings, scan.geometry)
     status, reason = _verdict(fit, values)
     details |= {
         "read-out": how,
         "misfit": fit.misfit if math.isfinite(fit.misfit) else None,
         "view_updates": fit.view_updates,
-        "densities": {"rho_a": rho_a, "rho_b": rho_b},
+        "densities": {"rho_a": rho[0], "rho_b": rho[1]},
     }
     return Volume(
         values=torch.from_numpy(values),
         status=status,
         reason=reason,
         details=details,
+        at_energy=lambda kev: torch.from_numpy(_summed(_at(kev, response), rho)),
     )
 
 
@@ -196,10 +197,19 @@ def _read(fit: Fit, settings: Settings, geometry: Geometry) -> tuple[Image, Imag
         length = typical_length(fit)
         weights, how = tangent(fit.response, fit.curve.of_water, length), f"hardened by {length:.1f} mm of water"
     else:
-        a, b = basis_functions(np.array([settings.readout]), fit.response.basis, fit.response.e_max)
-        weights, how = (float(a[0]), float(b[0])), f"at {settings.readout:g} keV"
+        weights, how = _at(settings.readout, fit.response), f"at {settings.readout:g} keV"
     rho = voxelise(fit.lattice.splats(fit.curve.densities_of(fit.u)), geometry)
-    return np.float32(weights[0]) * rho[0] + np.float32(weights[1]) * rho[1], rho, how
+    return _summed(weights, rho), rho, how
+
+
+def _at(kev: float, response: Response) -> tuple[float, float]:
+    """Return what ρa and ρb count at an energy."""
+    a, b = basis_functions(np.array([kev]), response.basis, response.e_max)
+    return float(a[0]), float(b[0])
+
+
+def _summed(weights: tuple[float, float], rho: Image) -> Image:
+    return np.float32(weights[0]) * rho[0] + np.float32(weights[1]) * rho[1]
 
 
 def _course(data: Data, response: Response, settings: Settings) -> Course:
