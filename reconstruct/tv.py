@@ -32,14 +32,15 @@ class Denoiser:
     def __init__(self, support: NDArray[np.bool_], ratios: NDArray[np.float32], positivity: bool) -> None:
         self.support, self.ratios, self.positivity = support, ratios, positivity
         self.dual = np.zeros((3, *support.shape), np.float32)
+        self._ahead = np.empty_like(self.dual)
 
     def run(self, b: Array, tau: float, iterations: int) -> Array:
         """Return the minimiser of `b`, [y, x, z], after `iterations` steps."""
-        x = np.empty_like(b)
+        x, ahead = np.empty_like(b), self._ahead
         if tau == 0:
             _primal(b, self.dual, np.float32(0), self.ratios, self.support, self.positivity, x)
             return x
-        ahead, start, t = np.empty_like(self.dual), self.dual, 1.0
+        start, t = self.dual, 1.0
         # ‖D‖² ≤ 4 Σ ratio², Beck and Teboulle's lemma 4.2 with a third axis
         step = np.float32(1 / (4 * float((self.ratios**2).sum()) * tau))
         for _ in range(iterations):

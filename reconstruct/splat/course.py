@@ -17,7 +17,7 @@ from reconstruct.splat.response import Response
 
 EMPTY = 0.05  # times water: a voxel of the coarser volume below that holds no splat
 SMALLEST = 24  # voxels along an axis below which there is no coarser level
-PASSES, MOST = (3, 7), 6e10
+PASSES, MOST = (3, 9), 6e10
 """Passes over each coarser grid and the finest; fewer, at least one, where all of a grid would meet more voxels."""
 COARSER = 4.0  # times the denoising on a coarser grid
 

@@ -47,7 +47,7 @@ Image = NDArray[np.float32]
 class Settings:
     """What the preset "fast" may be told.
 
-    `passes` over the views are those of each coarser level and of the finest; None makes them 3 and 7, or fewer, at
+    `passes` over the views are those of each coarser level and of the finest; None makes them 3 and 9, or fewer, at
     least one, where the passes over a level times its views times its voxels would be more than 6e10, minutes of two
     cores. `tv` is the threshold of denoising in units of water a hundred views, more in the first passes and on coarser
     levels. The finest grid is `fineness` times that of the volume, at most as fine as the detector's pixels at the

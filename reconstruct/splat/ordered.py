@@ -36,6 +36,11 @@ SETTLED = 4
 
 What is then smoothed away too far is regained from the data, while streaks come back slowly.
 """
+SHORTER = 2
+"""Last passes, one of three or less, in which steps shorten: to a half after the first and to a third after the second.
+
+Subsets that disagree, by noise or by what no model explains, would keep the fit from settling.
+"""
 LONGEST = 3.0  # times the median root of a step: hardly seen splats, their steps spread by F, make a fit diverge
 SAMPLE = 1 << 18  # roots of which the median is taken
 FAINT = 0.5  # times water: splats below are preconditioned as if they held this
@@ -79,16 +84,15 @@ class Fit:
     def run(self, passes: int, proceed: Callable[["Fit", bool], bool]) -> bool:
         """Go through all views `passes` times; stop and return False when `proceed(fit, whole)` says so.
 
-        It is asked after each subset, `whole` where that was the last of a pass. In the last pass steps grow shorter,
-        to a half: subsets that disagree, by noise or by what no model explains, would keep the fit from settling.
+        It is asked after each subset, `whole` where that was the last of a pass.
         """
         n_views = self.data.geometry.n_views
         n = n_subsets(n_views)
         order, every = bit_reversed(n), max(REST, n // A_PASS)
         while self.steps < passes * n:
             turn, k = divmod(self.steps, n)
-            views, last = np.arange(order[k], n_views, n), turn + 1 == passes
-            self.loss = self._step(views, turn == 0 and k % every == 0, 1 / (1 + k / n) if last else 1.0)
+            length = 1 / (1 + max(self.steps / n - passes + min(SHORTER, max(passes // 2, 1)), 0))
+            self.loss = self._step(np.arange(order[k], n_views, n), turn == 0 and k % every == 0, length)
             self.steps, self._total = self.steps + 1, (self._total if k else 0.0) + self.loss
             if (k + 1) % every == 0 or k + 1 == n:
                 hundreds = (k % every + 1) / n * n_views / 100
