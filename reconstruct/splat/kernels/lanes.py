@@ -213,6 +213,25 @@ def decay(typingctx, a, least):
     return lanes(lanes, lanes), codegen
 
 
+def _shuffled(which: list[int], doc: str):
+    @_operation
+    def operation(typingctx, a, b):
+        def codegen(context, builder, signature, args):
+            return builder.shuffle_vector(*args, ir.Constant(_INTS, which))
+
+        return lanes(lanes, lanes), codegen
+
+    operation.__doc__ = doc
+    return operation
+
+
+_TURNS = [k + far for k in range(WIDTH) for far in (0, WIDTH)]
+evens = _shuffled([*range(0, 2 * WIDTH, 2)], "Every second lane of a and on through b, from the first.")
+odds = _shuffled([*range(1, 2 * WIDTH, 2)], "Every second lane of a and on through b, from the second.")
+lower = _shuffled(_TURNS[:WIDTH], "The lanes of a and b in turns, the first eight.")
+upper = _shuffled(_TURNS[WIDTH:], "The lanes of a and b in turns, the last eight.")
+
+
 @_operation
 def total(typingctx, a):
     """Return the sum of the eight lanes, by halves."""

@@ -25,15 +25,19 @@ from reconstruct.splat.kernels.lanes import (
     add,
     decay,
     div,
+    evens,
     fma,
     load,
+    lower,
     mul,
+    odds,
     pick,
     ramp,
     spread,
     sqrt,
     store,
     sub,
+    upper,
 )
 from reconstruct.splat.kernels.splat_cpu import (
     BOX,
@@ -152,7 +156,13 @@ def _window(at, scale, camera, z, bounds, size, place):
 @njit(cache=True, error_model="numpy", inline="always")
 def _weighted(values, bounds, table):
     """Write a run's values times peaks."""
-    for k in range(bounds[1] - bounds[0]):
+    n, half = bounds[1] - bounds[0], WIDTH // 2
+    whole = n // WIDTH * WIDTH
+    for k in range(0, whole, WIDTH):
+        a, b = load(values, bounds[0] + k, 0), load(values, bounds[0] + k + half, 0)  # channels in turns
+        store(table, FIRST, k, mul(evens(a, b), load(table, PEAKS, k)))
+        store(table, SECOND, k, mul(odds(a, b), load(table, PEAKS, k)))
+    for k in range(whole, n):
         table[FIRST, k] = values[bounds[0] + k, 0] * table[PEAKS, k]
         table[SECOND, k] = values[bounds[0] + k, 1] * table[PEAKS, k]
 
@@ -197,6 +207,20 @@ def forward(runs, values, scale, cameras, images):
         _forward_view(runs, values, scale, cameras[view], images[view])
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _add_runs_own(table, bounds, sums):
+    """Add both channels of a run's table to the sums of its splats."""
+    n, half = bounds[1] - bounds[0], WIDTH // 2
+    whole = n // WIDTH * WIDTH
+    for k in range(0, whole, WIDTH):
+        a, b, at = load(table, FIRST, k), load(table, SECOND, k), bounds[0] + k
+        store(sums, at, 0, add(lower(a, b), load(sums, at, 0)))  # channels in turns
+        store(sums, at + half, 0, add(upper(a, b), load(sums, at + half, 0)))
+    for k in range(whole, n):
+        sums[bounds[0] + k, 0] += table[FIRST, k]
+        sums[bounds[0] + k, 1] += table[SECOND, k]
+
+
 @njit(cache=True, error_model="numpy")
 def _backward_runs(chosen, runs, scale, camera, image, sums):
     xy, starts, z, tallest = runs
@@ -232,9 +256,7 @@ def _backward_runs(chosen, runs, scale, camera, image, sums):
                 b = fma(g, pick(profile, 1, v), b)
             store(table, FIRST, k, mul(a, load(table, PEAKS, k)))
             store(table, SECOND, k, mul(b, load(table, PEAKS, k)))
-        for k in range(n):
-            sums[bounds[0] + k, 0] += table[FIRST, k]
-            sums[bounds[0] + k, 1] += table[SECOND, k]
+        _add_runs_own(table, bounds, sums)
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
