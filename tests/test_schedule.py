@@ -15,6 +15,7 @@ from benchmarks.schedule import Costs, ordered
 from benchmarks.workers import Lost
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from reconstruct.splat.course import PASSES
 
 OPTIONS = run.Options(keep_volumes=False)
 CIRCLE = Geometry(
@@ -207,7 +208,7 @@ def test_a_method_that_never_ran_is_guessed_from_the_time_of_fdk(smallest, tmp_p
         ("fdk", {}, 1.0),
         ("sirt", {"iterations": 7}, 7 * FDKS["sirt"]),
         ("sirt", {"iterations": "many"}, None),
-        ("splat", {}, (7 + 3 / 15) * 1.5**3 * FDKS["splat"]),
+        ("splat", {}, (PASSES[1] + PASSES[0] / 15) * 1.5**3 * FDKS["splat"]),
         ("splat", {"passes": [15, 0], "fineness": 1}, FDKS["splat"]),
         ("splat", {"preset": "r2"}, 30_000 * FDKS["splat r2"]),
         ("splat", {"preset": "paper", "steps": 100}, 100 * FDKS["splat paper"]),
