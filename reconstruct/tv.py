@@ -116,7 +116,8 @@ def _primal(b, field, tau, ratios, support, positivity, x):
 def _ascend(x, start, ahead, dual, step, momentum, ratios):
     """Step the dual field from `start` up the slopes of x, back into the unit balls, and on by its momentum: `ahead`.
 
-    `start` may be one of the two that are written.
+    `start` may be one of the two that are written: all of a voxel's values are loaded before any is stored, and no
+    other voxel's step reads or writes them.
     """
     for i in prange(x.shape[0]):
         for j in range(x.shape[1]):
