@@ -5,7 +5,7 @@
 DATA is a dataset of scenes that stand in no table (`make-dataset tune DATA`). A line of OUT/settings.csv holds a
 method, its settings, the iterations done, and by scene PSNR3D in dB under the protocols `tissue` and `aligned`
 (effective spectrum). Iterations need no runs of their own: the volume is scored as it passes each number. The passes of
-`splat` are a setting, since the last one differs from the others.
+`splat` are a setting, since the last ones differ from the others.
 """
 
 import csv
@@ -35,7 +35,7 @@ VALUES: dict[str, dict[str, tuple[Any, ...]]] = {
     "fista-tv": {"tv": (0.0006, 0.0012, 0.005), "tv_iterations": (10, 40)},
     "asd-pocs": {"alpha": (0.005, 0.01, 0.05), "tv_steps": (10, 40)},
     "awpcsd": {"alpha": (0.01, 0.05), "delta": (0.5, 1.0, 4.0), "tv_steps": (10, 40)},
-    "splat": {"passes": ((3, 4), (3, 12), (8, 7)), "tv": (0.0, 0.0125, 0.05), "fineness": (1.0, 1.25)},
+    "splat": {"passes": ((3, 4), (3, 12), (8, 9)), "tv": (0.0, 0.0125, 0.05), "fineness": (1.0, 1.25)},
 }
 PROTOCOLS = ("tissue", "aligned")
 
