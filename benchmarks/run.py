@@ -27,18 +27,19 @@ from benchmarks.limited import refuse_unless_positive
 from benchmarks.methods import Method
 from benchmarks.protocol import Score, Stored
 from benchmarks.records import Cost, Record, Run
-from benchmarks.volumes import at_50kev_of, identity_of, read_volume, write_volume
+from benchmarks.volumes import identity_of, keep, read_volume
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:
     import torch
 
-    from ctsim.types import Scan
+    from ctsim.types import Scan, Volume
 
 log = logging.getLogger(__name__)
 
 STORE = "ctsim.store:open_scan"
 LATE = 120.0  # seconds beyond its own
+SCORED = ("ok", "diverged")  # a run's status
 WARM, WARM_UPS = 1.0, 5  # seconds that a warm-up lasts beyond compiling, where a method knows of time, and how often
 
 
@@ -202,7 +203,9 @@ class Runner:
             self._twin = None
         else:
             pair, self._twin = Twin(), (task, outcome)
-        return _record(task, outcome, (self._judge[1], pair), self._results, self._options)
+        record = _record(task, outcome, (self._judge[1], pair), self._results, self._options)
+        outcome.at_50kev = None  # a twin waits for its scan's run, which asks for the volume that was returned alone
+        return record
 
 
 def _twin(task: Task, last: tuple[Task, Outcome] | None, results: Path, options: Options) -> Twin:
@@ -255,34 +258,49 @@ def describe(error: BaseException) -> str:
 
 def attempt(method: Method, scan: "Scan", device: str, warm_up_seconds: float) -> Outcome:
     """Run a method in this process and turn whatever happens into an outcome."""
-    from ctsim.simulate import REFERENCE_KEV
-
     cost: dict[str, Any] = {"device": device, "warm_up": warm_up_seconds}
-    values, at_50kev, shown, said = None, None, {}, {}
+    volume, values, shown, said = None, None, {}, {}
     with measured() as usage:
         try:
             volume = method.reconstruct(scan, device)
             status, reason = str(volume.status), volume.reason
             values = _array(volume.values)
-            at_50kev = None if volume.at_energy is None else _array(volume.at_energy(REFERENCE_KEV))
             cost["view_updates"] = int(volume.details.get("view_updates", scan.geometry.n_views))
             shown = intermediates.taken(volume.details, scan.geometry)
             said = details.kept(volume.details)
-        except MemoryError as error:
-            status, reason = "out_of_memory", describe(error)
         except Exception as error:  # a method's failure is a result
-            log.debug("method %s failed", method.name, exc_info=True)
-            out_of_memory = type(error).__name__ == "OutOfMemoryError"  # torch's, for devices
-            status, reason = "out_of_memory" if out_of_memory else "error", describe(error)
-    outcome = Outcome(status=status, reason=reason, values=values, at_50kev=at_50kev, intermediates=shown, details=said)
+            status, reason = _failure(method, error)
+    outcome = Outcome(status=status, reason=reason, values=values, intermediates=shown, details=said)
     outcome.cost = Cost(wall=usage.wall, cpu=usage.cpu, peak_bytes=usage.peak_bytes, **{"view_updates": 0, **cost})
+    if volume is not None and status in SCORED:
+        _read_at_50kev(outcome, method, volume)
     return checked(outcome, scan.geometry.n_voxel)
+
+
+def _read_at_50kev(outcome: Outcome, method: Method, volume: "Volume") -> None:
+    """Add the volume at 50 keV where the method knows energies; what goes wrong there is the run's failure."""
+    from ctsim.simulate import REFERENCE_KEV
+
+    try:
+        outcome.at_50kev = None if volume.at_energy is None else _array(volume.at_energy(REFERENCE_KEV))
+    except Exception as error:
+        outcome.values = None
+        outcome.status, reason = _failure(method, error)
+        outcome.reason = f"the volume at 50 keV: {reason}"
+
+
+def _failure(method: Method, error: Exception) -> tuple[str, str]:
+    """Return the status and reason of a run that ended by an exception."""
+    log.debug("method %s failed", method.name, exc_info=error)
+    # torch has an error of its own for devices
+    out_of_memory = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
+    return "out_of_memory" if out_of_memory else "error", describe(error)
 
 
 def checked(outcome: Outcome, shape: tuple[int, int, int]) -> Outcome:
     """Turn a volume of another shape into an error and one that is not finite into that status."""
     for what, values in (("volume", outcome.values), ("volume at 50 keV", outcome.at_50kev)):
-        if values is None or outcome.status not in ("ok", "diverged"):
+        if values is None or outcome.status not in SCORED:
             continue
         if values.shape != shape:
             outcome.status, outcome.values, outcome.at_50kev = "error", None, None
@@ -344,16 +362,14 @@ def tiny(scan: "Scan") -> "Scan":
 def _record(task: Task, outcome: Outcome, by: tuple[Judge, Twin], results: Path, options: Options) -> Record:
     """Score an outcome and write its volume."""
     scores, kept, identity = {}, None, task.run.identity
-    if outcome.values is not None and outcome.status in ("ok", "diverged"):
+    if outcome.values is not None and outcome.status in SCORED:
         try:
             scores = by[0].scores(outcome.values, task.variant, by[1], outcome.at_50kev)
         except MemoryError as error:
             outcome.status, outcome.reason = "out_of_memory", f"while scoring: {describe(error)}"
     if outcome.values is not None and options.keep_volumes:
         kept = f"volumes/{task.file_name}"
-        write_volume(results / kept, outcome.values, identity)
-        if outcome.at_50kev is not None:
-            write_volume(at_50kev_of(results / kept), outcome.at_50kev, identity)
+        keep(results / kept, outcome.values, outcome.at_50kev, identity)
         if outcome.intermediates:
             beside = intermediates.path_of(results / kept)
             intermediates.write(beside, outcome.intermediates, identity)

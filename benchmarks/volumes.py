@@ -39,9 +39,25 @@ def write_volume(path: Path, values: NDArray[np.float32], identity: str = "") ->
             aside.unlink(missing_ok=True)
 
 
+def keep(path: Path, values: NDArray[np.float32], at_50kev: NDArray[np.float32] | None, identity: str) -> None:
+    """Write a run's volume, and beside it the one at 50 keV; without one, that of an earlier run of this name goes."""
+    write_volume(path, values, identity)
+    beside = at_50kev_of(path)
+    if at_50kev is None:
+        beside.unlink(missing_ok=True)
+    else:
+        write_volume(beside, at_50kev, identity)
+
+
 def at_50kev_of(path: Path) -> Path:
     """Return where the volume at 50 keV of a kept volume's run lies."""
-    return path.with_name(f"{path.stem}__50kev{path.suffix}")
+    return path.parent / "50kev" / path.name
+
+
+def own_at_50kev(path: Path, identity: str) -> Path | None:
+    """Return where the volume at 50 keV of a kept volume's run lies; None where that very run has none."""
+    beside = at_50kev_of(path)
+    return beside if identity_of(beside) == identity else None
 
 
 def identity_of(path: Path) -> str | None:

@@ -3,6 +3,7 @@ import math
 import os
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -98,6 +99,9 @@ def spectral(scan, *, device, flaw=None):
     """Know the attenuation at any energy, or return something else there."""
     at = {None: lambda kev: torch.full(scan.geometry.n_voxel, 1 / kev), "shape": lambda kev: torch.zeros(2, 3, 4)}
     at["nan"] = lambda kev: torch.full(scan.geometry.n_voxel, math.nan)
+    at["hungry"] = lambda kev: hungry(scan, device=device)
+    at["broken"] = lambda kev: broken(scan, device=device)
+    at["slow"] = lambda kev: time.sleep(1) or torch.zeros(scan.geometry.n_voxel)
     return dataclasses.replace(good(scan, device=device), at_energy=at[flaw])
 
 
@@ -106,14 +110,10 @@ def broken(scan, *, device):
 
 
 def slow(scan, *, device):
-    import time
-
     time.sleep(60)
 
 
 def punctual(scan, *, device, seconds=None):
-    import time
-
     time.sleep(0.2 if seconds is None else seconds)
     return good(scan, device=device)
 
@@ -123,8 +123,6 @@ CALLS = []
 
 def compiling(scan, *, device, seconds=None):
     """Take three calls until nothing is left to compile, as a method that stops when its seconds are over."""
-    import time
-
     CALLS.append(seconds)
     time.sleep(2.5 if len(CALLS) < 3 else 0)
     return good(scan, device=device)
@@ -291,11 +289,27 @@ def test_what_a_method_knows_of_50_kev_is_scored_there_and_kept(tmp_path, isolat
     assert not at_50kev_of(tmp_path / str(plain.volume)).exists()
 
 
-@pytest.mark.parametrize(("flaw", "status"), [("shape", "error"), ("nan", "nonfinite")])
+def test_a_rerun_without_a_volume_at_50_kev_leaves_none_of_an_earlier_one(tmp_path, monkeypatch):
+    kept = at_50kev_of(tmp_path / str(once("spectral", tmp_path).volume))
+    assert kept == tmp_path / "volumes/50kev/box__test_run_spectral.tif" and kept.exists()
+    monkeypatch.setattr(sys.modules[__name__], "spectral", good)
+    assert once("spectral", tmp_path, force=True).status == "ok" and not kept.exists()
+
+
+@pytest.mark.parametrize(
+    ("flaw", "status"), [("shape", "error"), ("nan", "nonfinite"), ("hungry", "out_of_memory"), ("broken", "error")]
+)
 def test_a_volume_at_50_kev_that_is_none_is_the_runs_failure(tmp_path, flaw, status):
     method = methods.find("test_run:spectral", {"flaw": flaw})
     outcome = run.attempt(method, double(tmp_path).scan, "cpu", 0.0)
     assert outcome.status == status and "volume at 50 keV" in outcome.reason
+    assert outcome.at_50kev is None or status == "nonfinite"
+    assert outcome.cost is not None and outcome.cost.view_updates == 12
+
+
+def test_reading_at_50_kev_is_no_time_of_the_method(tmp_path):
+    outcome = run.attempt(methods.find("test_run:spectral", {"flaw": "slow"}), double(tmp_path).scan, "cpu", 0.0)
+    assert outcome.status == "ok" and outcome.cost is not None and outcome.cost.wall < 0.5
 
 
 @pytest.mark.parametrize("isolate", [False, True])
