@@ -24,7 +24,10 @@ Format = Literal["md", "tex"]
 
 
 def tidy(records: list[Record]) -> pd.DataFrame:
-    """Return one row a number: scene, seed, variant, method, inputs, protocol, metric, value, status, identical."""
+    """Return one row a number, with its scene, seed, variant, method, inputs, protocol, metric, and the run's status.
+
+    `identical` and `volume` are those of the score.
+    """
     rows: list[dict[str, Any]] = []
     for record in latest(records):
         base = {
@@ -35,14 +38,13 @@ def tidy(records: list[Record]) -> pd.DataFrame:
             "inputs": record.inputs,
             "status": record.status,
         }
-        numbers = [(p, m, v, s.identical) for p, s in record.scores.items() for m, v in s.values.items()]
+        numbers = [(p, m, v, s.identical, s.volume) for p, s in record.scores.items() for m, v in s.values.items()]
         if record.cost is not None:
-            numbers += [("cost", m, float(getattr(record.cost, m)), False) for m in COLUMNS["cost"]]
-        rows += [{**base, "protocol": p, "metric": m, "value": v, "identical": i} for p, m, v, i in numbers]
-        if not numbers:
-            rows.append({**base, "protocol": "", "metric": "", "value": None, "identical": False})
-    columns = ["scene", "seed", "variant", "method", "inputs", "protocol", "metric", "value", "status", "identical"]
-    frame = pd.DataFrame(rows + derived(rows), columns=pd.Index(columns))
+            numbers += [("cost", m, float(getattr(record.cost, m)), False, "") for m in COLUMNS["cost"]]
+        names = ("protocol", "metric", "value", "identical", "volume")
+        rows += [base | dict(zip(names, row, strict=True)) for row in numbers or [("", "", None, False, "")]]
+    columns = ["scene", "seed", "variant", "method", "inputs", "protocol", "metric", "value", "status"]
+    frame = pd.DataFrame(rows + derived(rows), columns=pd.Index([*columns, "identical", "volume"]))
     frame["value"] = pd.to_numeric(frame["value"])
     return frame
 
@@ -52,14 +54,18 @@ def _rows(frame: pd.DataFrame) -> list[dict[Any, Any]]:
 
 
 def summary(records: list[Record]) -> pd.DataFrame:
-    """Return mean, std (over seeds, ddof 1) and n of every number, as table.csv holds it."""
+    """Return mean, std (over seeds, ddof 1) and n of every number, as table.csv holds it.
+
+    `volume` says which of the method's volumes was scored.
+    """
     frame = tidy(records)
     keys = ["scene", "variant", "method", "inputs", "protocol", "metric"]
     if frame.empty:
-        return pd.DataFrame(columns=[*keys, "mean", "std", "n", "status", "identical"])
+        return pd.DataFrame(columns=[*keys, "mean", "std", "n", "status", "identical", "volume"])
     grouped = frame.groupby(keys, sort=False, dropna=False)
     table = grouped["value"].agg(mean="mean", std="std", n="count")
-    table["status"] = grouped["status"].agg(lambda s: ", ".join(dict.fromkeys(s)))
+    for name in ("status", "volume"):
+        table[name] = grouped[name].agg(lambda s: ", ".join(dict.fromkeys(s)))
     table["identical"] = grouped["identical"].all()
     return table.reset_index()
 

@@ -216,6 +216,15 @@ def test_write_makes_three_files(tmp_path):
         tables.write([], tmp_path)
 
 
+def test_the_csv_says_which_volume_was_scored(tmp_path):
+    given = record()
+    own = msgspec.structs.replace(given.scores["tissue"], volume="read at 50 keV")
+    tables.write([msgspec.structs.replace(given, scores={**given.scores, "paper": own})], tmp_path)
+    frame = pd.read_csv(tmp_path / "table.csv", keep_default_na=False)
+    said = {(row.protocol, row.volume) for row in frame.itertuples()}
+    assert said == {("tissue", "as returned"), ("paper", "read at 50 keV"), ("against", "as returned"), ("cost", "")}
+
+
 def test_texts_that_differ_in_numbers_only_are_merged_to_ranges():
     assert tables.merged(["behind 9.5 mm", "behind 30.25 mm", "behind 12.0 mm"]) == "behind 9.5 to 30.25 mm"
     assert tables.merged(["50 keV", "behind 1.0 of 2.0", "behind 1.0 of 3.0"]) == "50 keV / behind 1.0 of 2.0 to 3.0"
