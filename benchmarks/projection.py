@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.protocol import AS_RETURNED, AT_50KEV, Score, Stored, Truth
+from benchmarks.protocol import AS_RETURNED, Score, Stored, Truth
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 
@@ -177,7 +177,7 @@ def projection_score(values: NDArray[Any], held: HeldOut | str, at_50kev: NDArra
         n_voxels=int(held.regions["body"].sum()),
         values=rmse_by_target(values, held, at_50kev),
         note=held.note,
-        volume=AS_RETURNED if at_50kev is None else f"as returned, for 50 keV {AT_50KEV}",
+        volume=AS_RETURNED if at_50kev is None else f"{AS_RETURNED}; against 50 keV, read there",
     )
 
 

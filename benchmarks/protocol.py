@@ -25,8 +25,8 @@ VERSION = 3
 """Part of every run's identity: a change of the protocol's meaning counts it up.
 
 1: tissue, aligned, paper, metal, cost. 2: every method runs on the metal-free twin too, for `artefact`.
-3: `projection`, and `rmse` of `artefact`. That what is held against 50 keV is read there counted nothing up: a method
-that can be read there is of newer code than those that were held against it otherwise.
+3: `projection`, and `rmse` of `artefact`. The version was not raised for `at_energy`: only new code has it, and code is
+part of the identity.
 """
 
 METAL_MARGIN = 2

@@ -8,6 +8,7 @@ import torch
 from conftest import SMALLEST
 
 from benchmarks import make_dataset, projection
+from benchmarks.judge import Judge, Twin
 from benchmarks.projection import REGIONS, HeldOut, half_way, held_out, projection_score, with_floor
 from benchmarks.protocol import truth_of
 from ctsim.geometry import Geometry
@@ -122,10 +123,16 @@ def test_scores_are_the_rmse_in_each_region():
     assert score.values["effective/body"] == 0 and score.n_voxels == 6 * 36
     spectral = projection_score(volume, held_double(volume, (0.5, 0.1)), np.zeros_like(volume))
     assert {k for k, v in spectral.values.items() if v != score.values[k]} == {f"50kev/{r}" for r in REGIONS}
-    assert spectral.volume == "as returned, for 50 keV read at 50 keV"
+    assert spectral.volume == "as returned; against 50 keV, read there"
     held = held_double(volume, (0.0, 0.0))
     empty = dataclasses.replace(held, regions=held.regions | {"trace": np.zeros_like(held.regions["trace"])})
     assert projection_score(volume, empty).values["noise_free/trace"] is None
+
+
+def test_the_judge_projects_what_was_read_at_50_kev_too(stored):
+    judge, (returned, other) = Judge.of(stored), truth_of(stored).references.values()
+    found = judge.scores(returned, "metal", Twin(), other)["projection"]
+    assert found == projection_score(returned, judge.views, other) != projection_score(returned, judge.views)
 
 
 def test_a_scan_without_its_recipe_says_so(stored, tmp_path):
