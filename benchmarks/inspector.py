@@ -2,7 +2,8 @@
 
 `run-benchmark inspect DATA RESULTS` reads a kept volume, `run-benchmark inspect DATA --method NAME`
 reconstructs one. Each row of the table changes one convention of the protocol `tissue`; conventions
-that are known from the literature as a whole follow.
+that are known from the literature as a whole follow. Where the reference is that of 50 keV the method's own volume at
+50 keV is scored, if it has one, as in the tables.
 """
 
 import sys
@@ -106,14 +107,18 @@ WHOLE: tuple[Convention, ...] = (
 )
 
 
-def score(values: Volume, truth: "Truth", how: Convention) -> tuple[float | None, float | None, float]:
+def score(
+    values: Volume, truth: "Truth", how: Convention, at_50kev: Volume | None = None
+) -> tuple[float | None, float | None, float]:
     """Return PSNR (dB), SSIM and the data range (in the units the volumes have after alignment).
 
-    Outside the region the volume counts as the reference in SSIM's window. None where a number does
-    not exist: identical volumes have no PSNR, an empty region has neither.
+    What is held against 50 keV is `at_50kev` where there is one. Outside the region the volume counts as the reference
+    in SSIM's window. None where a number does not exist: identical volumes have no PSNR, an empty region has neither.
     """
     from benchmarks import metrics
 
+    if how.reference == "50kev" and at_50kev is not None:
+        values = at_50kev
     reference = truth.references[how.reference]
     region = region_of(truth, how.region)
     data_range = range_of(values, truth, how)
@@ -219,13 +224,13 @@ def similarity(
     return float(mean) if region.all() else float(full[region].mean(dtype=np.float64))
 
 
-def table(values: Volume, truth: "Truth") -> Iterator[list[str]]:
+def table(values: Volume, truth: "Truth", at_50kev: Volume | None = None) -> Iterator[list[str]]:
     """Yield the cells of each row: what changes, the convention, range, PSNR and SSIM with their changes."""
     base = score(values, truth, BASE)
     yield ["–", BASE.title, f"{base[2]:.4g}", _cell(base[0], None, 2), _cell(base[1], None, 3)]
     for what, conventions in (*SINGLE.items(), ("all of it", WHOLE)):
         for how in conventions:
-            psnr, ssim, data_range = score(values, truth, how)
+            psnr, ssim, data_range = score(values, truth, how, at_50kev)
             yield [what, how.title, f"{data_range:.4g}", _cell(psnr, base[0], 2), _cell(ssim, base[1], 3)]
 
 
@@ -235,26 +240,29 @@ def _cell(value: float | None, base: float | None, digits: int) -> str:
     return f"{value:.{digits}f}" + ("" if base is None else f" ({value - base:+.{digits}f})")
 
 
-def markdown(values: Volume, stored: "Stored", label: str) -> str:
-    """Return the table in Markdown with what it shows; the volume is [z, y, x] in 1/mm and finite."""
+def markdown(values: Volume, stored: "Stored", label: str, at_50kev: Volume | None = None) -> str:
+    """Return the table in Markdown with what it shows; volumes are [z, y, x] in 1/mm and finite."""
     from benchmarks.protocol import TISSUE, truth_of
 
     truth = truth_of(stored)
-    if values.shape != truth.metal.shape:
-        raise InputError(f"the volume has shape {values.shape}, scan {stored.name!r} {truth.metal.shape}")
-    if not np.isfinite(values).all():
-        raise InputError(f"the volume of {label} has voxels that are not finite: it has no scores")
+    for volume, which in ((values, "volume"), (at_50kev, "volume at 50 keV")):
+        if volume is not None and volume.shape != truth.metal.shape:
+            raise InputError(f"the {which} has shape {volume.shape}, scan {stored.name!r} {truth.metal.shape}")
+        if volume is not None and not np.isfinite(volume).all():
+            raise InputError(f"the {which} of {label} has voxels that are not finite: it has no scores")
+    what, own = "volume", "the same volume, the only one there is,"
+    if at_50kev is not None:
+        what, own = "run", "the method's own volume at 50 keV"
     rows = [["changed", "convention", "range", "PSNR3D (dB)", "SSIM3D"], ["---", "---", "---:", "---:", "---:"]]
-    rows += list(table(values, truth))
+    rows += list(table(values, truth, at_50kev))
     return (
-        f"# One volume, many scores: {stored.name}, {label}\n\n"
+        f"# One {what}, many scores: {stored.name}, {label}\n\n"
         f"First the protocol tissue: region {TISSUE}; reference effective spectrum behind {truth.l0:.1f} mm of water; "
         "no alignment; nothing clipped; range the 99.9 percentile of the reference in the region; SSIM with Gaussian "
         "weights in slices along three axes. Each row changes what its first column says; a range follows its rule, so "
-        "that another reference has another one. The last rows are conventions as they are printed. In brackets the "
-        "change; ranges are 1/mm, but for volumes scaled to [0, 1].\n\n"
-        + "\n".join("| " + " | ".join(row) + " |" for row in rows)
-        + "\n"
+        f"that another reference has another one. Where the reference is 50 keV, {own} is scored. "
+        "The last rows are conventions as they are printed. In brackets the change; ranges are 1/mm, but for volumes "
+        "scaled to [0, 1].\n\n" + "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
     )
 
 
@@ -262,8 +270,8 @@ def main(arguments: list[str]) -> int:
     """Run the command; return 0. Raises InputError where data, volume or method cannot be used."""
     given = tyro.cli(Arguments, prog="run-benchmark inspect", args=arguments)
     stored = _scan(given)
-    values, label = _kept(given, stored) if given.results is not None else _made(given, stored)
-    text = markdown(values, stored, label)
+    values, label, at_50kev = _kept(given, stored) if given.results is not None else _made(given, stored)
+    text = markdown(values, stored, label, at_50kev)
     name = "".join(c if c.isalnum() or c in "-.=" else "_" for c in f"inspect-{stored.name}-{label}")
     path = given.out or (given.results or Path()) / f"{name}.md"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -284,10 +292,10 @@ def _scan(given: Arguments) -> "Stored":
     return open_scan(scans[name])
 
 
-def _kept(given: Arguments, stored: "Stored") -> tuple[Volume, str]:
-    """Read the volume that a results folder keeps of a scan and method."""
+def _kept(given: Arguments, stored: "Stored") -> tuple[Volume, str, Volume | None]:
+    """Read the volumes that a results folder keeps of a scan and method."""
     from benchmarks import records
-    from benchmarks.volumes import identity_of, read_volume
+    from benchmarks.volumes import identity_of, own_at_50kev, read_volume
 
     assert given.results is not None
     found, _ = records.read_all(given.results)
@@ -307,10 +315,11 @@ def _kept(given: Arguments, stored: "Stored") -> tuple[Volume, str]:
     values = read_volume(path)
     if identity_of(path) != kept[label].identity:
         raise InputError(f"{path}: is not the volume of the last record of {label}; run it again with --force")
-    return values, label
+    own = own_at_50kev(path, kept[label].identity)
+    return values, label, None if own is None else read_volume(own)
 
 
-def _made(given: Arguments, stored: "Stored") -> tuple[Volume, str]:
+def _made(given: Arguments, stored: "Stored") -> tuple[Volume, str, Volume | None]:
     """Reconstruct the scan."""
     from benchmarks import methods
     from benchmarks.devices import check_device
@@ -326,4 +335,4 @@ def _made(given: Arguments, stored: "Stored") -> tuple[Volume, str]:
     outcome = attempt(method, scan, given.device, 0.0)
     if outcome.status != "ok" or outcome.values is None:
         raise InputError(f"method {given.method!r} ended as {outcome.status}: {outcome.reason}")
-    return outcome.values, method.label
+    return outcome.values, method.label, outcome.at_50kev

@@ -16,17 +16,18 @@ from benchmarks.panels import Look, cut, look_of
 from benchmarks.protocol import Stored, Truth, truth_of
 from benchmarks.records import Record, latest, read_all
 from benchmarks.run import repetition
-from benchmarks.volumes import identity_of
+from benchmarks.volumes import identity_of, map_volume, own_at_50kev
 from ctsim.errors import InputError
 from ctsim.store import list_scans, open_scan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kept:
-    """One method's record and its volume [z, y, x] in 1/mm."""
+    """One method's record and its volume [z, y, x] in 1/mm; that at 50 keV of a method that knows energies."""
 
     record: Record
     values: NDArray[Any]
+    at_50kev: NDArray[Any] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,14 +59,14 @@ class Case:
 
 def case_of(stored: Stored, records: list[Record], results: Path) -> Case:
     """Collect what `results` keeps of a scan; volumes of other data, parameters or code are left out."""
-    import tifffile
-
     kept = []
     for record in latest(records):
         path = results / record.volume if record.volume else None
         mine = record.run.scan == stored.content_hash and record.run.variant == "metal" and record.scores
         if mine and path is not None and identity_of(path) == record.identity:
-            kept.append(Kept(record=record, values=tifffile.memmap(path, mode="r")))
+            own = own_at_50kev(path, record.identity)
+            at_50kev = None if own is None else map_volume(own)
+            kept.append(Kept(record=record, values=map_volume(path), at_50kev=at_50kev))
     scene, seed = repetition(stored)
     truth = truth_of(stored)
     look = look_of(truth, None, np.zeros(0, np.bool_), water_attenuation(stored))

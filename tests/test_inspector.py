@@ -1,3 +1,4 @@
+import dataclasses
 import math
 import sys
 
@@ -8,8 +9,9 @@ from test_metrics import truth
 
 from benchmarks import cli, inspector, records
 from benchmarks.inspector import BASE, SINGLE, WHOLE, Convention, score
-from benchmarks.protocol import evaluate
-from benchmarks.volumes import write_volume
+from benchmarks.protocol import AT_50KEV, evaluate
+from benchmarks.volumes import at_50kev_of, write_volume
+from reconstruct.fdk import reconstruct as fdk
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +38,16 @@ def test_the_protocols_are_among_the_conventions(case):
     # scikit-image sums squares in float32 for float32 volumes: 1e-7 of the MSE is 4e-7 dB; ten times that
     expected = peak_signal_noise_ratio(t.references["50kev"], volume, data_range=2.0)
     assert score(*case, how("NAF"))[0] == pytest.approx(expected, abs=5e-6)
+
+
+def test_what_is_held_against_50_kev_is_the_methods_own_volume_there(case):
+    volume, t = case
+    own = (t.references["50kev"] + np.float32(0.001)).astype(np.float32)
+    paper = evaluate(volume, t, at_50kev=own)["paper"].values
+    assert score(volume, t, how("protocol paper"), own)[:2] == (paper["psnr3d"], paper["ssim3d"])
+    at_50kev = {c.title for c in (*WHOLE, *SINGLE["reference"]) if c.reference == "50kev"}
+    pairs = zip(inspector.table(volume, t, own), inspector.table(volume, t), strict=True)
+    assert {a[1] for a, b in pairs if a != b} == at_50kev
 
 
 def test_a_range_moves_the_psnr_by_its_ratio(case):
@@ -103,6 +115,12 @@ def test_clipping_is_closed_form():
     assert score(volume, t, how("to [0, 1]"))[0] == pytest.approx(psnr(0, 1.0), abs=1e-5)
 
 
+def spectral(scan, *, device):
+    """FDK, and something else at 50 keV."""
+    volume = fdk(scan, device=device)
+    return dataclasses.replace(volume, at_energy=lambda kev: volume.values * (60 / kev))
+
+
 def command(monkeypatch, capsys, *arguments):
     monkeypatch.setattr(sys, "argv", ["run-benchmark", *map(str, arguments)])
     code = cli.run_benchmark()
@@ -131,6 +149,21 @@ def test_the_command_shows_a_kept_volume_and_writes_the_table(smallest, results,
     assert code == 0 and (results / "again.md").read_text(encoding="utf-8") == text
 
 
+def test_the_table_of_a_method_that_knows_energies_agrees_with_its_record(smallest, tmp_path, monkeypatch, capsys):
+    chosen = ("--method", "test_inspector:spectral")
+    assert command(monkeypatch, capsys, smallest, tmp_path, *chosen, "--no-anchor")[0] == 0
+    (record,) = records.read_all(tmp_path)[0]
+    assert record.scores["paper"].volume == AT_50KEV and record.volume is not None
+    paper = record.scores["paper"].values["psnr3d"]
+    for source in ((tmp_path,), (*chosen, "--out", tmp_path / "made.md")):
+        code, said = command(monkeypatch, capsys, "inspect", smallest, *source)
+        assert code == 0 and "the method's own volume at 50 keV is scored" in said.out
+        (row,) = (line for line in said.out.splitlines() if "| protocol paper |" in line)
+        assert f"| {paper:.2f} (" in row
+    write_volume(at_50kev_of(tmp_path / record.volume), np.zeros((10, 12, 12), np.float32), "another run")
+    assert "the same volume" in command(monkeypatch, capsys, "inspect", smallest, tmp_path)[1].out
+
+
 def test_errors_are_one_sentence_and_code_2(smallest, results, tmp_path, monkeypatch, capsys):
     cases = [
         ((tmp_path / "nothing", results), "nothing"),
@@ -157,5 +190,8 @@ def test_a_volume_that_has_no_scores_is_refused(case, smallest):
     stored = open_scan(list_scans(smallest)[0])
     with pytest.raises(InputError, match="shape"):
         inspector.markdown(case[0], stored, "fdk")
+    right = np.zeros((10, 12, 12), np.float32)
+    with pytest.raises(InputError, match="volume at 50 keV has shape"):
+        inspector.markdown(right, stored, "fdk", case[0])
     with pytest.raises(InputError, match="not finite"):
         inspector.markdown(np.full((10, 12, 12), np.nan), stored, "fdk")

@@ -18,6 +18,7 @@ import pytest
 from PIL import Image
 
 from benchmarks import cli, cli_run, host, lines, make_dataset, stress_records, tables
+from benchmarks.volumes import at_50kev_of, write_volume
 from ctsim.errors import InputError
 from reports import figures, kept, markdown, report, slices, view
 
@@ -410,6 +411,19 @@ def test_without_ipywidgets_the_viewer_says_what_to_install(case, monkeypatch):
     monkeypatch.setitem(sys.modules, "ipywidgets", None)
     with pytest.raises(InputError, match=r"ctsim\[notebook\]"):
         view.viewer(case)
+
+
+def test_a_case_holds_the_volume_at_50_kev_of_that_very_run(smallest, results, case):
+    first = case.kept[0]
+    at_50kev = at_50kev_of(results / str(first.record.volume))
+    try:
+        for identity, found in ((first.record.identity, True), ("another run", False)):
+            write_volume(at_50kev, np.ones(first.values.shape, np.float32), identity)
+            own = kept.open_case(smallest, results).kept[0].at_50kev
+            assert (own is not None) == found and (own is None or (own == 1).all())
+    finally:
+        at_50kev.unlink()
+    assert all(k.at_50kev is None for k in case.kept)
 
 
 # Notebooks

@@ -14,6 +14,7 @@
 # # One volume, many scores
 # PSNR and SSIM are not numbers of a volume but of a volume and a convention. Here one kept volume is scored under the
 # protocol `tissue`, then with one thing changed at a time. The same table comes from `run-benchmark inspect`.
+# Conventions with the reference of 50 keV score a method's own volume at 50 keV, if it has one, here and below.
 #
 # The folders are `data` and `results`, or what the environment variables `CTSIM_DATA` and `CTSIM_RESULTS` name.
 
@@ -34,7 +35,7 @@ first = case.kept[0]
 values = np.asarray(first.values)
 
 # %%
-show.text(inspector.markdown(values, case.stored, first.record.label))
+show.text(inspector.markdown(values, case.stored, first.record.label, first.at_50kev))
 
 # %% [markdown]
 # ## How far each convention moves the scores
@@ -44,7 +45,7 @@ show.text(inspector.markdown(values, case.stored, first.record.label))
 # %%
 base_psnr, base_ssim, _ = inspector.score(values, case.truth, inspector.BASE)
 named = [(what, how) for what, group in (*inspector.SINGLE.items(), ("all of it", inspector.WHOLE)) for how in group]
-moved = [(what, how, inspector.score(values, case.truth, how)) for what, how in named]
+moved = [(what, how, inspector.score(values, case.truth, how, first.at_50kev)) for what, how in named]
 kinds = list(dict.fromkeys(what for what, _ in named))
 
 drawing = Figure(figsize=(9.5, 0.27 * len(moved) + 1.2), layout="constrained")
@@ -68,7 +69,7 @@ show.figure(drawing, "metrics-conventions")
 # %%
 rows = []
 for how in (inspector.BASE, *(how for _, how in named)):
-    found = {k.record.label: inspector.score(np.asarray(k.values), case.truth, how)[0] for k in case.kept}
+    found = {k.record.label: inspector.score(k.values, case.truth, how, k.at_50kev)[0] for k in case.kept}
     known = {label: psnr for label, psnr in found.items() if psnr is not None}
     rows.append([how.title, " > ".join(sorted(known, key=lambda label: -known[label])) or "–"])
 show.table(["convention", "order by PSNR3D"], rows)
