@@ -37,7 +37,8 @@ SETTLED = 4
 What is then smoothed away too far is regained from the data, while streaks come back slowly.
 """
 SHORTER = 2
-"""Last passes, one of three or less, in which steps shorten: to a half after the first and to a third after the second.
+"""So many last passes, but one where there are three or fewer, shorten their steps as 1/(1 + t) after t passes: to 1/2
+after one, 1/3 after two.
 
 Subsets that disagree, by noise or by what no model explains, would keep the fit from settling.
 """
@@ -91,8 +92,8 @@ class Fit:
         order, every = bit_reversed(n), max(REST, n // A_PASS)
         while self.steps < passes * n:
             turn, k = divmod(self.steps, n)
-            length = 1 / (1 + max(self.steps / n - passes + min(SHORTER, max(passes // 2, 1)), 0))
-            self.loss = self._step(np.arange(order[k], n_views, n), turn == 0 and k % every == 0, length)
+            views, length = np.arange(order[k], n_views, n), step_length(self.steps / n, passes)
+            self.loss = self._step(views, turn == 0 and k % every == 0, length)
             self.steps, self._total = self.steps + 1, (self._total if k else 0.0) + self.loss
             if (k + 1) % every == 0 or k + 1 == n:
                 hundreds = (k % every + 1) / n * n_views / 100
@@ -180,6 +181,11 @@ class Fit:
 def n_subsets(n_views: int) -> int:
     """Return into how many subsets the views fall, each of which makes a step."""
     return min(max(n_views // SUBSET, LEAST_SUBSETS), n_views)
+
+
+def step_length(done: float, passes: int) -> float:
+    """Return the length of a step after `done` of so many passes."""
+    return 1 / (1 + max(done - passes + min(SHORTER, max(passes // 2, 1)), 0))
 
 
 def bit_reversed(n: int) -> list[int]:
