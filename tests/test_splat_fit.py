@@ -1,6 +1,8 @@
 """The splat reconstructor's default: levels, carving, the material curve, and what it makes of a small scan."""
 
 import dataclasses
+import math
+import pickle
 
 import msgspec
 import numpy as np
@@ -23,7 +25,7 @@ from reconstruct.splat.curve import MATERIALS, MaterialCurve
 from reconstruct.splat.lattice import Lattice
 from reconstruct.splat.level import Data, carve, coarser, refined, weighted
 from reconstruct.splat.method import reconstruct
-from reconstruct.splat.ordered import Fit, bit_reversed
+from reconstruct.splat.ordered import Fit, bit_reversed, step_length
 from reconstruct.splat.response import evaluate, make_response
 from reconstruct.watch import listen
 
@@ -187,6 +189,21 @@ def test_two_passes_over_the_finest_grid_reach_35_db(tmp_path):
     assert psnr3d(volume.values.numpy(), reference, data_range=float(np.ptp(reference))) > 35
 
 
+@pytest.mark.parametrize(
+    "passes, begins",
+    [
+        (1, [1]),
+        (3, [1, 1, 1]),
+        (4, [1, 1, 1, 1 / 2]),
+        (9, [1, 1, 1, 1, 1, 1, 1, 1, 1 / 2]),
+    ],
+)
+def test_steps_shorten_in_the_last_passes(passes, begins):
+    assert [step_length(float(k), passes) for k in range(passes)] == begins
+    assert step_length(passes - 0.5, passes) == 1 / (2.5 if passes > 3 else 1.5)
+    assert step_length(float(passes), passes) == 1 / (3 if passes > 3 else 2)
+
+
 def test_shorter_steps_in_the_last_passes_let_the_fit_settle(small, monkeypatch):
     given, thin = small.scan, 300  # of the dose, so that subsets disagree by noise
     signal = np.maximum(given.counts.numpy().astype(np.float64) - given.dark, 0) / thin
@@ -196,8 +213,8 @@ def test_shorter_steps_in_the_last_passes_let_the_fit_settle(small, monkeypatch)
     settled = tissue_score(reconstruct(scan).values.numpy(), truth).values
     monkeypatch.setattr(Fit, "_step", lambda fit, views, measure, length: step(fit, views, measure, 1.0))
     restless = tissue_score(reconstruct(scan).values.numpy(), truth).values
-    assert settled["rmse"] < 0.985 * restless["rmse"]  # measured: 0.970
-    assert settled["ssim3d"] > restless["ssim3d"] + 0.003  # 0.912 and 0.905
+    assert settled["rmse"] < 0.985 * restless["rmse"]  # measured: 0.957
+    assert settled["ssim3d"] > restless["ssim3d"] + 0.003  # 0.897 and 0.886
 
 
 def test_progress_goes_from_the_first_subset_to_the_whole(small):
@@ -244,6 +261,7 @@ def test_an_empty_scan_gives_an_empty_volume_that_says_so(stored):
     open_field = scan.flat.expand(scan.counts.shape).to(scan.counts.dtype)
     volume = reconstruct(dataclasses.replace(scan, counts=open_field))
     assert not volume.values.any() and "empty" in volume.details["limitation"]
+    assert volume.at_energy is not None and torch.equal(volume.at_energy(50.0), volume.values)
 
 
 def test_it_stops_when_its_seconds_are_over(stored):
@@ -347,6 +365,17 @@ def test_time_that_ran_out_can_be_given_later_also_for_another_read_out(small, t
     assert late.at_energy is not None and torch.equal(late.at_energy(60.0), late.values)
     assert torch.equal(late.at_energy(50.0), reconstruct(small.scan, passes=(1, 1), readout=50.0).values)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_volume_can_be_pickled_and_read_at_any_energy_that_there_is(small):
+    volume = reconstruct(small.scan, passes=(1, 0))
+    again = pickle.loads(pickle.dumps(volume))
+    assert volume.at_energy is not None and torch.equal(again.at_energy(70.0), volume.at_energy(70.0))
+    for wrong in (0.0, -50.0, math.inf, math.nan, "50"):
+        with pytest.raises(InputError, match="positive energy in keV"):
+            volume.at_energy(wrong)
+        with pytest.raises(InputError, match="positive energy in keV"):
+            reconstruct(small.scan, readout=wrong)
 
 
 def test_a_budget_counts_what_was_spent_before_an_interruption(small, tmp_path):

@@ -6,6 +6,7 @@ enter.
 """
 
 import dataclasses
+import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,11 +54,12 @@ class Settings:
     levels. The finest grid is `fineness` times that of the volume, at most as fine as the detector's pixels at the
     isocentre. Its splats are projected by EWA, or if `exact` by their exact line integrals. `response` "tube" is a tube
     behind `filtration` mm of aluminium, seen by a scintillator; "known" takes `tube` and `detector`, tables of a scene
-    file, whole or in part. `readout` is an energy in keV, or "hardened": by the object's own water. After `seconds`,
-    those before an interruption included, it returns what there is. `checkpoints` is a folder where an unfinished fit
-    is kept each minute and goes on from, "" for none. `scatter` is what every reading holds of it over the open field
-    (S/I0); None has it found in the pixels that no shadow reaches (`open_excess`), 0 is for scans whose open pixels are
-    brighter than their open field for another reason. Raises InputError for values that make no sense.
+    file, whole or in part. `readout`, of the volume that is returned, is an energy in keV, or "hardened": by the
+    object's own water; `Volume.at_energy` gives the volume at any other. After `seconds`, those before an interruption
+    included, it returns what there is. `checkpoints` is a folder where an unfinished fit is kept each minute and goes
+    on from, "" for none. `scatter` is what every reading holds of it over the open field (S/I0); None has it found in
+    the pixels that no shadow reaches (`open_excess`), 0 is for scans whose open pixels are brighter than their open
+    field for another reason. Raises InputError for values that make no sense.
     """
 
     passes: tuple[int, int] | None = None
@@ -85,9 +87,8 @@ class Settings:
         if self.response not in RESPONSES:
             raise InputError(f"response of preset 'fast' must be one of {', '.join(RESPONSES)}, got {self.response!r}")
         refuse_beam(self.response, self.tube, self.detector)
-        at_energy = isinstance(self.readout, int | float) and math.isfinite(self.readout) and self.readout > 0
-        if self.readout != "hardened" and not at_energy:
-            raise InputError(f"readout must be 'hardened' or a positive energy in keV, got {self.readout!r}")
+        if self.readout != "hardened":
+            _refuse_unless_energy(self.readout, "readout must be 'hardened' or a positive energy in keV")
 
     def make_response(self, e_max: float) -> Response:
         """Build the response for a scan of greatest energy `e_max` (keV)."""
@@ -116,7 +117,9 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     if fit is None:
         blind = bool(clamped.all())
         details["limitation"] = f"{'no reading is of use' if blind else 'no ray met anything'}: the volume is empty"
-        return Volume(values=torch.zeros(scan.geometry.n_voxel), details=details)
+        nothing = np.zeros((2, *scan.geometry.n_voxel), np.float32)
+        at_energy = functools.partial(_at_energy, nothing, response)
+        return Volume(values=torch.zeros(scan.geometry.n_voxel), details=details, at_energy=at_energy)
     values, rho, how = _read(fit, settings, scan.geometry)
     status, reason = _verdict(fit, values)
     details |= {
@@ -130,7 +133,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         status=status,
         reason=reason,
         details=details,
-        at_energy=lambda kev: torch.from_numpy(_summed(_at(kev, response), rho)),
+        at_energy=functools.partial(_at_energy, rho, response),
     )
 
 
@@ -200,6 +203,17 @@ def _read(fit: Fit, settings: Settings, geometry: Geometry) -> tuple[Image, Imag
         weights, how = _at(settings.readout, fit.response), f"at {settings.readout:g} keV"
     rho = voxelise(fit.lattice.splats(fit.curve.densities_of(fit.u)), geometry)
     return _summed(weights, rho), rho, how
+
+
+def _at_energy(rho: Image, response: Response, kev: float) -> torch.Tensor:
+    """Return the attenuation in 1/mm at an energy; a function of the module, so that volumes can be pickled."""
+    _refuse_unless_energy(kev, "at_energy must be asked for a positive energy in keV")
+    return torch.from_numpy(_summed(_at(kev, response), rho))
+
+
+def _refuse_unless_energy(kev: Any, expected: str) -> None:
+    if not (isinstance(kev, int | float) and math.isfinite(kev) and kev > 0):
+        raise InputError(f"{expected}, got {kev!r}")
 
 
 def _at(kev: float, response: Response) -> tuple[float, float]:
