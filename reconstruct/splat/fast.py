@@ -212,7 +212,7 @@ def _at_energy(rho: Image, response: Response, kev: float) -> torch.Tensor:
 
 
 def _refuse_unless_energy(kev: Any, expected: str) -> None:
-    if not (isinstance(kev, int | float) and math.isfinite(kev) and kev > 0):
+    if not (isinstance(kev, int | float | np.floating) and math.isfinite(kev) and kev > 0):
         raise InputError(f"{expected}, got {kev!r}")
 
 

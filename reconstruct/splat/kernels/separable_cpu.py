@@ -54,8 +54,8 @@ from reconstruct.splat.kernels.splat_cpu import (
 
 RUNS = 256  # in a task of the transpose
 SLACK = 1e-3  # of a splat and of a row: ranges are wider by that, so that the cutoff alone decides, not rounding
-HALF = 0.5 * math.log2(math.e)  # exponents are of 2, which saves a product each
-ROW, FALLING, PEAKS, FIRST, SECOND = range(5)  # of a run's table [5, splat]: row, −HALF/S_vv, peak, two channels
+HALF_LOG2E = 0.5 * math.log2(math.e)  # exponents are of 2, which saves a product each
+ROW, FALLING, PEAKS, FIRST, SECOND = range(5)  # of a run's table [5, splat]: row, −HALF_LOG2E/S_vv, peak, two channels
 # what a run has in common: u, S_uu, v per mm of z, S_vv's two parts, |ray|²'s two, and the peak over √S_vv
 U0, S_UU, PER_Z, S_VV, S_VV_2, RAY, RAY_2, W0 = range(8)
 PLACE = 8
@@ -95,12 +95,12 @@ def _row(camera, place, z):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _shadows(camera, place, z, bounds, table):
-    """Write the rows, −HALF/S_vv and peaks of a run's splats."""
+    """Write the rows, −HALF_LOG2E/S_vv and peaks of a run's splats."""
     source, origin = spread(np.float32(-camera[SOURCE + 2])), spread(np.float32(-camera[ORIGIN_V]))
     per_z, peak = spread(np.float32(place[PER_Z])), spread(np.float32(place[W0]))
     across, along = spread(np.float32(place[S_VV])), spread(np.float32(place[S_VV_2]))
     ray, ray_2 = spread(np.float32(place[RAY])), spread(np.float32(place[RAY_2]))
-    one, half = spread(np.float32(1)), spread(np.float32(-HALF))
+    one, half = spread(np.float32(1)), spread(np.float32(-HALF_LOG2E))
     for i in range(bounds[0], bounds[1], WIDTH):
         cz = add(load(z, 0, i), source)
         at = mul(per_z, cz)
@@ -120,7 +120,7 @@ def _columns(camera, place, n_u):
 @njit(cache=True, error_model="numpy", inline="always")
 def _gains(camera, place, left, right, gains):
     """Write to gains [1, u − left] what the columns left … right − 1 have of a shadow."""
-    falling, least = spread(np.float32(-HALF / place[S_UU])), _least(camera)
+    falling, least = spread(np.float32(-HALF_LOG2E / place[S_UU])), _least(camera)
     for u in range(left, right, WIDTH):
         t = ramp(np.float32(u - place[U0]))
         store(gains, 0, u - left, decay(mul(mul(t, t), falling), least))
@@ -128,8 +128,8 @@ def _gains(camera, place, left, right, gains):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _least(camera):
-    """Return the exponent at the cutoff."""
-    return spread(np.float32(-HALF * camera[CUTOFF] * camera[CUTOFF]))
+    """Return the exponent of 2 at the cutoff."""
+    return spread(np.float32(-HALF_LOG2E * camera[CUTOFF] * camera[CUTOFF]))
 
 
 @njit(cache=True, error_model="numpy")
