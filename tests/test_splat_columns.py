@@ -9,6 +9,7 @@ from ctsim.geometry import Geometry
 from reconstruct.splat.columns import LatticeProjector
 from reconstruct.splat.kernels import separable_cpu as kernels
 from reconstruct.splat.kernels import splat_reference as reference
+from reconstruct.splat.kernels.lanes import WIDTH, decay, load, spread, store
 from reconstruct.splat.lattice import Lattice
 from reconstruct.splat.project import CUTOFF, Projector
 
@@ -96,6 +97,19 @@ def test_each_column_is_its_product_of_gaussians_to_float32():
         beyond = found[0][~inside]
         assert np.minimum(abs(beyond), abs(beyond - expected[~inside])).max() < 1e-5 * peak  # cut off, or right
         np.testing.assert_allclose(found[1], -2 * found[0], rtol=1e-6)
+
+
+@numba.njit
+def powers(exponents, least, out):
+    for k in range(0, exponents.shape[1], WIDTH):
+        store(out, 0, k, decay(load(exponents, 0, k), spread(least)))
+
+
+def test_powers_of_two_are_right_down_to_the_cutoff_and_none_beyond():
+    exponents = np.linspace(-300, 0, 1 << 16, dtype=np.float32)[None]
+    least, found = np.float32(-0.5 * np.log2(np.e) * CUTOFF**2), np.empty_like(exponents)
+    powers(exponents, least, found)
+    np.testing.assert_allclose(found, np.where(exponents >= least, 2.0**exponents, 0), rtol=4e-6, atol=0)
 
 
 def on_the_rim(geometry, lattice, below):
