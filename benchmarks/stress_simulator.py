@@ -313,12 +313,12 @@ def beside_float64(side: int, found: Findings) -> None:
     rule, background = Response.of(plan.rule, tracer.materials), tracer.background(where, 0)
     solids = (tracer.prims, inflate(tracer.prims, pose), everywhere(shape, len(tracer.prims)))
     spans, order = np.tile(np.array([0, shape[1]]), (shape[0], 1)), work_order(-(-shape[0] // raytrace_cpu.STRIP))
-    edge = (rule.edge_mu, EDGE_THRESHOLD, STEP_THRESHOLD, plan.settings.subrays)
+    edge = (rule.edge_mu, EDGE_THRESHOLD, STEP_THRESHOLD, plan.settings.subrays, plan.settings.edge_tolerance)
     logs = []
     for kernel, kind in ((raytrace_cpu, np.float32), (raytrace_reference, np.float64)):
         m1, m2 = np.ones(shape, kind), np.ones(shape, kind)
         energies = (rule.mu, rule.w1, rule.w2)
-        kernel.transmit_view(tracer.bricks[:5], solids, pose, order, spans, background, energies, edge, m1, m2)
+        kernel.transmit_view(tracer.bricks[:5], solids, pose, order, spans, background, energies, edge, True, m1, m2)
         logs.append(np.log(np.stack([m1, m2]).astype(np.float64)))
     # the exponential is good to 4e-7·max(1, P/4) and so are the sums; lengths of 50 mm to 8e-6 mm, by 0.5/mm
     found.at_most("largest |ΔP| of float32", float(np.abs(logs[0] - logs[1]).max()), 2e-5)

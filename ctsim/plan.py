@@ -138,7 +138,7 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
     rule = _rule(phantom, scanner, simulation, source, found.lengths)
     _check_bowtie(scanner, rule)
     twin = _has_twin(phantom, truth)
-    tried = trial(tracer, scanner.geometry, Response.of(rule, tracer.materials), subrays=simulation.subrays, twin=twin)
+    tried = trial(tracer, scanner.geometry, Response.of(rule, tracer.materials), settings=simulation, twin=twin)
     outputs = _outputs(phantom, scanner, truth, present)
     n_rays, n_voxels = int(np.prod(scanner.geometry.shape)), int(np.prod(scanner.geometry.n_voxel))
     draws = n_rays * (2 if twin else 1) * (scanner.noise.model != "none")

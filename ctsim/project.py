@@ -124,6 +124,7 @@ def transmit(
     response: Response,
     *,
     subrays: int = 34,
+    edge_tolerance: float = 0.03,
     background: NDArray[np.float32] | None = None,
     out: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -132,13 +133,12 @@ def transmit(
     The signal is Σ w1·exp(−Σ μ·L) averaged over the pixel; the variance of one photon-noise draw is the
     second moment over the photons of an open pixel. The label volume is sampled along the central ray, the
     solids along every sub-ray. `background` is what `Tracer.background` returned for this view,
-    if known, plus what else the rays cross. `out` = (signal, second moment, spans) updates only those columns
-    of given images.
+    if known, plus what else the rays cross. `subrays` and `edge_tolerance` are those of `ctsim.settings.Simulation`.
+    `out` = (signal, second moment, spans) writes all of those columns of given images, and no others.
     """
     shape, pose = geometry.n_detector, geometry.pose(view)
     if out is None:
-        # summed in the kernel's order, so that a skipped ray equals a traced one
-        m1, m2 = (np.full(shape, np.cumsum(w, dtype=np.float32)[-1]) for w in (response.w1, response.w2))
+        m1, m2 = np.empty(shape, np.float32), np.empty(shape, np.float32)
         spans = np.tile(np.array([0, shape[1]]), (shape[0], 1))
     else:
         m1, m2, spans = out
@@ -151,7 +151,8 @@ def transmit(
         spans,
         tracer.background(geometry, view) if background is None else background,
         (response.mu, response.w1, response.w2),
-        (response.edge_mu, EDGE_THRESHOLD, STEP_THRESHOLD, most),
+        (response.edge_mu, EDGE_THRESHOLD, STEP_THRESHOLD, most, edge_tolerance),
+        tracer.skip,
         m1,
         m2,
     )

@@ -11,13 +11,15 @@ class Simulation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """Accuracy of the simulation.
 
     `tolerance` bounds the error of P = −ln(signal/open) made by replacing the fine spectrum with Gauss
-    nodes. `subrays` is the largest number of rays that measure one pixel on the edge of a solid (1: central
-    rays only). With `skip` off everything is computed even where it cannot matter: the result is the same
-    within `tolerance`, only slower.
+    nodes. `subrays` is the largest number of rays that first measure a pixel on the edge of a solid (1: central
+    rays only). Where the error in P estimated from their spread exceeds `edge_tolerance`, up to 16 times as many
+    follow (infinity: none follow). With `skip` off everything is computed even where it cannot matter: the
+    result is the same within `tolerance`, only slower.
     """
 
     tolerance: Annotated[float, msgspec.Meta(ge=1e-7, le=1e-1)] = 1e-4
     subrays: Annotated[int, msgspec.Meta(ge=1, le=256)] = 34
+    edge_tolerance: Annotated[float, msgspec.Meta(ge=1e-3)] = 0.03
     skip: bool = True
 
 

@@ -97,11 +97,14 @@ class _Simulator:
         m1, m2 = self._transmit(self.tracer, k)
         out = self._measured(m1, m2, k)
         if "metal_free/counts" in self.names:
-            shape = self.geometry.n_detector
-            # only pixels in the metal's shadow can differ
-            spans = row_spans(self.tracer.shadows(self.geometry.pose(k), shape)[:, self.tracer.metal], shape[1])
-            twin = self._transmit(self.bare, k, (m1.copy(), m2.copy(), spans))
-            drawn = self._measured(*twin, k, (out["counts"].copy(), spans))
+            if self.plan.settings.skip:
+                # only pixels in the metal's shadow can differ
+                shape = self.geometry.n_detector
+                spans = row_spans(self.tracer.shadows(self.geometry.pose(k), shape)[:, self.tracer.metal], shape[1])
+                twin = self._transmit(self.bare, k, (m1.copy(), m2.copy(), spans))
+                drawn = self._measured(*twin, k, (out["counts"].copy(), spans))
+            else:
+                drawn = self._measured(*self._transmit(self.bare, k), k)
             out |= {f"metal_free/{name}": image for name, image in drawn.items()}
         return out | self._paths(k)
 
@@ -112,6 +115,7 @@ class _Simulator:
             k,
             self.response,
             subrays=self.plan.settings.subrays,
+            edge_tolerance=self.plan.settings.edge_tolerance,
             background=self.lengths,
             out=out,
         )

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.project import Response, Tracer, path_lengths, transmit
+from ctsim.settings import Simulation
 from ctsim.shadow import row_spans
 
 VIEWS, PIXELS = 8, 48
@@ -59,20 +60,21 @@ class Trial:
     edge_error: float
 
 
-def trial(tracer: Tracer, geometry: Geometry, response: Response, *, subrays: int, twin: bool) -> Trial:
+def trial(tracer: Tracer, geometry: Geometry, response: Response, *, settings: Simulation, twin: bool) -> Trial:
     """Measure one view, and its metal-free twin if there is to be one, as the simulator does."""
     view, shape = geometry.n_views // 2, geometry.n_detector
+    rays = {"subrays": settings.subrays, "edge_tolerance": settings.edge_tolerance}
     spans = row_spans(tracer.shadows(geometry.pose(view), shape)[:, tracer.metal], shape[1])
     background, m1, seconds = tracer.background(geometry, view), np.empty(0), 0.0
     for _ in range(2):  # the first call compiles
         start = time.perf_counter()
         tracer.background(geometry, view, background)
-        m1, m2 = transmit(tracer, geometry, view, response, subrays=subrays, background=background)
+        m1, m2 = transmit(tracer, geometry, view, response, background=background, **rays)
         if twin:
             bare, out = tracer.without_metal(), (m1.copy(), m2.copy(), spans)
-            transmit(bare, geometry, view, response, subrays=subrays, background=background, out=out)
+            transmit(bare, geometry, view, response, background=background, out=out, **rays)
         seconds = time.perf_counter() - start
-    error = _edge_error(tracer, geometry, view, response, m1, background) if subrays > 1 else 0.0
+    error = _edge_error(tracer, geometry, view, response, m1, background) if settings.subrays > 1 else 0.0
     return Trial(seconds=seconds, edge_error=error)
 
 

@@ -10,7 +10,7 @@ from benchmarks import cli, host, lines, make_dataset, skipping, skipping_cases,
 from benchmarks.skipping_cases import Pair, Setup
 from ctsim.bricks import MIXED
 from ctsim.errors import InputError
-from ctsim.project import Tracer
+from ctsim.project import Tracer, transmit
 from ctsim.scatter import Scatter, open_fraction
 from phantoms.scene import build
 
@@ -77,6 +77,33 @@ def test_a_difference_beyond_what_is_stated_ends_with_one(here, tmp_path, monkey
     assert skipping.main([str(tmp_path), "--case", "rays", "--repeats", "2", "--force"]) == 0
     out = capsys.readouterr().out
     assert "NO" not in out and out.count("| rays |") == 2  # the newest run alone
+
+
+def test_a_twin_that_keeps_metal_on_open_detector_is_found(here, tmp_path, monkeypatch, capsys):
+    """Plant what once was wrong: columns in which the body without metal meets nothing kept the scan with metal."""
+
+    def leaving(tracer, geometry, view, response, *, background, out=None, **rays):
+        before = None if out is None else [image.copy() for image in out[:2]]
+        found = transmit(tracer, geometry, view, response, background=background, out=out, **rays)
+        if before is not None:
+            empty = background[1:].sum(0) == 0
+            for image, old in zip(found, before, strict=True):
+                image[empty] = old[empty]
+        return found
+
+    monkeypatch.setattr("ctsim.simulate.transmit", leaving)
+    given = [str(tmp_path), "--case", "twin", "--case", "rays", "--size", "small", "--repeats", "1"]
+    assert skipping.main(given) == 1
+    capsys.readouterr()
+    held = {
+        (r.measured.case, r.measured.scene): r.measured.held for r in skipping_tables.read(tmp_path / skipping.NAME)
+    }
+    assert held == {
+        ("twin", "lung-Fe"): True,
+        ("twin", "chicken-Fe"): False,
+        ("rays", "lung-Fe"): True,
+        ("rays", "chicken-Fe"): False,
+    }
 
 
 def test_an_interrupted_command_goes_on_from_the_case_it_was_in(here, tmp_path, monkeypatch, capsys):

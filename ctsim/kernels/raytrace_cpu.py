@@ -2,11 +2,11 @@
 
 What a pixel's central ray crosses in the label volume is given (`columns_cpu`, `bricks_cpu`). Solids are
 intersected exactly and replace the volume along their intervals. Pixels that the edge of a solid crosses are
-measured by several rays and averaged in *intensity*, as a detector does; what differs between those rays is
-the solids, while the volume is always that of the central ray. Rows are done in strips, so that neighbours
-share their pixels' corners; a strip depends on no other, so results are bitwise equal for any number of
-threads. What runs once a ray is inlined: a call would count references of its arrays atomically, which costs
-more than the ray.
+measured by several rays and averaged in *intensity*, as a detector does, and by more where these disagree; what
+differs between those rays is the solids, while the volume is always that of the central ray. Rows are done in strips,
+so that neighbours share their pixels' corners; a strip depends on no other, so results are bitwise equal for any
+number of threads. What runs once a ray is inlined: a call would count references of its arrays atomically, which
+costs more than the ray.
 """
 
 import numpy as np
@@ -20,6 +20,8 @@ from ctsim.shadow import MOST_TIMES
 STRIP = 8  # rows done one after the other: they compute 9 rows of pixel corners instead of 16
 GOLDEN = 0.6180339887498949
 ALL_SUBRAYS = 8.5  # a pixel across which the solids' optical thickness changes by 7.5 gets all, others a share
+RANGE_SHARE = 0.5  # of the signal's range over the sub-rays: the error of their mean at least, where an edge crosses
+LATTICE_ORDER = 4 / 3  # at an edge the mean of n lattice points is off by about n^(-3/4)
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
@@ -148,14 +150,33 @@ def _is_open(background, u):
 
 
 @njit(cache=True, error_model="numpy")
-def _trim(background, span, near):
+def _trim(background, span, near, skip):
     """Leave out the columns at both ends of a row in which nothing is met."""
     first, last = span[0], span[1]
+    if not skip:
+        return first, last
     while first < last and not near[first] and _is_open(background, first):
         first += 1
     while first < last and not near[last - 1] and _is_open(background, last - 1):
         last -= 1
     return first, last
+
+
+@njit(cache=True, error_model="numpy")
+def _fill_open(rule, span, columns, m1, m2):
+    """Write the open field's signal to a row's columns of `span` outside `columns`.
+
+    The images may hold another scan. Weights are summed in the order of `_signal`, so that a skipped ray equals a
+    traced one.
+    """
+    _, w1, w2 = rule
+    open1, open2 = np.float32(0), np.float32(0)
+    for k in range(w1.size):
+        open1 += w1[k]
+        open2 += w2[k]
+    for u in range(span[0], span[1]):
+        if u < columns[0] or u >= columns[1]:
+            m1[u], m2[u] = open1, open2
 
 
 @njit(cache=True, error_model="numpy")
@@ -182,57 +203,105 @@ def _centres(volume, solids, pose, v, columns, background, lengths, centre):
                 lengths[m, u - first] = max(background[m, u] - covered[m], 0.0) + painted[m]
 
 
+@njit(inline="always", error_model="numpy")
+def _uncertainty(signal, count, seen, bounds):
+    """Estimate the relative error of the mean of `count` sub-rays.
+
+    `seen` is the solids' (least, largest) thickness along them and `bounds` that at the pixel's corners and centre:
+    where the bounds lie beyond, there is something brighter or darker that no sub-ray met. Half the difference of the
+    means of even and odd sub-rays can be small by chance; a share of the signal's range / count cannot.
+    """
+    darkest, brightest, even, odd = signal[0], signal[0], 0.0, 0.0
+    for i in range(count):
+        darkest, brightest = min(darkest, signal[i]), max(brightest, signal[i])
+        if i % 2:
+            odd += signal[i]
+        else:
+            even += signal[i]
+    if bounds[0] < seen[0]:  # nothing is brighter than the open field
+        brightest = min(brightest * np.exp(min(seen[0] - bounds[0], 80.0)), max(1.0, brightest))
+    if bounds[1] > seen[1]:
+        darkest *= np.exp(seen[1] - bounds[1])
+    halves = abs(even / (count - count // 2) - odd / (count // 2)) / 2
+    return max(halves, RANGE_SHARE * (brightest - darkest) / count) * count / (even + odd)
+
+
+@njit(inline="always", error_model="numpy")
+def _cast(volume, solids, pose, at, count, background, edge_mu, work):
+    """Trace `count` sub-rays of a pixel: fill their path lengths, return the solids' (least, largest) thickness.
+
+    `at` is (v, u) from the detector's centre, in pixels, and the column. What the solids replace is taken from the
+    pixel's central ray, as is the rest of the volume.
+    """
+    prims, shadow, active = solids
+    code, slot, pool, density, grid = volume
+    lengths, hits, found, ray, pair, covered, painted, pieces = work
+    v, u, column = at
+    n_m = background.shape[0]
+    t, far, thinnest, thickest = np.inf, -np.inf, np.inf, 0.0
+    for i in range(count):
+        # a golden-section lattice has `count` distinct positions along u and along v
+        du, dv = (i + 0.5) / count - 0.5, (i * GOLDEN + 0.5) % 1.0 - 0.5
+        aim(pose, u + du, v + dv, ray)
+        found[i] = _collect(prims, shadow, active, column + du, ray, pair, hits[i])
+        for k in range(found[i]):
+            t, far = min(t, hits[i, k, 0]), max(far, hits[i, k, 1])
+        thickness = _thickness(hits[i], found[i], edge_mu)
+        thinnest, thickest = min(thinnest, thickness), max(thickest, thickness)
+    aim(pose, u, v, ray)
+    n_pieces = walk(code, slot, pool, density, grid, ray, t, far, pieces) if t < far else 0
+    for i in range(count):
+        if found[i]:
+            _paint(hits[i], found[i], pieces, n_pieces, covered, painted)
+            for m in range(1, n_m):
+                lengths[m, i] = max(background[m, column] - covered[m], 0.0) + painted[m]
+        else:
+            lengths[1:, i] = background[1:, column]
+    return thinnest, thickest
+
+
 @njit(cache=True, error_model="numpy")
-def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, m1, m2):
+def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, bounds, m1, m2):
     """Measure again, by several rays each, the pixels of a row that the edge of a solid crosses.
 
-    What the solids replace is taken from the pixel's central ray, as is the rest of the volume.
+    A pixel whose mean is uncertain by more than the tolerance is measured anew by more rays.
     """
     prims, fat, shadow, active, near = solids
     mu, w1, w2 = rule
-    most = edge[3]
+    edge_mu, _, _, most, tolerance = edge
     first, last, n_v = columns
     n_m, n_u = background.shape
     size = most * MOST_TIMES
     lengths, hits = np.zeros((n_m, size), np.float32), np.empty((size, 2 * active.size + 1, 3))
     tau, s1, s2 = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    code, slot, pool, density, grid = volume
     ray, pair, found = np.empty(7), np.empty(4), np.empty(size, np.int64)
-    covered, painted, pieces = np.empty(n_m), np.empty(n_m), np.empty((int(grid[:3].sum()) + 8, 3))
+    covered, painted, pieces = np.empty(n_m), np.empty(n_m), np.empty((int(volume[4][:3].sum()) + 8, 3))
+    work = lengths, hits, found, ray, pair, covered, painted, pieces
     thin = (fat[active, 0] >= 0).any()
     for u in range(first, last):
         if not near[u]:
             continue
         times = 0
+        at = v - (n_v - 1) / 2, u - (n_u - 1) / 2, u
         if thin:
-            aim(pose, u - (n_u - 1) / 2, v - (n_v - 1) / 2, ray)
+            aim(pose, at[1], at[0], ray)
             times = _grazes(fat, shadow, active, u, ray, pair)
         if times == 0 and changes[u] == 0:
             continue
         count = most * times if times else max(2, int(most * min(1.0, (1.0 + changes[u]) / ALL_SUBRAYS)))
-        t, far = np.inf, -np.inf
-        for i in range(count):
-            # a golden-section lattice has `count` distinct positions along u and along v
-            du, dv = (i + 0.5) / count - 0.5, (i * GOLDEN + 0.5) % 1.0 - 0.5
-            aim(pose, u + du - (n_u - 1) / 2, v + dv - (n_v - 1) / 2, ray)
-            found[i] = _collect(prims, shadow, active, u + du, ray, pair, hits[i])
-            for k in range(found[i]):
-                t, far = min(t, hits[i, k, 0]), max(far, hits[i, k, 1])
-        aim(pose, u - (n_u - 1) / 2, v - (n_v - 1) / 2, ray)
-        n_pieces = walk(code, slot, pool, density, grid, ray, t, far, pieces) if t < far else 0
-        for i in range(count):
-            if found[i]:
-                _paint(hits[i], found[i], pieces, n_pieces, covered, painted)
-                for m in range(1, n_m):
-                    lengths[m, i] = max(background[m, u] - covered[m], 0.0) + painted[m]
-            else:
-                lengths[1:, i] = background[1:, u]
-        _signal(lengths, count, mu, w1, w2, tau, s1, s2)
+        while True:
+            seen = _cast(volume, (prims, shadow, active), pose, at, count, background, edge_mu, work)
+            _signal(lengths, count, mu, w1, w2, tau, s1, s2)
+            excess = _uncertainty(s1, count, seen, bounds[:, u]) / tolerance
+            if excess <= 1.0 or count == size:
+                break
+            # the estimate sharpens with the rays, so a step is fourfold at most
+            count = min(int(count * min(max(excess, 1.2) ** LATTICE_ORDER, 4.0)) + 1, size)
         m1[u], m2[u] = s1[:count].mean(), s2[:count].mean()
 
 
 @njit(cache=True, error_model="numpy")
-def _measure_row(volume, solids, pose, v, span, background, rule, edge, corners, m1, m2):
+def _measure_row(volume, solids, pose, v, span, background, rule, edge, skip, corners, m1, m2):
     """Measure columns span[0]…span[1] of row v; `corners` [4, u + 1] are those below and above once it is done."""
     prims, fat, shadows = solids
     shadow = shadows[v]
@@ -247,7 +316,8 @@ def _measure_row(volume, solids, pose, v, span, background, rule, edge, corners,
     else:
         corners[1], corners[3] = 0.0, 0.0
     row = background[:, v]
-    first, last = _trim(row, span, near)
+    first, last = _trim(row, span, near, skip)
+    _fill_open(rule, span, (first, last), m1[v], m2[v])
     if first >= last:
         return
     size, columns = last - first, (first, last, n_v)
@@ -257,19 +327,22 @@ def _measure_row(volume, solids, pose, v, span, background, rule, edge, corners,
     _signal(lengths, size, mu, w1, w2, tau, s1, s2)
     m1[v, first:last], m2[v, first:last] = s1, s2
     if edges:
+        bounds = np.empty((2, n_u))
         for u in range(first, last):
             a, b, c, d = corners[0, u], corners[0, u + 1], corners[1, u], corners[1, u + 1]
-            change = max(max(max(a, b), max(c, d)), centre[u]) - min(min(min(a, b), min(c, d)), centre[u])
+            bounds[0, u] = min(min(min(a, b), min(c, d)), centre[u])
+            bounds[1, u] = max(max(max(a, b), max(c, d)), centre[u])
+            change = bounds[1, u] - bounds[0, u]
             a, b, c, d = corners[2, u], corners[2, u + 1], corners[3, u], corners[3, u + 1]
             # where a solid begins the change is not linear, and less of it matters
             limit = edge[1] if a == b and b == c and c == d else edge[2]
             centre[u] = change if change > limit else 0.0
         parts = (prims, fat, shadow, active, near)
-        _edges(volume, parts, pose, v, columns, row, rule, edge, centre, m1[v], m2[v])
+        _edges(volume, parts, pose, v, columns, row, rule, edge, centre, bounds, m1[v], m2[v])
 
 
 @njit(cache=True, error_model="numpy")
-def _measure_strip(volume, solids, pose, first, spans, background, rule, edge, m1, m2):
+def _measure_strip(volume, solids, pose, first, spans, background, rule, edge, skip, m1, m2):
     n_v, n_u = m1.shape
     corners = np.zeros((4, n_u + 1))
     shadow = solids[2][first]
@@ -279,11 +352,11 @@ def _measure_strip(volume, solids, pose, first, spans, background, rule, edge, m
         v = first - 0.5 - (n_v - 1) / 2
         _corners(solids[0], shadow, active, near, pose, v, edge[0], corners[1], corners[3])
     for v in range(first, min(first + STRIP, n_v)):
-        _measure_row(volume, solids, pose, v, spans[v], background, rule, edge, corners, m1, m2)
+        _measure_row(volume, solids, pose, v, spans[v], background, rule, edge, skip, corners, m1, m2)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def transmit_view(volume, solids, pose, order, spans, background, rule, edge, m1, m2):
+def transmit_view(volume, solids, pose, order, spans, background, rule, edge, skip, m1, m2):
     """Measure one view: mean signal `m1` and second moment `m2` [v, u] relative to the open field.
 
     `volume` is (code, slot, pool, density, grid) of `ctsim.bricks.Bricks` and `background` [material, v, u]
@@ -291,10 +364,12 @@ def transmit_view(volume, solids, pose, order, spans, background, rule, edge, m1
     inflated twins and the columns in which they are seen (`ctsim.shadow.inflate` and `cast`). `pose` [12];
     `order` [strip] is the order of work; only columns spans[row] = (from, to) are touched. `rule` is
     (mu [material, node] 1/mm, w1 [node], w2 [node]); `edge` is (edge_mu [material], least change of
-    optical thickness that takes sub-rays, the same where a solid begins, most sub-rays a pixel).
+    optical thickness that takes sub-rays, the same where a solid begins, most sub-rays of a pixel at first, estimated
+    relative error of its signal above which it gets up to `MOST_TIMES` as many). Without `skip`, rays that
+    meet nothing are traced, too.
     """
     for index in prange(order.size):
-        _measure_strip(volume, solids, pose, order[index] * STRIP, spans, background, rule, edge, m1, m2)
+        _measure_strip(volume, solids, pose, order[index] * STRIP, spans, background, rule, edge, skip, m1, m2)
 
 
 @njit(cache=True, error_model="numpy")

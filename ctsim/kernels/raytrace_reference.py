@@ -95,9 +95,9 @@ def _thickness(prims, ray, edge_mu):
 
 
 def _n_subrays(solids, pose, u, v, edge):
-    """How many rays measure the pixel at detector position (u, v)."""
+    """How many rays measure the pixel at detector position (u, v) at first."""
     prims, fat, _ = solids
-    edge_mu, smooth, begins, most = edge
+    edge_mu, smooth, begins, most, _ = edge
     if most < 2 or len(prims) == 0:
         return 1
     centre = _ray(pose, u, v)
@@ -110,26 +110,54 @@ def _n_subrays(solids, pose, u, v, edge):
     return max(2, int(most * min(1.0, (1 + change) / 8.5))) if change > threshold else 1
 
 
-def transmit_view(bricks, solids, pose, order, spans, background, rule, edge, m1, m2):
+def _uncertainty(signal, thickness, bounds):
+    """Estimate the relative error of the mean of a pixel's sub-rays, as `raytrace_cpu._uncertainty` does."""
+    brightest, darkest = max(signal), min(signal)
+    if min(bounds) < min(thickness):
+        brightest = max(brightest, min(1.0, brightest * math.exp(min(min(thickness) - min(bounds), 80.0))))
+    if max(bounds) > max(thickness):
+        darkest *= math.exp(max(thickness) - max(bounds))
+    halves = abs(np.mean(signal[::2]) - np.mean(signal[1::2])) / 2
+    return max(halves, 0.5 * (brightest - darkest) / len(signal)) / np.mean(signal)
+
+
+def _subrays(volume, grid, solids, pose, at, n, background, rule, edge_mu):
+    """Signal, second moment and thickness of the solids along the n sub-rays of the pixel at (u, v)."""
+    mu, w1, w2 = rule
+    u, v = at
+    signal, second, thickness = [], [], []
+    for i in range(n):
+        du = (i + 0.5) / n - 0.5 if n > 1 else 0.0
+        dv = math.fmod(i * GOLDEN + 0.5, 1.0) - 0.5
+        ray, central = _ray(pose, u + du, v + dv), _ray(pose, u, v)
+        _, under, solid = _lengths(volume, grid, solids[0], ray, len(mu), central)
+        passed = np.exp(-np.minimum((np.maximum(background - under, 0) + solid) @ mu, 80.0))
+        signal.append(w1 @ passed)
+        second.append(w2 @ passed)
+        thickness.append(_thickness(solids[0], ray, edge_mu)[0])
+    return signal, second, thickness
+
+
+def transmit_view(bricks, solids, pose, order, spans, background, rule, edge, skip, m1, m2):
     """Measure one view: mean signal `m1` and second moment `m2` [v, u] relative to the open field."""
     volume, strip = _label_volume(bricks), -(-len(m1) // len(order))
-    mu, w1, w2 = (np.asarray(a, np.float64) for a in rule)
+    rule = tuple(np.asarray(a, np.float64) for a in rule)
     n_v, n_u = m1.shape
+    edge_mu, most, tolerance = edge[0], edge[3], edge[4]
     for row in (k * strip + i for k in order for i in range(strip) if k * strip + i < n_v):
         for column in range(*spans[row]):
-            u, v = column - (n_u - 1) / 2, row - (n_v - 1) / 2
+            at = u, v = column - (n_u - 1) / 2, row - (n_v - 1) / 2
             n = _n_subrays(solids, pose, u, v, edge)
-            total1 = total2 = 0.0
-            for i in range(n):
-                du = (i + 0.5) / n - 0.5 if n > 1 else 0.0
-                dv = math.fmod(i * GOLDEN + 0.5, 1.0) - 0.5
-                ray, central = _ray(pose, u + du, v + dv), _ray(pose, u, v)
-                _, under, solid = _lengths(volume, bricks[4], solids[0], ray, len(mu), central)
-                lengths = np.maximum(background[:, row, column] - under, 0) + solid
-                passed = np.exp(-np.minimum(lengths @ mu, 80.0))
-                total1 += w1 @ passed
-                total2 += w2 @ passed
-            m1[row, column], m2[row, column] = total1 / n, total2 / n
+            corners = [(u + du, v + dv) for du in (-0.5, 0.5) for dv in (-0.5, 0.5)]
+            bounds = [_thickness(solids[0], _ray(pose, *where), edge_mu)[0] for where in (at, *corners)]
+            under = background[:, row, column]
+            while True:
+                rays = _subrays(volume, bricks[4], solids, pose, at, n, under, rule, edge_mu)
+                excess = _uncertainty(rays[0], rays[2], bounds) / tolerance if n > 1 else 0.0
+                if excess <= 1 or n == 16 * most:
+                    break
+                n = min(int(n * min(max(excess, 1.2) ** (4 / 3), 4.0)) + 1, 16 * most)
+            m1[row, column], m2[row, column] = np.mean(rays[0]), np.mean(rays[1])
 
 
 def trace_view(bricks, prims, pose, lengths):
