@@ -19,6 +19,7 @@ from phantoms.inserts import count, diameter, inserts
 
 MATERIALS = ("air", "soft_tissue", "cortical_bone", "dentin", "enamel")
 AIR, SOFT, BONE, DENTIN, ENAMEL = range(5)
+CENTRE = -0.32  # y of the half ellipse's centre that the dental arch is
 
 
 class Teeth(Recipe, frozen=True, kw_only=True, tag="teeth"):
@@ -88,7 +89,7 @@ def teeth(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Teeth) ->
 def _arch(t: Field | float) -> tuple[Field, Field]:
     """Point of the arch's midline (x, y) at t in [−1, 1]: half an ellipse with straightened ends."""
     angle = np.asarray(t) * 1.42
-    return 0.56 * np.sin(angle) * (1 + 0.10 * np.abs(np.sin(angle)) ** 3), -0.48 + 0.98 * np.cos(angle)
+    return 0.56 * np.sin(angle) * (1 + 0.10 * np.abs(np.sin(angle)) ** 3), CENTRE + 0.98 * np.cos(angle)
 
 
 def _arch_gap(x: Field, y: Field) -> Field:
@@ -97,7 +98,7 @@ def _arch_gap(x: Field, y: Field) -> Field:
     shape = np.broadcast_shapes(x.shape, y.shape)
     at = np.stack([np.broadcast_to(x, shape).ravel(), np.broadcast_to(y, shape).ravel()], 1)
     gap, nearest = KDTree(np.stack([px, py], 1)).query(at)
-    inner = np.hypot(at[:, 0], at[:, 1] + 0.48) < np.hypot(px[nearest], py[nearest] + 0.48)
+    inner = np.hypot(at[:, 0], at[:, 1] - CENTRE) < np.hypot(px[nearest], py[nearest] - CENTRE)
     return np.where(inner, -gap, gap).reshape(shape).astype(np.float32)
 
 
@@ -106,22 +107,30 @@ def _soft(canvas: Canvas, rng: np.random.Generator) -> None:
     wobble = Noise(rng, 4)
 
     def face(x: Field, y: Field, z: Field) -> Mask:
-        section = (np.abs(x / 0.87) ** 2.6 + np.abs((y + 0.04) / 0.84) ** 2.4) ** np.float32(1 / 2.5)
-        return (section**8 + np.abs(z / 0.9) ** 8) ** np.float32(1 / 8) + 0.012 * wobble(x, y, z) < 0.98
+        power = np.where(y > 0.04, np.float32(2.1), np.float32(2.6))  # the cheeks are broader than the lips
+        section = (np.abs(x / 0.95) ** 2.6 + np.abs((y - 0.04) / 0.93) ** power) ** np.float32(1 / 2.5)
+        return (section**8 + np.abs(z / 0.97) ** 8) ** np.float32(1 / 8) + 0.012 * wobble(x, y, z) < 0.98
 
     canvas.fill(SOFT, face)
-    canvas.fill(  # the open mouth: between the arches and just before the teeth
-        AIR,
-        lambda x, y, z: (_arch_gap(x, y) < 0.19) & (np.abs(z) < 0.30) & (y > -0.62),
-        ((-0.9, -0.62, -0.3), (0.9, 0.9, 0.3)),
-    )
+    canvas.fill(AIR, lambda x, y, z: _mouth(x, y, z, wobble), ((-0.9, -0.7, -0.5), (0.9, 0.9, 0.5)))
     canvas.fill(
         SOFT,
         lambda x, y, z: (
-            (x / 0.40) ** 2 + ((y + 0.22) / 0.52) ** 2 + ((z + 0.18 - 0.1 * wobble(x, y, z)) / 0.27) ** 2 <= 1
+            (x / 0.40) ** 2 + ((y + 0.06) / 0.52) ** 2 + ((z + 0.18 - 0.1 * wobble(x, y, z)) / 0.27) ** 2 <= 1
         ),
     )
-    canvas.ellipsoid(AIR, (0.0, -0.3, 0.82), (0.2, 0.5, 0.05))  # floor of the nose
+    canvas.ellipsoid(AIR, (0.0, -0.14, 0.82), (0.2, 0.5, 0.05))  # floor of the nose
+
+
+def _mouth(x: Field, y: Field, z: Field, wobble: Noise) -> Mask:
+    """Tell points of the open mouth: before the teeth, under the vaulted palate, back to the throat."""
+    gap = _arch_gap(x, y)
+    before = np.clip(gap, 0, None) / 0.175
+    vault = np.sin(np.pi / 2 * np.clip((-gap - 0.1) / 0.4, 0, 1))
+    height = 0.28 + np.where(z > 0, np.float32(0.16), np.float32(0.06)) * vault
+    throat = -0.56 + 0.25 * x**2 + 0.03 * wobble(x, y, z)
+    behind = np.clip((-0.19 - y) / (-0.19 - throat), 0, None)
+    return before**4 + (z / height) ** 4 + behind**4 <= 1
 
 
 def _bone(canvas: Canvas, jaw: int, spongy: Noise) -> None:
@@ -133,12 +142,12 @@ def _bone(canvas: Canvas, jaw: int, spongy: Noise) -> None:
         across = _arch_gap(x, y) / width
         return (np.abs(across) ** 4 + np.abs((h - 0.555) / 0.32) ** 4) ** np.float32(0.25)
 
-    box = ((-0.92, -0.92, -0.92 if jaw < 0 else 0.2), (0.92, 0.8, -0.2 if jaw < 0 else 0.92))
-    canvas.fill(SOFT, lambda x, y, z: (level(x, y, z) <= 1.12) & (y > -0.66), box, over=(AIR,))  # gum
-    canvas.fill(BONE, lambda x, y, z: (level(x, y, z) <= 1) & (y > -0.70), box)
+    box = ((-0.92, -0.92, -0.95 if jaw < 0 else 0.18), (0.92, 0.95, -0.18 if jaw < 0 else 0.95))
+    canvas.fill(SOFT, lambda x, y, z: level(x, y, z) <= 1.12, box, over=(AIR,))  # gum
+    canvas.fill(BONE, lambda x, y, z: level(x, y, z) <= 1, box)
     canvas.fill(
         SOFT,
-        lambda x, y, z: (level(x, y, z) <= 0.80) & (y > -0.66) & (spongy(x, y, z) > -0.45),
+        lambda x, y, z: (level(x, y, z) <= 0.80) & (spongy(x, y, z) > -0.45),
         box,
         over=(BONE,),
     )
