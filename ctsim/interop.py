@@ -1,4 +1,4 @@
-"""Our axes in the words of other libraries: TIGRE, LEAP, ASTRA, RTK and R2-Gaussian.
+"""Our axes in the words of other libraries: TIGRE, LEAP, ASTRA, RTK, and R2-Gaussian, whose order NAF has, too.
 
 The only module that permutes axes. Ours: volume [z, y, x], projections [view, v, u], angles in radians,
 right-handed x, y, z in mm. Functions take and return views of the array where they can.
@@ -71,10 +71,15 @@ def points_to(library: Library, points: NDArray) -> NDArray:
 
 
 def angles_to(library: Library, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert view angles in radians: ASTRA's are a quarter turn ahead, LEAP's and RTK's are in degrees."""
+    """Convert view angles in radians: ASTRA's and LEAP's are a quarter turn ahead, LEAP's and RTK's are in degrees.
+
+    LEAP's set_conebeam takes the quarter turn off again; its source is at the angle that is left.
+    """
     if library is Library.ASTRA:
         return angles + np.pi / 2
-    return np.degrees(angles) if library in (Library.LEAP, Library.RTK) else angles
+    if library is Library.LEAP:
+        return np.degrees(angles) + 90
+    return np.degrees(angles) if library is Library.RTK else angles
 
 
 def astra_vectors(geometry: Geometry) -> NDArray[np.float64]:
