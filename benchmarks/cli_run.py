@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from ctsim.errors import InputError
+from ctsim.human import human_choice
 
 if TYPE_CHECKING:
     from benchmarks.methods import Method
@@ -190,7 +191,7 @@ def _scans(given: Arguments) -> "list[Stored]":
     names = [s.name for s in scans]
     for wanted in given.scene:
         if wanted not in names:
-            raise InputError(f"--scene {wanted!r}: {given.data} has {', '.join(names)}")
+            raise InputError(f"--scene {wanted!r}: {given.data} has {human_choice(names, wanted)}")
     return scans
 
 

@@ -17,6 +17,7 @@ import tyro
 from numpy.typing import NDArray
 
 from ctsim.errors import InputError
+from ctsim.human import human_choice
 
 if TYPE_CHECKING:
     from benchmarks.protocol import Stored, Truth
@@ -288,7 +289,7 @@ def _scan(given: Arguments) -> "Stored":
         raise InputError(f"{given.data}: the dataset has no scenes")
     name = given.scene or next(iter(scans))
     if name not in scans:
-        raise InputError(f"--scene {name!r}: {given.data} has {', '.join(scans)}")
+        raise InputError(f"--scene {name!r}: {given.data} has {human_choice(scans, name)}")
     return open_scan(scans[name])
 
 

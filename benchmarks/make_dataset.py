@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import difflib
 import shutil
 import sys
 import time
@@ -16,7 +15,7 @@ import tyro
 
 from benchmarks.workers import TICK, Lost, Pool, open_pool
 from ctsim.errors import InputError
-from ctsim.human import human_bytes, human_time
+from ctsim.human import human_bytes, human_choice, human_time
 
 if TYPE_CHECKING:
     from importlib.resources.abc import Traversable
@@ -107,8 +106,7 @@ def select(scenes: "tuple[Scene, ...]", only: tuple[str, ...], seeds: tuple[int,
     names = [scene.name for scene in scenes]
     for name in only:
         if name not in names:
-            near = difflib.get_close_matches(name, names) or names
-            raise InputError(f"--only {name}: no such scene, expected one of {', '.join(near)}")
+            raise InputError(f"--only {name}: no such scene, expected one of {human_choice(names, name)}")
     chosen = tuple(scene for scene in scenes if not only or scene.name in only)
     if not seeds:
         return chosen

@@ -21,7 +21,7 @@ from benchmarks.host import commit, host, use_threads
 from benchmarks.pareto_records import NAME, WHAT, Part, Timed, latest, read, runs
 from benchmarks.records import OK
 from ctsim.errors import InputError
-from ctsim.human import human_time
+from ctsim.human import human_choice, human_time
 
 if TYPE_CHECKING:
     from benchmarks.pareto_jobs import Job, Ran
@@ -99,11 +99,11 @@ def _scenes(given: Arguments, suite: "Suite") -> dict[Part, list[str]]:
         raise InputError(f"{given.suite}: dataset.suite: {error}") from None
     for name in suite.dataset.scenes:
         if name not in known["methods"]:
-            expected = ", ".join(known["methods"])
+            expected = human_choice(known["methods"], name)
             raise InputError(f"{given.suite}: dataset.scenes: there is no {name!r}, expected one of {expected}")
     for name in given.scene:
         if not any(name in known[part] for part in parts):
-            expected = "; ".join(f"{part}: {', '.join(known[part])}" for part in parts)
+            expected = "; ".join(f"{part}: {human_choice(known[part], name)}" for part in parts)
             raise InputError(f"--scene {name!r}: there is no such scene, expected one of {expected}")
     chosen = given.scene or (RODS, *(suite.dataset.scenes or known["methods"]))
     return {part: [name for name in known[part] if name in chosen] for part in parts}

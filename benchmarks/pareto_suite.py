@@ -1,6 +1,5 @@
 """What `run-benchmark pareto` measures, as data: `benchmarks/suites/pareto.toml`, or tables of one's own over it."""
 
-import tomllib
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,6 +9,7 @@ import msgspec
 from ctsim.errors import InputError
 from ctsim.settings import Simulation
 from phantoms.messages import explain
+from phantoms.suites import parse_toml, read_toml
 
 NAME = "pareto.toml"
 Count = Annotated[int, msgspec.Meta(ge=1)]
@@ -97,16 +97,10 @@ def load(path: Path | None) -> Suite:
 
     Raises InputError naming the file, the key and what was expected.
     """
-    bundled = tomllib.loads((resources.files("benchmarks") / "suites" / NAME).read_text(encoding="utf-8"))
+    bundled = parse_toml((resources.files("benchmarks") / "suites" / NAME).read_text(encoding="utf-8"), NAME)
     if path is None:
         return msgspec.convert(bundled, Suite)
-    try:
-        own = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); expected a TOML file like {NAME}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not TOML: {error}") from error
-    tables = bundled | own
+    tables = bundled | read_toml(path, f"like {NAME}")
     try:
         suite = msgspec.convert(tables, Suite)
     except msgspec.ValidationError as error:

@@ -7,6 +7,7 @@ from typing import Annotated
 import msgspec
 
 from ctsim.errors import InputError
+from phantoms.suites import parse_toml
 
 Name = Annotated[str, msgspec.Meta(min_length=1)]
 Seconds = Annotated[float, msgspec.Meta(ge=0)]
@@ -67,8 +68,8 @@ def parse(text: str, where: str) -> Catalogue:
     twice, and where a case names a peer that is not listed.
     """
     try:
-        found = msgspec.toml.decode(text, type=Catalogue)
-    except msgspec.DecodeError as error:
+        found = msgspec.convert(parse_toml(text, where), Catalogue)
+    except msgspec.ValidationError as error:
         raise InputError(f"{where}: {error}") from None
     peers = [peer.name for peer in found.peer]
     for names in ([case.name for case in found.case], peers):

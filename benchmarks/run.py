@@ -9,7 +9,6 @@ import dataclasses
 import datetime
 import logging
 import time
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +28,7 @@ from benchmarks.protocol import Score, Stored
 from benchmarks.records import Cost, Record, Run
 from benchmarks.volumes import identity_of, keep, read_volume
 from ctsim.errors import InputError
+from phantoms.suites import read_toml
 
 if TYPE_CHECKING:
     import torch
@@ -106,13 +106,11 @@ class Task:
 
 def repetition(stored: Stored) -> tuple[str, int]:
     """Return the scene's name and its seed; make-dataset names the repetitions of a scene NAME-sSEED."""
-    try:
-        recipe = tomllib.loads((stored.folder / "scene.toml").read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        recipe = {}
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{stored.folder / 'scene.toml'}: damaged ({error})") from None
-    seed = int(recipe.get("seed", stored.info.get("seed", 0)))
+    path = stored.folder / "scene.toml"
+    recipe = read_toml(path, "that make-dataset wrote") if path.exists() else {}
+    seed = recipe.get("seed", stored.info.get("seed", 0))
+    if not isinstance(seed, int):
+        raise InputError(f"{path}: seed: {seed!r} is no integer")
     return stored.name.removesuffix(f"-s{seed}"), seed
 
 

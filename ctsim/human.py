@@ -1,4 +1,9 @@
-"""Sizes and times for people."""
+"""Sizes, times and names for people."""
+
+import difflib
+from collections.abc import Iterable
+
+_MANY = 20  # names, beyond which a sentence gives but some
 
 
 def human_bytes(size: float) -> str:
@@ -15,3 +20,12 @@ def human_time(seconds: float) -> str:
     if seconds < 99.5:
         return f"{seconds:.2g} s"
     return f"{seconds / 60:.0f} min" if seconds < 5970 else f"{seconds / 3600:.1f} h"
+
+
+def human_choice(names: Iterable[str], given: str) -> str:
+    """Return the names that there are, in a row; of many their number and those nearest to the one given."""
+    names = list(names)
+    if len(names) <= _MANY:
+        return ", ".join(names)
+    near = difflib.get_close_matches(given, names, n=5)
+    return f"{len(names)}, {'nearest' if near else 'such as'} {', '.join(near or names[:5])}"

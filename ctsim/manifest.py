@@ -52,6 +52,11 @@ class IndexLine(msgspec.Struct, frozen=True, kw_only=True):
     content_hash: str
 
 
+def is_reserved(name: str) -> bool:
+    """Say whether no scene may have this name, which the data folder's index needs: on some disks in any case."""
+    return f"{name}.".casefold().startswith(f"{INDEX}.")
+
+
 def file_sha256(path: Path) -> str:
     """Return the SHA-256 of a file in hex, reading it in blocks."""
     with path.open("rb") as file:

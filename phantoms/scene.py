@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.manifest import is_reserved
 from ctsim.settings import Simulation, Truth
 from ctsim.types import Phantom, Scanner
 from phantoms.recipes import AnyRecipe, build_recipe
@@ -36,6 +37,8 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", self.name):
             raise InputError(f"name must be letters, digits, '.', '_', '-' (it names a folder), got {self.name!r}")
+        if is_reserved(self.name):
+            raise InputError(f"name: {self.name!r} is what the data folder's own index is called; expected another")
         if not 0 <= self.seed < 2**63:
             raise InputError(f"seed must be within 0 to 2^63 - 1, got {self.seed}")
         try:

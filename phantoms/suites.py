@@ -4,7 +4,7 @@ What is wrong is an `InputError` that names the file, the key's path and what wa
 """
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
 
@@ -14,6 +14,8 @@ from ctsim.errors import InputError
 from phantoms.messages import explain
 
 S = TypeVar("S", bound=msgspec.Struct)
+DEEPEST = 32  # tables and lists within each other; no scene has more than eight
+_TOO_DEEP = f"nested more than {DEEPEST} deep"
 NULL = "null"  # how a file says None, which TOML lacks, where None is not the default
 
 
@@ -21,21 +23,45 @@ class _Named(Protocol):
     name: str
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file of scenes."""
+def read_toml(path: Path, kind: str = "of scenes") -> dict[str, Any]:
+    """Read a TOML file; `kind` says in messages which was expected."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); expected a TOML file of scenes") from error
+        raise InputError(f"{path}: cannot be read ({error}); expected a TOML file {kind}") from error
     return parse_toml(text, str(path))
 
 
 def parse_toml(text: str, where: str) -> dict[str, Any]:
     """Read TOML text; `where` names the file in messages, here and below."""
     try:
-        return tomllib.loads(text)
+        data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{where}: not TOML: {error}") from error
+    except RecursionError:
+        raise InputError(f"{where}: {_TOO_DEEP}") from None
+    except ValueError:  # of more digits than Python turns into a number
+        raise InputError(f"{where}: an integer of thousands of digits; expected at most 64 bits") from None
+    _check_extent(data, where)
+    return data
+
+
+def _check_extent(data: Mapping[str, Any], where: str) -> None:
+    """Refuse what the reading of values would recurse into for ever, and integers that TOML does not promise."""
+    left: list[tuple[Any, str, int]] = [(data, "", 0)]
+    while left:
+        table, path, depth = left.pop()
+        if depth > DEEPEST:
+            raise InputError(f"{where}: {path.partition('.')[0]}: {_TOO_DEEP}")
+        for key, value in table.items() if isinstance(table, dict) else enumerate(table):
+            if isinstance(value, dict | list):
+                left.append((value, _below(path, key), depth + 1))
+            elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+                raise InputError(f"{where}: {_below(path, key)}: an integer beyond 64 bits")
+
+
+def _below(path: str, key: str | int) -> str:
+    return f"{path}[{key}]" if isinstance(key, int) else f"{path}.{key}" if path else key
 
 
 def scenes_of(data: Mapping[str, Any], kind: type[S], where: str) -> tuple[S, ...]:
@@ -48,10 +74,20 @@ def scenes_of(data: Mapping[str, Any], kind: type[S], where: str) -> tuple[S, ..
     if not isinstance(tables, list) or not tables or not all(isinstance(t, dict) for t in tables):
         raise InputError(f"{where}: no scenes; expected at least one [[scene]] table")
     scenes = tuple(decode(_merge(defaults, t), kind, where, f"scene[{k}]") for k, t in enumerate(tables))
-    names = [cast(_Named, s).name for s in scenes]
-    if twice := sorted({n for n in names if names.count(n) > 1}):
-        raise InputError(f"{where}: two scenes are named {twice[0]!r}; names must differ")
+    _check_names([cast(_Named, s).name for s in scenes], where)
     return scenes
+
+
+def _check_names(names: Sequence[str], where: str) -> None:
+    """Refuse a name that is there twice, or twice but for its case, which some disks do not tell apart."""
+    known: dict[str, str] = {}
+    for name in names:
+        if (other := known.get(name.casefold())) is not None:
+            same = f"{name!r}; names must differ"
+            raise InputError(
+                f"{where}: two scenes are named {same if other == name else f'{other!r} and {same} in more than case'}"
+            )
+        known[name.casefold()] = name
 
 
 def decode(data: Mapping[str, Any], kind: type[S], where: str, prefix: str = "") -> S:

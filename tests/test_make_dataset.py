@@ -10,11 +10,12 @@ import pytest
 import tifffile
 
 import benchmarks.make_dataset as command
-from benchmarks.make_dataset import OF_COMMANDS, bundled, load, main
+from benchmarks.make_dataset import OF_COMMANDS, bundled, load, main, select
 from ctsim import simulate
+from ctsim.errors import InputError
 from ctsim.human import human_bytes, human_time
 from ctsim.store import list_scans, open_scan
-from phantoms.scene import load_suite, scene_id
+from phantoms.scene import load_suite, parse_suite, scene_id
 
 SUITE = """
 [defaults]
@@ -203,6 +204,16 @@ def test_wrong_arguments_are_one_sentence(suite, tmp_path, capsys):
         assert main(argv) == 2
         error = capsys.readouterr().err
         assert said in error and error.count("\n") == 1
+
+
+def test_a_wrong_name_among_thousands_is_answered_with_the_nearest_and_their_number():
+    (one,) = parse_suite('name = "a"\nphantom = { recipe = "validation" }')
+    many = tuple(msgspec.structs.replace(one, name=f"head-{k:04}") for k in range(300))
+    with pytest.raises(InputError, match="no such scene, expected one of 300, nearest head-0077, ") as e:
+        select(many, ("head-00077",), ())
+    assert len(str(e.value)) < 150
+    with pytest.raises(InputError, match="no such scene, expected one of 300, such as head-0000, head-0001, "):
+        select(many, ("x",), ())
 
 
 @pytest.mark.parametrize(

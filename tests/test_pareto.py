@@ -134,6 +134,8 @@ def test_a_file_of_ones_own_says_what_is_measured_and_leaves_the_rest_as_it_is(t
     ("text", "says"),
     [
         ("[dataset", "mine.toml: not TOML"),
+        ("x = " + "[" * 3000 + "]" * 3000, "mine.toml: nested more than 32 deep"),
+        ("[iterations]\nstops = [1]\ntimes = " + "9" * 5000, "mine.toml: an integer of thousands of digits"),
         (
             "[[scene]]\nname = 'a'",
             "mine.toml: scene: unknown key; expected one of dataset, iterations, method, simulator",

@@ -16,6 +16,7 @@ from ctsim.errors import InputError
 from ctsim.plan import make_plan
 from ctsim.settings import Truth
 from ctsim.simulate import simulate_views
+from ctsim.writer import SceneWriter
 from phantoms.recipes import NAMES
 from phantoms.scanners import MACHINES, ScannerSettings, preset
 from phantoms.scene import Scene, build, load_suite, parse_suite, scene_id, scene_to_toml, stream_id
@@ -108,6 +109,13 @@ def test_more_truth_keeps_the_noise() -> None:
         ("scene = []", ["no scenes"]),
         ("[extra]", ["unknown key 'extra'"]),
         (MINIMAL + "sede = 1", ["s.toml", "sede"]),
+        (MINIMAL + "x = " + "[" * 3000 + "]" * 3000, ["nested more than 32 deep"]),
+        (MINIMAL + "x = " + "{a=" * 3000 + "1" + "}" * 3000, ["nested more than 32 deep"]),
+        (MINIMAL + "[truth." + ".".join("a" * 3000) + "]\nb = 1", ["truth: nested more than 32 deep"]),
+        ("[[scene]]\n[scene.truth." + ".".join("a" * 40) + "]", ["scene[0]: nested more than 32 deep"]),
+        (MINIMAL + "seed = " + "9" * 5000, ["an integer of thousands of digits"]),
+        (MINIMAL + "seed = 0x" + "f" * 5000, ["seed: an integer beyond 64 bits"]),
+        (MINIMAL + "scanner = { angles_deg = [0, -9223372036854775809] }", ["scanner.angles_deg[1]: an integer"]),
         ('name = "a"\nphantom = { recipe = "lungs" }', ["phantom.recipe", "lungs"]),
         ('name = "a"\nphantom = { recipe = "lung", vesels = 3 }', ["phantom", "vesels"]),
         ('name = "a"\nphantom = { recipe = "lung", metal = "Unobtainium" }', ["phantom", "Unobtainium"]),
@@ -202,11 +210,23 @@ def test_two_scenes_of_one_name_and_missing_files_are_refused(tmp_path: Path) ->
     table = '[[scene]]\nname = "a"\nphantom = { recipe = "lung" }\n'
     with pytest.raises(InputError, match="two scenes are named 'a'"):
         parse_suite(table + table)
+    with pytest.raises(InputError, match="two scenes are named 'a' and 'A'; names must differ in more than case"):
+        parse_suite(table + table.replace('"a"', '"A"'))
     with pytest.raises(InputError, match=r"none\.toml"):
         load_suite(tmp_path / "none.toml")
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match=r"binary\.toml"):
         load_suite(tmp_path / "binary.toml")
+
+
+@pytest.mark.parametrize("name", ["index.jsonl", "INDEX.jsonl", "index.jsonl.new"])
+def test_a_name_that_the_data_folder_needs_is_refused(name: str, tmp_path: Path) -> None:
+    """The index of scenes, and what it is written to before it takes its place; on some disks in any case."""
+    with pytest.raises(InputError, match=re.escape(f"s.toml: name: {name!r} is what the data folder's own index")):
+        parse_suite(MINIMAL.replace("rods", name), "s.toml")
+    with pytest.raises(InputError, match="data folder's own index"):
+        SceneWriter(tmp_path, name, scene_id="a", plan_hash="b", stacks=())
+    assert parse_suite(MINIMAL.replace("rods", "index.jsonl-s1"))
 
 
 def test_a_value_left_empty_survives_the_round_trip() -> None:

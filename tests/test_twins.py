@@ -168,7 +168,11 @@ def test_repetitions_are_seeds_of_one_scene(tmp_path):
     (tmp_path / "scene.toml").write_text('name = "box-s7"\nseed = 7\n')
     assert run.repetition(stored) == ("box", 7)
     assert run.repetition(dataclasses.replace(stored, name="box-s17")) == ("box-s17", 7)
-    (tmp_path / "scene.toml").write_text("seed = ")
+    for damaged in ("seed = ", "seed = 'x'", "seed = " + "9" * 5000, "seed = " + "[" * 3000 + "]" * 3000):
+        (tmp_path / "scene.toml").write_text(damaged)
+        with pytest.raises(InputError, match=r"scene\.toml"):
+            run.repetition(stored)
+    (tmp_path / "scene.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(InputError, match=r"scene\.toml"):
         run.repetition(stored)
 
