@@ -29,6 +29,7 @@ TRIES = 3
 TICK = 1.0  # seconds between two looks at what goes on
 GRACE = 10.0  # seconds that a worker has to write down where it stopped
 CONNECT = 10.0  # seconds that a scheduler has to answer
+CERTIFICATES = ("distributed.comm.tls.ca-file", "distributed.comm.tls.client.cert")
 
 Function = Callable[[Any], Any]
 Answers = Iterator[tuple[int, Any] | None]
@@ -225,8 +226,8 @@ def _follow_parent() -> None:
 class Cluster:
     """The workers of a Dask scheduler: one job at a time each, with as many threads as Dask gave the worker.
 
-    Workers may come and go. Those of a cluster outlive the command: when it is interrupted, jobs that have
-    begun there end by themselves.
+    Certificates for a scheduler at tls:// come from Dask's configuration. Workers may come and go. Those of a
+    cluster outlive the command: when it is interrupted, jobs that have begun there end by themselves.
     """
 
     def __init__(self, address: str) -> None:
@@ -239,14 +240,15 @@ class Cluster:
         self._address, reason = address, ""
         try:
             self._client = self._dask.Client(address, timeout=CONNECT)
-        except (OSError, ValueError) as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
+        except (OSError, ValueError, RuntimeError, TypeError) as error:
+            said = " ".join(str(error).split()) or type(error).__name__
+            reason = f"no Dask scheduler answers there, expected tcp://host:port or tls://host:port ({said})"
+            if isinstance(error, TypeError) and address.startswith("tls://"):  # it would connect without a context
+                reason = f"needs certificates: expected {' and '.join(CERTIFICATES)} in Dask's configuration"
         if reason:
             # the client that failed closes itself when it is collected; while another is made that waits for ever
             gc.collect()
-            raise InputError(
-                f"--scheduler {address}: no Dask scheduler answers there, expected tcp://host:port ({reason})"
-            )
+            raise InputError(f"--scheduler {address}: {reason}")
 
     def __enter__(self) -> Self:
         return self

@@ -1,9 +1,11 @@
 """Several processes and a Dask cluster give what one process gives, also when one of them is killed at work."""
 
+import contextlib
 import gc
 import hashlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -274,6 +276,8 @@ def test_threads_are_the_cores_through_the_workers_but_never_more_than_were_set(
         (["--workers", "2", "--scheduler", "tcp://127.0.0.1:9"], "exclude each other"),
         (["--scheduler", "tcp://127.0.0.1:9"], "no Dask scheduler answers there"),  # the port of `discard`
         (["--scheduler", "nonsense://x"], "no Dask scheduler answers there"),
+        (["--scheduler", "tls://127.0.0.1:9"], "needs certificates: expected distributed.comm.tls.ca-file"),
+        (["--scheduler", "ucx://127.0.0.1:9"], "no Dask scheduler answers there"),  # not installed with Dask
     ],
 )
 def test_workers_that_cannot_be_had_are_one_sentence(serial, tmp_path, monkeypatch, capsys, flags, said):
@@ -314,6 +318,53 @@ def test_a_scheduler_that_goes_is_one_sentence(tmp_path):
             scheduler.kill()
             with pytest.raises(InputError, match="it is gone"):
                 list(answers)
+
+
+def certificate(folder: Path, name: str) -> dict[str, str]:
+    """Make a certificate that is its own authority; return the files as Dask's configuration wants them."""
+    key, cert = folder / f"{name}.key", folder / f"{name}.pem"
+    files = ["-keyout", key, "-out", cert]
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj", f"/CN={name}", *files],
+        check=True,
+        capture_output=True,
+    )
+    return {"ca-file": str(cert), "cert": str(cert), "key": str(key)}
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl, which makes the certificates, is not installed")
+def test_a_scheduler_with_certificates_works_for_those_who_have_them_alone(tmp_path, monkeypatch):
+    dask = pytest.importorskip("dask")
+    ours, others = certificate(tmp_path, "ours"), certificate(tmp_path, "others")
+
+    def configured(files):
+        names = {"ca-file": "ca-file", "cert": "client.cert", "key": "client.key"}
+        tls = {f"distributed.comm.tls.{name}": files[file] for file, name in names.items()}
+        return tls | {"distributed.comm.require-encryption": True}
+
+    flags = [word for name, path in ours.items() for word in (f"--tls-{name}", path)]
+    file = tmp_path / "scheduler.json"
+    flags += ["--no-dashboard", "--scheduler-file", str(file)]
+    scheduler = ["dask_scheduler", "--protocol", "tls", "--port", "0", *flags]
+    worker = ["dask_worker", "--nthreads", "1", "--no-nanny", *flags]
+    with contextlib.ExitStack() as running:
+        for module, *words in (scheduler, worker):
+            command = [sys.executable, "-m", f"distributed.cli.{module}", *words]
+            process = running.enter_context(subprocess.Popen(command, stderr=subprocess.DEVNULL))
+            running.callback(process.kill)
+            until(file.exists)
+        address = json.loads(file.read_text())["address"]
+        assert address.startswith("tls://")
+        with dask.config.set(configured(ours)), Cluster(address) as pool:
+            assert [answer for answer in pool.answers(str.upper, ["one"]) if answer] == [(0, "ONE")]
+        monkeypatch.setattr(workers, "CONNECT", 1.0)
+        with dask.config.set(configured(others)), pytest.raises(InputError, match="no Dask scheduler answers there"):
+            Cluster(address)
+        with pytest.raises(InputError, match=r"tls://.* needs certificates: expected distributed\.comm\.tls\.ca-file"):
+            Cluster(address)
+        plain = address.replace("tls://", "tcp://")
+        with dask.config.set(configured(ours)), pytest.raises(InputError, match=r"encryption required by Dask"):
+            Cluster(plain)
 
 
 def test_a_scheduler_that_does_not_answer_is_one_sentence_but_a_jobs_own_error_is_not(cluster, monkeypatch):
