@@ -24,7 +24,7 @@ from reconstruct.settings import keywords
 class Bridging:
     """Where the metal is, how its trace is bridged, and how it comes back.
 
-    `mask` is "oracle", "auto" or a TIFF file (`baselines.metal.find_metal`); `interpolation` "rows" or "harmonic"
+    `mask` is "oracle", "auto" or a file (`baselines.metal.find_metal`); `interpolation` "rows" or "harmonic"
     (`baselines.inpaint.fill`); `insert` "fdk", "mean" or "none" (`baselines.metal.reinsert`); `dilation` widens the
     trace by so many pixels, None by what the mask's edge leaves out of it (`baselines.metal.Trace`).
     """

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from baselines.morphology import dilate, filled, pieces, spread
+from ctsim.arrayfile import read_array
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.project import Tracer
@@ -52,7 +53,7 @@ def find_metal(scan: Scan, volume: NDArray[np.float32], mask: str) -> Metal:
     """Return the metal mask of a scan.
 
     `mask` is "oracle" (`scan.metal`, the true mask), "auto" (from the uncorrected reconstruction `volume`
-    [z, y, x] in 1/mm, see `auto_mask`) or the path of a TIFF stack [z, y, x] that is not 0 in metal.
+    [z, y, x] in 1/mm, see `auto_mask`) or the path of a TIFF stack or .npy array [z, y, x], not 0 in metal.
 
     Raises
     ------
@@ -66,21 +67,19 @@ def find_metal(scan: Scan, volume: NDArray[np.float32], mask: str) -> Metal:
             raise InputError("mask = 'oracle': the scan has no true metal mask; say 'auto' or name a file")
         found = scan.metal.numpy() != 0
     else:
-        found = _read(Path(mask))
+        found = _read(Path(mask), volume.shape)
     if found.shape != volume.shape:
         raise InputError(f"mask {mask!r} has shape {found.shape}, the volume {volume.shape}")
     return Metal(mask=found, source=mask)
 
 
-def _read(path: Path) -> NDArray[np.bool_]:
-    import tifffile
-
+def _read(path: Path, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     if not path.is_file():
-        raise InputError(f"mask: expected 'oracle', 'auto' or a TIFF file, and there is no file {path}")
+        raise InputError(f"mask: expected 'oracle', 'auto', a TIFF or a .npy file, and there is no file {path}")
     try:
-        return np.asarray(tifffile.imread(path)) != 0
-    except (OSError, ValueError, tifffile.TiffFileError) as error:
-        raise InputError(f"mask: {path} cannot be read as TIFF: {error}") from None
+        return read_array(path, shape) != 0
+    except InputError as error:
+        raise InputError(f"mask: {error}") from None
 
 
 def auto_mask(volume: NDArray[np.float32]) -> Metal:

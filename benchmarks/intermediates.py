@@ -6,7 +6,6 @@ kept beside the volume as NAME.npz and stand in no record. A method that attache
 
 import contextlib
 import os
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.arrayfile import read_arrays
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 
@@ -73,10 +73,9 @@ def read(path: Path, identity: str) -> Intermediates:
     Raises InputError where the file is damaged.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            found = {name: np.asarray(file[name]) for name in file.files}
+        found = read_arrays(path)
     except FileNotFoundError:
         return {}
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); delete it or run the method again with --force") from None
     return found if str(found.pop(_RUN, "")) == identity else {}

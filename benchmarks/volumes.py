@@ -86,18 +86,14 @@ def map_volume(path: Path) -> NDArray[np.float32]:
 
 
 def read_volume(path: Path) -> NDArray[np.float32]:
-    """Read a kept volume [z, y, x] in 1/mm.
+    """Read a kept volume [z, y, x] in 1/mm, which is not compressed: no more than the file holds.
 
     Raises InputError where the file is not there or no volume.
     """
-    import tifffile
-
     try:
-        values = np.asarray(tifffile.imread(path))
+        values = np.array(map_volume(path))
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such volume; run the method again with --force") from None
-    except (ValueError, tifffile.TiffFileError) as error:
-        raise InputError(f"{path}: cannot be read as a TIFF stack: {error}") from None
     if values.ndim != 3:
         raise InputError(f"{path}: expected a volume [z, y, x], got shape {values.shape}")
     return values

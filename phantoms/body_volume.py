@@ -1,6 +1,7 @@
 """A CT volume from a file as a body: grey values become tissue and its density, metal is put into it."""
 
 import hashlib
+import math
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.arrayfile import MOST, read_array
 from ctsim.errors import InputError
 from ctsim.geometry import Triple
 from ctsim.materials import attenuation
@@ -85,17 +87,9 @@ def _read(params: CtVolume) -> NDArray[np.float32]:
     if (found := _digest(params.path)) != params.sha256:
         raise InputError(f"path: {params.path} has the SHA-256 {found}, the scene was made of {params.sha256}")
     try:
-        if params.path.endswith(".npy"):
-            values = np.load(params.path, allow_pickle=False)
-        else:
-            import tifffile
-
-            values = tifffile.imread(params.path)
-    except Exception as error:  # whatever a decoder says of a file that is not one
-        raise InputError(f"path: {params.path} is no TIFF stack or .npy array: {error}") from None
-    if not isinstance(values, np.ndarray) or values.ndim != 3 or not values.size or values.dtype.kind not in "iuf":
-        what = f"{values.dtype} of shape {values.shape}" if isinstance(values, np.ndarray) else "several arrays"
-        raise InputError(f"path: {params.path} holds {what}, expected one array of numbers [z, y, x]")
+        values = read_array(Path(params.path))
+    except InputError as error:
+        raise InputError(f"path: {error}") from None
     slope, intercept = params.rescale
     with np.errstate(over="ignore", invalid="ignore"):
         hu = values.astype(np.float32) * np.float32(slope) + np.float32(intercept)
@@ -112,6 +106,10 @@ def _resampled(hu: NDArray[np.float32], params: CtVolume, n: Shape, d_voxel: Tri
     from scipy import ndimage
 
     times = np.ceil(np.divide(d_voxel, params.spacing) - 1e-9).astype(int)
+    if math.prod(int(a * b) for a, b in zip(n, times, strict=True)) > MOST:
+        raise InputError(
+            f"spacing: {params.spacing} mm makes more than {MOST} places of the object's cube; expected less"
+        )
     fine, step = np.multiply(n, times), np.divide(d_voxel, params.spacing) / times
     first: Any = (0.5 - fine / 2) * step + np.divide(hu.shape, 2) - 0.5
     out = np.empty(fine, np.float32)

@@ -296,8 +296,11 @@ def test_a_mask_file_serves_as_well_as_the_oracle(iron, tmp_path):
     tifffile.imwrite(tmp_path / "mask.tif", scan.metal.numpy())
     given = limar.reconstruct(dataclasses.replace(scan, metal=None), mask=str(tmp_path / "mask.tif"))
     assert torch.equal(given.values, limar.reconstruct(scan).values)
+    np.save(tmp_path / "mask.npy", scan.metal.numpy())
+    again = limar.reconstruct(dataclasses.replace(scan, metal=None), mask=str(tmp_path / "mask.npy"))
+    assert torch.equal(given.values, again.values)
     tifffile.imwrite(tmp_path / "small.tif", scan.metal.numpy()[1:])
-    with pytest.raises(InputError, match="has shape"):
+    with pytest.raises(InputError, match=r"mask: .*small\.tif holds uint8 of shape .*, expected \("):
         limar.reconstruct(scan, mask=str(tmp_path / "small.tif"))
 
 

@@ -1,0 +1,99 @@
+"""Arrays from files that may be anybody's: what a file declares is looked at before anything of it is decoded.
+
+A compressed file of a megabyte can hold a gigabyte of zeros, and a header can declare more than any memory holds.
+"""
+
+import math
+import zipfile
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.errors import InputError
+from ctsim.human import human_bytes
+
+MOST = 2**31  # values: a volume of 1290³, 8.6 GB as float32
+PLAIN, TIMES = 2**28, 100  # bytes, and times the file's own: no CT beyond both decodes to so much
+
+
+def read_array(path: Path, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
+    """Read a TIFF stack or a .npy array, of `shape` where that is known.
+
+    Raises InputError, a sentence that begins with the path: for a file that is neither, does not hold one array of
+    numbers of that shape, three-dimensional where none is said, or would decode to more than is plausible.
+    """
+    try:
+        return _npy(path, shape) if path.suffix == ".npy" else _tiff(path, shape)
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # whatever a decoder says of a file that is not one
+        said = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path} is no TIFF stack or .npy array: {said}") from None
+
+
+def _tiff(path: Path, shape: tuple[int, ...] | None) -> NDArray[Any]:
+    import tifffile
+
+    with tifffile.TiffFile(path) as file:
+        series = file.series[0]
+        _check(path, series.shape, series.dtype, shape)
+        size, own = math.prod(series.shape) * np.dtype(series.dtype).itemsize, path.stat().st_size
+        if shape is None and size > max(PLAIN, TIMES * own):
+            raise InputError(
+                f"{path} has {human_bytes(own)} and would decode to {human_bytes(size)}, as no CT does; "
+                "expected a file that is not compressed, if this is meant"
+            )
+        return np.asarray(series.asarray())
+
+
+def _npy(path: Path, shape: tuple[int, ...] | None) -> NDArray[Any]:
+    with path.open("rb") as file:
+        found, _, dtype = _header(file)
+        _check(path, found, dtype, shape)
+        if math.prod(found) * dtype.itemsize > path.stat().st_size - file.tell():
+            raise InputError(f"{path} ends before its array of shape {found} does")
+    return np.load(path, allow_pickle=False)
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Read the arrays of an .npz file as `numpy.savez` writes it, not compressed.
+
+    Raises OSError where it cannot be read, and ValueError for what is none or declares more than the file holds.
+    """
+    try:
+        with zipfile.ZipFile(path) as file:
+            for member in file.infolist():
+                _check_member(file, member)
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: np.asarray(arrays[name]) for name in arrays.files}
+    except (EOFError, KeyError, RuntimeError, zipfile.BadZipFile) as error:
+        raise ValueError(str(error) or type(error).__name__) from None
+
+
+def _check_member(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
+    """Refuse an array that is not in the file as it stands: NumPy makes room for all that a header says."""
+    if member.compress_type != zipfile.ZIP_STORED:
+        raise ValueError(f"{member.filename} is compressed, which nothing here writes")
+    with file.open(member) as inner:
+        found, _, dtype = _header(inner)
+    if math.prod(found) * dtype.itemsize > member.file_size:
+        raise ValueError(f"{member.filename} ends before its array of shape {found} does")
+
+
+def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Read shape, whether the order is Fortran's, and dtype from the beginning of a .npy file."""
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    return read(file)
+
+
+def _check(path: Path, found: tuple[int, ...], dtype: Any, shape: tuple[int, ...] | None) -> None:
+    """Refuse an array that is not what was asked for, or more than is read."""
+    if shape is not None and found != shape:
+        raise InputError(f"{path} holds {dtype} of shape {found}, expected {shape}")
+    if shape is None and (len(found) != 3 or not math.prod(found) or np.dtype(dtype).kind not in "iuf"):
+        raise InputError(f"{path} holds {dtype} of shape {found}, expected one array of numbers [z, y, x]")
+    if math.prod(found) > MOST:
+        raise InputError(f"{path} declares {math.prod(found)} values of shape {found}, expected at most {MOST}")
