@@ -93,8 +93,7 @@ def water_attenuation(stored: Stored) -> float | None:
 
 def layout_of(stored: Stored, truth: Truth) -> Layout:
     """Choose the ROIs and lines of a scan from its labels and its metal; nothing depends on a method."""
-    names = list(stored.info.get("materials", []))
-    rois, small = homogeneous(np.asarray(stored.labels), truth, names)
+    rois, small = homogeneous(np.asarray(stored.labels), truth, stored.info.materials)
     lines, n_pairs, cut = metal_lines(truth)
     near = near_metal(truth)
     water = water_attenuation(stored)
@@ -119,7 +118,7 @@ def _roi_text(roi: Roi) -> str:
     return f"ROI {roi.material}: {roi.voxels.size} voxels around ({x:.1f}, {y:.1f}, {z:.1f}) mm"
 
 
-def homogeneous(labels: NDArray[Any], truth: Truth, names: list[str]) -> tuple[tuple[Roi, ...], list[str]]:
+def homogeneous(labels: NDArray[Any], truth: Truth, names: tuple[str, ...]) -> tuple[tuple[Roi, ...], list[str]]:
     """Return one ROI a material, its largest connected homogeneous piece, and the materials too small for one.
 
     A voxel is homogeneous where all labels within 2 voxels, diagonals included, are its own, and it is

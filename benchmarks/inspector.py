@@ -323,8 +323,8 @@ def _kept(given: Arguments, stored: "Stored") -> tuple[Volume, str, Volume | Non
 def _made(given: Arguments, stored: "Stored") -> tuple[Volume, str, Volume | None]:
     """Reconstruct the scan."""
     from benchmarks import methods
+    from benchmarks.attempt import attempt, scan_for
     from benchmarks.devices import check_device
-    from benchmarks.run import attempt, scan_for
 
     if given.method is None:
         raise InputError("expected a results folder or --method NAME")

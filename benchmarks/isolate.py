@@ -54,11 +54,11 @@ class _Ended(msgspec.Struct, frozen=True, kw_only=True):
 
 def _work(store: str, folder: str, variant: str, method: "Method", device: str, out: str) -> None:
     """Be the process: open the scan, warm up, run, leave the outcome in `out`."""
-    from benchmarks.run import attempt, scan_for, warm_up
+    from benchmarks.attempt import run_here, scan_for, warm_up
 
     stored = pkgutil.resolve_name(store)(folder)
     warm = warm_up(method, scan_for(method, stored, "metal"), device)
-    outcome = attempt(method, scan_for(method, stored, variant), device, warm)
+    outcome = run_here(stored, variant, method, device, warm)
     for name in _VOLUMES:
         if (volume := getattr(outcome, name)) is not None:
             np.save(Path(out) / f"{name}.npy", volume)

@@ -84,7 +84,7 @@ def within(process: Limited, threads: int, job: Job) -> Ran:
 
 def do(threads: int, job: Job) -> Ran:
     """Be the process: run a job, after a warm-up if it is the first of its kind, and say whatever happens."""
-    from benchmarks.run import describe
+    from benchmarks.attempt import describe
 
     use_threads(threads)
     marks, status, reason, first = (), OK, "", None

@@ -18,12 +18,12 @@ import numpy as np
 import torch
 
 from benchmarks import metrics
+from benchmarks.attempt import scan_for, warm_up
 from benchmarks.methods import Method, find
 from benchmarks.pareto_jobs import Ended
 from benchmarks.pareto_records import Mark, Setting
 from benchmarks.pareto_suite import Listed, Suite
 from benchmarks.protocol import VERSION, Truth, tissue_range, truth_of
-from benchmarks.run import scan_for, warm_up
 from ctsim.errors import InputError
 from ctsim.store import StoredScan, open_scan
 from ctsim.types import Status

@@ -19,6 +19,7 @@ from ctsim.errors import InputError
 
 if TYPE_CHECKING:
     from ctsim.geometry import Geometry
+    from ctsim.scaninfo import ScanInfo
     from ctsim.types import Scan
 
 VERSION = 3
@@ -71,8 +72,8 @@ class Stored(Protocol):
         ...
 
     @property
-    def info(self) -> dict[str, Any]:
-        """What scan.json says; `seed` is the repetition's."""
+    def info(self) -> "ScanInfo":
+        """What scan.json says."""
         ...
 
     @property

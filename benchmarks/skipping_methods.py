@@ -17,9 +17,9 @@ from baselines.metal import Trace, find_metal
 from baselines.nmar import Normalise, normalised
 from baselines.prior import Choice, choose_prior
 from benchmarks import cli_run, make_dataset, skipping_cases
+from benchmarks.attempt import scan_for
 from benchmarks.cli import EXIT_INTERRUPTED
 from benchmarks.methods import Method, find
-from benchmarks.run import scan_for
 from benchmarks.skipping_cases import Pair, Pairs, Setup, largest
 from benchmarks.skipping_tables import Measured
 from benchmarks.volumes import read_volume

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +16,7 @@ from ctsim import manifest as mf
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.manifest import list_scans, verify
+from ctsim.scaninfo import ScanInfo, read_info
 from ctsim.tiffstack import map_array
 from ctsim.writer import SceneWriter, Stack, is_complete
 
@@ -32,29 +32,49 @@ _TWIN = "metal_free/"
 class StoredScan:
     """A finished scan on disk. `scan` is what a method gets; the rest is ground truth for judging it.
 
-    Arrays are memory-mapped copy-on-write: nothing is read before it is used, the files never change.
-    `info` is scan.json; `l0` the median water-equivalent path (mm). `metal_free` is the paired twin.
+    It holds no open file: arrays are memory-mapped when they are asked for, each time anew and copy-on-write, so that
+    nothing is read before it is used and neither the files nor another one's arrays ever change. `info` is scan.json;
+    `metal_free` is the paired twin.
     """
 
     folder: Path
     name: str
     scene_id: str
     content_hash: str
-    scan: "Scan"
-    info: dict[str, Any]
+    info: ScanInfo
     files: dict[str, mf.FileEntry]
     prefix: str = ""
     metal_free: "StoredScan | None" = None
 
     @property
+    def scan(self) -> "Scan":
+        """Map the scan anew: what is written into it stays with the one who asked.
+
+        Raises
+        ------
+        InputError
+            When a file cannot be mapped, and when the open field has no usable pixel.
+        """
+        import torch  # seconds that listing and verifying do without
+
+        from ctsim.types import Scan
+
+        counts, flat = (torch.from_numpy(_map(self.folder, self.files, name)) for name in _readings(self.prefix))
+        info = self.info
+        try:
+            return Scan(geometry=info.geometry, counts=counts, flat=flat, dark=info.dark, i0=info.i0, e_max=info.e_max)
+        except InputError as error:
+            raise InputError(f"{self.folder}: {error}") from None
+
+    @property
     def geometry(self) -> Geometry:
         """Return the scan's geometry."""
-        return self.scan.geometry
+        return self.info.geometry
 
     @property
     def l0(self) -> float:
         """Return the scene's median water-equivalent path in mm."""
-        return float(self.info["l0"])
+        return self.info.l0
 
     @property
     def labels(self) -> NDArray[np.uint8]:
@@ -82,52 +102,34 @@ class StoredScan:
 
 
 def open_scan(folder: str | Path) -> StoredScan:
-    """Open a finished scan; the counts are mapped, not read.
+    """Open a finished scan: its files are found and measured, none but its JSON is read.
 
     Raises
     ------
     InputError
-        When the folder is half-written, damaged (a file missing or of another size) or of another format.
+        When the folder is half-written, damaged (a file missing or of another size), of another format, or its
+        scan.json says what cannot be.
     """
     folder = Path(folder)
     manifest = mf.read_manifest(folder)
     problems = mf.check_sizes(folder, manifest)
     if problems:
         raise InputError(f"damaged dataset: {problems[0]}" + (f" (and {len(problems) - 1} more)" * (len(problems) > 1)))
-    info = _read_info(folder / "scan.json")
+    info = read_info(folder / "scan.json")
     twin = _open(folder, manifest, info, _TWIN, None) if f"{_TWIN}counts.tif" in manifest.files else None
     return _open(folder, manifest, info, "", twin)
 
 
-def _open(
-    folder: Path, manifest: mf.Manifest, info: dict[str, Any], prefix: str, twin: StoredScan | None
-) -> StoredScan:
-    import torch  # seconds that listing and verifying do without
-
-    from ctsim.types import Scan
-
-    where = folder / "scan.json"
-    counts, flat = (torch.from_numpy(_map(folder, manifest.files, name)) for name in (f"{prefix}counts", "flat"))
-    try:
-        scan = Scan(
-            geometry=msgspec.convert(info["geometry"], Geometry),
-            counts=counts,
-            flat=flat,
-            dark=float(info["dark"]),
-            i0=float(info["i0"]),
-            e_max=float(info["e_max"]),
-        )
-        float(info["l0"])
-    except KeyError as error:
-        raise InputError(f"{where}: the key {error} is missing") from None
-    except (TypeError, ValueError) as error:  # msgspec's and our own errors are ValueErrors
-        raise InputError(f"{where}: {error}") from None
+def _open(folder: Path, manifest: mf.Manifest, info: ScanInfo, prefix: str, twin: StoredScan | None) -> StoredScan:
+    for name, shape in zip(_readings(prefix), (info.geometry.shape, info.geometry.n_detector), strict=True):
+        found, _, _ = _place(folder, manifest.files, name)
+        if found != shape:
+            raise InputError(f"{folder / name}.tif: shape {found}, the geometry of scan.json says {shape}")
     return StoredScan(
         folder=folder,
         name=manifest.name,
         scene_id=manifest.scene_id,
         content_hash=manifest.content_hash,
-        scan=scan,
         info=info,
         files=manifest.files,
         prefix=prefix,
@@ -135,21 +137,23 @@ def _open(
     )
 
 
-def _read_info(path: Path) -> dict[str, Any]:
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
-    except FileNotFoundError:
-        raise InputError(f"{path}: missing") from None
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: damaged ({error})") from None
+def _readings(prefix: str) -> tuple[str, str]:
+    """Return the names of a scan's counts and of its open field, which a twin shares."""
+    return f"{prefix}counts", "flat"
 
 
-def _map(folder: Path, files: dict[str, mf.FileEntry], name: str) -> NDArray[Any]:
+def _place(folder: Path, files: dict[str, mf.FileEntry], name: str) -> tuple[tuple[int, ...], str, int]:
+    """Return an array's shape, dtype and byte offset; raises InputError where there is none of that name."""
     entry = files.get(f"{name}.tif")
     if entry is None or entry.shape is None or entry.dtype is None or entry.offset is None:
         raise InputError(f"{folder}: was written without {name}.tif")
+    return entry.shape, entry.dtype, entry.offset
+
+
+def _map(folder: Path, files: dict[str, mf.FileEntry], name: str) -> NDArray[Any]:
+    shape, dtype, offset = _place(folder, files, name)
     path = folder / f"{name}.tif"
     try:
-        return map_array(path, entry.shape, entry.dtype, entry.offset)
+        return map_array(path, shape, dtype, offset)
     except (OSError, TypeError, ValueError) as error:
         raise InputError(f"{path}: cannot be mapped ({error})") from error

@@ -15,6 +15,7 @@ from ctsim.detector import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry, Triple
 from ctsim.noise import Noise
+from ctsim.scaninfo import check_readings
 from ctsim.scatter import Scatter
 from ctsim.solids import Solid
 from ctsim.spectrum import Tube
@@ -97,6 +98,12 @@ class Scan:
     `flat` [v, u] float32 is the open-field image and `dark` the pedestal, both in counts. `e_max` is
     the highest photon energy (keV); `i0` the photons per open pixel and view. `metal` [z, y, x], not 0 in metal,
     is the true mask, there only for methods that declare to be given it.
+
+    Raises
+    ------
+    InputError
+        When arrays are no tensors of real numbers in the geometry's shapes, when no pixel of `flat` is finite and
+        above `dark`, and when a number cannot be what it is to be. The counts themselves are not read.
     """
 
     geometry: Geometry
@@ -108,12 +115,14 @@ class Scan:
     metal: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
-        if tuple(self.counts.shape) != self.geometry.shape:
-            raise InputError(f"counts have shape {tuple(self.counts.shape)}, the geometry says {self.geometry.shape}")
-        if tuple(self.flat.shape) != self.geometry.n_detector:
-            raise InputError(f"flat has shape {tuple(self.flat.shape)}, the detector {self.geometry.n_detector}")
-        if self.metal is not None and tuple(self.metal.shape) != self.geometry.n_voxel:
-            raise InputError(f"metal has shape {tuple(self.metal.shape)}, the volume {self.geometry.n_voxel}")
+        check_readings(self.dark, self.i0, self.e_max)
+        _check_array("counts", self.counts, self.geometry.shape, READINGS)
+        _check_array("flat", self.flat, self.geometry.n_detector, READINGS)
+        if self.metal is not None:
+            _check_array("metal", self.metal, self.geometry.n_voxel, (torch.bool, *READINGS))
+        flat = self.flat.double()
+        if not bool(((flat > self.dark) & (flat < math.inf)).any()):
+            raise InputError(f"flat: no pixel is finite and above the pedestal, dark = {self.dark:g} counts")
 
     @classmethod
     def from_line_integrals(
@@ -122,13 +131,33 @@ class Scan:
         """Return the scan whose −log projections are `p` [view, v, u], for measurements that are no longer counts.
 
         `i0` is how many photons an open pixel saw: readings below half a photon, p above ln(2 i0), count as nothing
-        seen, as do those that are not finite. Raises InputError where shapes disagree or `i0` is not positive.
+        seen, as do those that are not finite. Raises InputError as `Scan` does.
         """
-        if not (math.isfinite(i0) and i0 > 0):
-            raise InputError(f"i0 must be photons above 0, got {i0}")
+        check_readings(0.0, i0, e_max)
         counts = i0 * torch.exp(-torch.as_tensor(p, dtype=torch.float64))
         flat = torch.full(geometry.n_detector, i0, dtype=torch.float32)
         return cls(geometry=geometry, counts=counts.float(), flat=flat, i0=i0, e_max=e_max)
+
+
+READINGS = (
+    torch.uint8, torch.uint16, torch.uint32, torch.int8, torch.int16, torch.int32, torch.int64,
+    torch.float16, torch.float32, torch.float64,
+)  # fmt: skip
+"""What readings may be stored as: real numbers of types that NumPy has too."""
+
+
+def _check_array(name: str, given: Any, shape: tuple[int, ...], dtypes: tuple[torch.dtype, ...]) -> None:
+    """Raise InputError unless `given` is a tensor of that shape and one of these types that needs no gradient."""
+    if not isinstance(given, torch.Tensor):
+        hint = f"; torch.from_numpy({name}) makes one" if isinstance(given, np.ndarray) else ""
+        raise InputError(f"{name} must be a torch.Tensor, got {type(given).__module__}.{type(given).__name__}{hint}")
+    if tuple(given.shape) != shape:
+        raise InputError(f"{name}: shape {tuple(given.shape)}, the geometry says {shape}")
+    if given.dtype not in dtypes:
+        names = ", ".join(str(dtype).removeprefix("torch.") for dtype in dtypes)
+        raise InputError(f"{name} must be real numbers ({names}), got {given.dtype}")
+    if given.requires_grad:
+        raise InputError(f"{name} must not require gradients; {name}.detach() does not")
 
 
 class Status(enum.StrEnum):

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import artefact, cli, cli_run, intermediates, methods, records, run
+from benchmarks import artefact, attempt, cli, cli_run, intermediates, methods, records, run
 from benchmarks.panels import Row, cut, draw, write_panels
 from benchmarks.protocol import truth_of
 from benchmarks.tables import caption
 from benchmarks.volumes import at_50kev_of, identity_of, read_volume, write_volume
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.scaninfo import ScanInfo
 from ctsim.types import Scan, Volume
 
 GEOMETRY = Geometry(
@@ -39,7 +40,7 @@ class Double:
 
     @property
     def info(self):
-        return {"seed": 3}
+        return ScanInfo(geometry=GEOMETRY, dark=0.0, i0=1e5, e_max=90.0, l0=self.l0, seed=3, metal=("Fe",))
 
     @property
     def geometry(self):
@@ -195,8 +196,8 @@ def test_a_method_that_can_be_told_its_seconds_ends_by_itself(tmp_path):
 
 def test_a_warm_up_goes_on_until_nothing_is_left_to_compile(tmp_path):
     CALLS.clear()
-    seconds = run.warm_up(methods.find("test_run:compiling"), double(tmp_path).scan, "cpu")
-    assert CALLS == [run.WARM] * 3 and seconds > 4 * run.WARM
+    seconds = attempt.warm_up(methods.find("test_run:compiling"), double(tmp_path).scan, "cpu")
+    assert CALLS == [attempt.WARM] * 3 and seconds > 4 * attempt.WARM
 
 
 def test_a_rerun_does_only_what_is_missing(tmp_path):
@@ -229,7 +230,7 @@ def test_a_method_can_skip_with_a_reason(tmp_path, monkeypatch):
 
 def test_the_tiny_scan_keeps_slices_and_memory():
     scan = double(Path()).scan
-    small = run.tiny(scan)
+    small = attempt.tiny(scan)
     assert small.geometry.n_voxel == (8, 14, 16) and small.geometry.d_voxel == scan.geometry.d_voxel
     assert small.counts.data_ptr() == scan.counts.data_ptr() and small.counts.stride() == scan.counts.stride()
 
@@ -301,14 +302,14 @@ def test_a_rerun_without_a_volume_at_50_kev_leaves_none_of_an_earlier_one(tmp_pa
 )
 def test_a_volume_at_50_kev_that_is_none_is_the_runs_failure(tmp_path, flaw, status):
     method = methods.find("test_run:spectral", {"flaw": flaw})
-    outcome = run.attempt(method, double(tmp_path).scan, "cpu", 0.0)
+    outcome = attempt.attempt(method, double(tmp_path).scan, "cpu", 0.0)
     assert outcome.status == status and "volume at 50 keV" in outcome.reason
     assert outcome.at_50kev is None or status == "nonfinite"
     assert outcome.cost is not None and outcome.cost.view_updates == 12
 
 
 def test_reading_at_50_kev_is_no_time_of_the_method(tmp_path):
-    outcome = run.attempt(methods.find("test_run:spectral", {"flaw": "slow"}), double(tmp_path).scan, "cpu", 0.0)
+    outcome = attempt.attempt(methods.find("test_run:spectral", {"flaw": "slow"}), double(tmp_path).scan, "cpu", 0.0)
     assert outcome.status == "ok" and outcome.cost is not None and outcome.cost.wall < 0.5
 
 
@@ -365,7 +366,7 @@ def test_panels_hold_what_each_method_gave():
 )
 def test_intermediates_that_cannot_be_drawn_are_an_error(tmp_path, entries, words):
     method = methods.find("test_run:shows", {"entries": entries})
-    outcome = run.attempt(method, double(tmp_path).scan, "cpu", 0.0)
+    outcome = attempt.attempt(method, double(tmp_path).scan, "cpu", 0.0)
     assert outcome.status == "error" and words in outcome.reason
     for wrong in ({"view": 6}, {"view": -1}, {"prior": np.zeros((2, 2, 2))}, {"view": 0, "trace": np.zeros((5, 5))}):
         with pytest.raises(InputError):

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.attempt import warm_up
 from benchmarks.make_dataset import main as make_dataset
 from benchmarks.methods import find
 from benchmarks.metrics import psnr3d
 from benchmarks.protocol import tissue_score, truth_of
-from benchmarks.run import warm_up
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation

@@ -170,8 +170,9 @@ def test_an_array_that_cannot_be_mapped_is_refused_by_its_own_name(tmp_path, mon
         raise OSError(12, "Cannot allocate memory")
 
     monkeypatch.setattr(store, "map_array", refuse)
+    stored = open_scan(folder)  # maps nothing yet
     with pytest.raises(InputError, match=r"counts\.tif: .*Cannot allocate memory"):
-        open_scan(folder)
+        _ = stored.scan
 
 
 def test_a_file_is_no_data_folder(tmp_path):
@@ -198,21 +199,74 @@ def test_the_index_survives_a_torn_line_and_a_missing_folder(tmp_path):
         list_scans(tmp_path)
 
 
+GOOD = {"geometry": msgspec.to_builtins(GEOMETRY), "dark": 100.0, "i0": 1e5, "e_max": 90.0, "l0": 12.5}
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
-    [({"l0": None}, "l0"), ({"geometry": {"dso": 1.0}}, "scan.json"), ({"e_max": "high"}, "scan.json")],
+    [
+        ({"l0": None}, "`l0`"),
+        ({"l0": -3.0}, "l0"),
+        ({"geometry": {"dso": 1.0}}, "geometry"),
+        ({"e_max": "high"}, "e_max"),
+        ({"e_max": 0}, "e_max"),
+        ({"e_max": -1}, "e_max"),
+        ({"dark": "nan"}, "dark"),
+        ({"dark": True}, "dark"),
+        ({"dark": "100.0"}, "dark"),
+        ({"i0": 0}, "i0"),
+        ({"i0": -5}, "i0"),
+        ({"i0": "inf"}, "i0"),
+        ({"seed": "x"}, "seed"),
+        ({"seed": -1}, "seed"),
+        ({"potato": 1}, "potato"),
+        ({"geometry": GOOD["geometry"] | {"n_views": 7}}, "counts.tif: shape"),
+        ({"geometry": GOOD["geometry"] | {"n_detector": [5, 8]}}, "counts.tif: shape"),
+    ],
 )
 def test_a_wrong_scan_json_is_refused_by_name(tmp_path, change, said):
-    folder = write(tmp_path)
-    info = msgspec.json.decode((folder / "scan.json").read_bytes()) | change
-    info = {k: v for k, v in info.items() if v is not None}
-    text = msgspec.json.encode(info)
+    with pytest.raises(InputError, match=said) as caught:
+        open_scan(with_info(write(tmp_path), {k: v for k, v in (GOOD | change).items() if v is not None}))
+    assert "\n" not in str(caught.value) and ("scan.json" in str(caught.value))
+
+
+@pytest.mark.parametrize("number", ["NaN", "1e999", "-Infinity"])
+def test_a_number_that_json_does_not_know_is_refused(tmp_path, number):
+    text = msgspec.json.encode(GOOD).replace(b'"i0":100000.0', b'"i0":' + number.encode())
+    with pytest.raises(InputError, match=r"scan\.json"):
+        open_scan(with_info(write(tmp_path), text))
+
+
+def with_info(folder: Path, info: dict | bytes) -> Path:
+    """Give a stored scan another scan.json, of the size that its manifest says."""
+    text = info if isinstance(info, bytes) else msgspec.json.encode(info)
     manifest = msgspec.json.decode((folder / MANIFEST).read_bytes())
     manifest["files"]["scan.json"]["bytes"] = len(text)
     (folder / "scan.json").write_bytes(text)
     (folder / MANIFEST).write_bytes(msgspec.json.encode(manifest))
-    with pytest.raises(InputError, match=said):
-        open_scan(folder)
+    return folder
+
+
+def test_a_flat_without_a_usable_pixel_is_refused_when_the_scan_is_asked_for(tmp_path):
+    folder = write(tmp_path)
+    stored = open_scan(with_info(folder, GOOD | {"dark": 4e4}))  # the open field's own value
+    with pytest.raises(InputError, match="scene: flat: no pixel is finite and above"):
+        _ = stored.scan
+
+
+def test_each_asking_gets_a_view_of_its_own_and_leaves_no_file_open(tmp_path):
+    opened = Path("/proc/self/fd")
+    before = len(list(opened.iterdir()))
+    stored = open_scan(write(tmp_path))
+    assert len(list(opened.iterdir())) == before
+    expected = np.stack([one_view(k)["counts"] for k in range(6)])
+    first = stored.scan
+    first.counts.zero_()
+    first.flat.zero_()
+    np.testing.assert_array_equal(stored.scan.counts.numpy(), expected)
+    assert (stored.scan.flat == 4e4).all()
+    del first
+    assert len(list(opened.iterdir())) == before
 
 
 def test_the_content_hash_sees_counts_but_not_the_plans_estimates(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 import torch
 from test_run import GEOMETRY, Double
 
-from benchmarks import artefact, methods, records, run
+from benchmarks import artefact, attempt, methods, records, run
 from benchmarks.volumes import identity_of, read_volume, write_volume
 from ctsim.errors import InputError
 from ctsim.materials import attenuation
@@ -203,8 +203,8 @@ def test_the_true_mask_goes_to_methods_that_ask_for_it_and_is_empty_in_the_twin(
 
 
 def test_warming_up_sees_the_metal(tmp_path):
-    scan = run.scan_for(methods.find("test_twins:masked"), pair(tmp_path), "metal")
-    small = run.tiny(scan)
+    scan = attempt.scan_for(methods.find("test_twins:masked"), pair(tmp_path), "metal")
+    small = attempt.tiny(scan)
     assert tuple(small.metal.shape) == small.geometry.n_voxel == (8, 14, 16)
     assert small.metal.sum() == scan.metal.sum() > 0
 

@@ -76,7 +76,7 @@ show.figure(drawing, "physics-spectrum")
 # first. What is left is harder, so that a millimetre more weighs less.
 
 # %%
-metals = [m for m in stored.info["metal"] if m in plan.materials]
+metals = [m for m in stored.info.metal if m in plan.materials]
 drawing = Figure(figsize=(8.5, 3.2), layout="constrained")
 panels = drawing.subplots(1, 2)
 rows = []

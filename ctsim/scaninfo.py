@@ -1,0 +1,71 @@
+"""What scan.json says of a scan: its geometry and the numbers that counts are read with."""
+
+import math
+import numbers
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+
+
+class ScanInfo(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What scan.json holds; lengths mm, energies keV.
+
+    `dark` is the pedestal and `gain` the open signal above it, in counts; `i0` the photons per open pixel and view;
+    `l0` the median water-equivalent path. `materials` name the labels, `metal` those of them that are inserts. `notes`
+    say what a user of the scan should know, such as that no view shows the metal. `seed` is that of a scan without
+    scene.toml.
+    """
+
+    geometry: Geometry
+    dark: float
+    i0: float
+    e_max: float
+    l0: Annotated[float, msgspec.Meta(ge=0)]
+    gain: float | None = None
+    mean_detected_kev: float | None = None
+    scatter_fraction: float = 0.0
+    materials: tuple[str, ...] = ()
+    metal: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    seed: Annotated[int, msgspec.Meta(ge=0)] = 0
+
+    def __post_init__(self) -> None:
+        check_readings(self.dark, self.i0, self.e_max)
+        if not math.isfinite(self.l0):
+            raise InputError(f"l0 must be finite (mm), got {self.l0}")
+
+
+def read_info(path: Path) -> ScanInfo:
+    """Read scan.json.
+
+    Raises
+    ------
+    InputError
+        When it is missing or damaged, or says what cannot be (naming the key).
+    """
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=ScanInfo)
+    except FileNotFoundError:
+        raise InputError(f"{path}: missing") from None
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: {error}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: damaged ({error})") from None
+
+
+def check_readings(dark: Any, i0: Any, e_max: Any) -> None:
+    """Raise InputError unless the pedestal is finite, and photons and energy are finite and positive."""
+    if not _is_number(dark):
+        raise InputError(f"dark must be a finite number of counts, got {dark!r}")
+    if not (_is_number(i0) and i0 > 0):
+        raise InputError(f"i0 must be positive and finite (photons per open pixel and view), got {i0!r}")
+    if not (_is_number(e_max) and e_max > 0):
+        raise InputError(f"e_max must be positive and finite (keV), got {e_max!r}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
