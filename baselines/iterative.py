@@ -20,7 +20,7 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.types import Scan, Status, Volume
 from reconstruct.fdk import reconstruct as fdk
-from reconstruct.log import line_integrals
+from reconstruct.log import NO_SIGNAL, is_blind, line_integrals
 from reconstruct.projector import Views, adjoint_columns, forward_columns
 from reconstruct.redundancy import ray_weights
 from reconstruct.watch import Stopwatch
@@ -65,6 +65,7 @@ class System:
         data, clamped = line_integrals(scan, slice(None))
         self.data: Array = data.numpy()
         self.clamped = int(clamped.sum())
+        self.blind = is_blind(scan, self.clamped)
         self.weights, self.about_weights = _weights(given, scan, self.data)
         self.views_projected = self.views_backprojected = 0
         n_z, n_y, n_x = self.geometry.n_voxel
@@ -131,9 +132,12 @@ def finish(system: System, course: Course, x: Array, **details: Any) -> Volume:
     reason, beyond = course.reason, system.beyond.sentence
     if not reason and not residual <= 1 + 1e-3:
         reason = f"the final data residual is {residual:.3g}, an empty volume's 1"
+    status = Status.DIVERGED if reason else Status.OK
+    if system.blind:
+        values, status, reason = np.zeros_like(values), Status.ERROR, NO_SIGNAL
     return Volume(
         values=torch.from_numpy(values),
-        status=Status.DIVERGED if reason else Status.OK,
+        status=status,
         reason=reason,
         details={
             "view_updates": course.view_updates,

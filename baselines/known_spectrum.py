@@ -24,10 +24,10 @@ from ctsim.errors import InputError
 from ctsim.materials import attenuation, material
 from ctsim.quadrature import effective_weights, energy_rule, full_rule
 from ctsim.spectrum import Spectrum, Tube, spectrum
-from ctsim.types import Scan, Status, Volume
+from ctsim.types import Scan, Volume
 from reconstruct.beam import Given, known_detector, known_tube
 from reconstruct.fdk import fdk_stream
-from reconstruct.log import count_floor, line_integrals
+from reconstruct.log import count_floor, how_it_ended, is_blind, line_integrals
 from reconstruct.projector import forward_columns
 from reconstruct.redundancy import ray_weights
 
@@ -254,7 +254,7 @@ def _changed(scan: Scan, change: Callable[[Array, slice], Array]) -> tuple[torch
 
 def _ended(values: torch.Tensor, clamped: int, scan: Scan, beam: Beam, runs: int, more: dict[str, object]) -> Volume:
     """Wrap a volume that was reconstructed with a known spectrum."""
-    finite, weights = bool(torch.isfinite(values).all()), ray_weights(scan.geometry)
+    weights, (status, reason) = ray_weights(scan.geometry), how_it_ended(values, scan, clamped)
     details = (
         beam.details()
         | more
@@ -267,8 +267,8 @@ def _ended(values: torch.Tensor, clamped: int, scan: Scan, beam: Beam, runs: int
         }
     )
     return Volume(
-        values=values,
-        status=Status.OK if finite else Status.NONFINITE,
-        reason="" if finite else "the reconstruction holds values that are not finite",
+        values=torch.zeros_like(values) if is_blind(scan, clamped) else values,
+        status=status,
+        reason=reason,
         details=details | ({"limitation": weights.note} if weights.note else {}),
     )

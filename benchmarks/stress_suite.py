@@ -13,7 +13,7 @@ import msgspec
 
 from benchmarks.methods import TABLE
 from benchmarks.stress_cases import FULL
-from benchmarks.stress_changes import AnyChange, Unchanged
+from benchmarks.stress_changes import AnyChange, Filled, Unchanged
 from benchmarks.stress_scans import (
     BONE,
     HEIGHT,
@@ -139,6 +139,11 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     def has_other(self, method: str) -> bool:
         """Say whether a method must give the same volume of the other form."""
         return self.like is not None and not any(method in GROUPS.get(name, (name,)) for name in self.unlike)
+
+    @property
+    def unlit(self) -> bool:
+        """Whether every reading is at the pedestal or below, so that there is nothing to reconstruct."""
+        return isinstance(self.change, Filled) and self.change.value <= self.scanner.noise.dark
 
     @property
     def digest(self) -> str:

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.kernels.backproject_cpu import backproject
-from ctsim.types import Scan, Status, Volume
+from ctsim.types import Scan, Volume
 from reconstruct.filters import filter_rows, padded_length, ramp_response
-from reconstruct.log import LineIntegrals
+from reconstruct.log import LineIntegrals, how_it_ended, is_blind
 from reconstruct.redundancy import RayWeights, ray_weights
 
 CHUNK_BYTES = 1 << 25
@@ -26,8 +26,9 @@ def reconstruct(scan: Scan, *, device: str = "cpu", window: str = "ram-lak", cut
     """Reconstruct `scan` by FDK without any correction.
 
     `window` and `cutoff` are those of `reconstruct.filters.window_gain`. Details hold the clamped pixels,
-    the number of views backprojected (`view_updates`) and how redundant rays were weighted. Raises
-    InputError for another device than the CPU, for a geometry given by poses, and for an unknown window.
+    the number of views backprojected (`view_updates`) and how redundant rays were weighted. Where no pixel has
+    signal the volume is empty and the status an error. Raises InputError for another device than the CPU, for a
+    geometry given by poses, and for an unknown window.
     """
     if torch.device(device).type != "cpu":
         raise InputError(f"fdk runs on device 'cpu' only, got {device!r}")
@@ -40,8 +41,10 @@ def reconstruct(scan: Scan, *, device: str = "cpu", window: str = "ram-lak", cut
         return p
 
     weights = _orbit_weights(scan.geometry)
-    values = _run(read, scan.geometry, weights, window, cutoff)
-    finite = bool(np.isfinite(values).all())
+    values = torch.from_numpy(_run(read, scan.geometry, weights, window, cutoff))
+    status, reason = how_it_ended(values, scan, clamped)
+    if is_blind(scan, clamped):
+        values = torch.zeros_like(values)
     details = {
         "window": window,
         "cutoff": cutoff,
@@ -53,12 +56,7 @@ def reconstruct(scan: Scan, *, device: str = "cpu", window: str = "ram-lak", cut
     }
     if weights.note:
         details["limitation"] = weights.note
-    return Volume(
-        values=torch.from_numpy(values),
-        status=Status.OK if finite else Status.NONFINITE,
-        reason="" if finite else "the reconstruction holds values that are not finite",
-        details=details,
-    )
+    return Volume(values=values, status=status, reason=reason, details=details)
 
 
 def fdk(projections: torch.Tensor, geometry: Geometry, *, window: str = "ram-lak", cutoff: float = 1.0) -> torch.Tensor:

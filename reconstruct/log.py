@@ -1,4 +1,4 @@
-"""Line integrals from counts: the logarithm, its floor, and the mask of pixels that hit it."""
+"""Line integrals from counts: the logarithm, its floor, the mask of pixels that hit it, and what all of them mean."""
 
 import math
 
@@ -7,7 +7,9 @@ import torch
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from ctsim.types import Scan
+from ctsim.types import Scan, Status
+
+NO_SIGNAL = "no pixel has signal: every reading is at the floor of the logarithm or not finite"
 
 
 def count_floor(scan: Scan) -> float:
@@ -20,6 +22,20 @@ def count_floor(scan: Scan) -> float:
     half_count = 0.0 if scan.counts.is_floating_point() else 0.5
     floor = max(half_photon, half_count)
     return floor if math.isfinite(floor) and floor > 0 else 0.5
+
+
+def is_blind(scan: Scan, clamped: int) -> bool:
+    """Say whether so many clamped pixels are all that a scan has, so that it shows nothing."""
+    return clamped >= scan.counts.numel()
+
+
+def how_it_ended(values: torch.Tensor, scan: Scan, clamped: int) -> tuple[Status, str]:
+    """Return the status of a reconstruction and its reason, by its values and by how many pixels were clamped."""
+    if is_blind(scan, clamped):
+        return Status.ERROR, NO_SIGNAL
+    if not bool(torch.isfinite(values).all()):
+        return Status.NONFINITE, "the reconstruction holds values that are not finite"
+    return Status.OK, ""
 
 
 class LineIntegrals:

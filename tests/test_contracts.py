@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.attempt import scan_for
 from benchmarks.methods import TABLE, find
-from benchmarks.run import scan_for
 from ctsim.store import list_scans, open_scan
 from ctsim.types import Status
 
@@ -63,6 +63,35 @@ def test_a_method_leaves_the_scan_as_it_was_and_repeats_itself(name, stored):
     first = method.reconstruct(scan, "cpu").values
     assert torch.equal(scan.counts, counts)
     assert torch.equal(method.reconstruct(scan, "cpu").values, first)
+
+
+def unlit(scan, kind):
+    """Return the scan with readings that show nothing: at the pedestal or below it, 0, not a number, infinite."""
+    if kind in ("zero", "dark"):
+        return torch.full_like(scan.counts, 0 if kind == "zero" else int(scan.dark))
+    return torch.full(scan.counts.shape, {"nan": torch.nan, "inf": torch.inf, "negative": -1e6}[kind])
+
+
+@pytest.mark.parametrize("kind", ["zero", "dark", "nan", "inf", "negative"])
+@pytest.mark.parametrize(
+    ("name", "params"),
+    [*((name, {}) for name in TABLE), *(("splat", {"preset": p, "steps": 2}) for p in ("paper", "r2"))],
+    ids=lambda value: value if isinstance(value, str) else value.get("preset", ""),
+)
+def test_a_scan_in_which_no_pixel_has_signal_does_not_end_well(name, params, kind, stored):
+    method = find(name, params)
+    scan = scan_for(method, stored, "metal")
+    volume = method.reconstruct(dataclasses.replace(scan, counts=unlit(scan, kind)), "cpu")
+    assert volume.status is Status.ERROR and volume.reason.startswith("no pixel has signal")
+    assert tuple(volume.values.shape) == stored.geometry.n_voxel and not volume.values.any()
+
+
+def test_one_pixel_with_signal_is_enough_for_a_volume(stored):
+    scan = stored.scan
+    counts = torch.zeros_like(scan.counts)
+    counts[3, 4, 5] = 30_000
+    volume = find("fdk").reconstruct(dataclasses.replace(scan, counts=counts), "cpu")
+    assert volume.status is Status.OK and volume.details["clamped_pixels"] == counts.numel() - 1
 
 
 @pytest.mark.parametrize("name", TABLE)

@@ -23,7 +23,7 @@ from ctsim.geometry import Geometry
 from ctsim.spectrum import Tube
 from ctsim.types import Scan, Status, Volume
 from reconstruct.beam import Given, detected, refuse_beam
-from reconstruct.log import line_integrals
+from reconstruct.log import how_it_ended, line_integrals
 from reconstruct.scatter import open_excess
 from reconstruct.splat.checkpoint import Checkpoint, identity_of
 from reconstruct.splat.course import PASSES, Course, levels_of, passes_over
@@ -115,11 +115,12 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         "splats": 0 if fit is None else len(fit.lattice),
     }
     if fit is None:
-        blind = bool(clamped.all())
-        details["limitation"] = f"{'no reading is of use' if blind else 'no ray met anything'}: the volume is empty"
-        nothing = np.zeros((2, *scan.geometry.n_voxel), np.float32)
+        nothing, empty = np.zeros((2, *scan.geometry.n_voxel), np.float32), torch.zeros(scan.geometry.n_voxel)
         at_energy = functools.partial(_at_energy, nothing, response)
-        return Volume(values=torch.zeros(scan.geometry.n_voxel), details=details, at_energy=at_energy)
+        status, reason = how_it_ended(empty, scan, int(clamped.sum()))
+        if status is Status.OK:
+            details["limitation"] = "no ray met anything: the volume is empty"
+        return Volume(values=empty, status=status, reason=reason, details=details, at_energy=at_energy)
     values, rho, how = _read(fit, settings, scan.geometry)
     status, reason = _verdict(fit, values)
     details |= {

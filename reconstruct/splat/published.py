@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.types import Scan, Status, Volume
+from reconstruct.log import NO_SIGNAL, is_blind
 from reconstruct.splat.adam import Array
 from reconstruct.splat.checkpoint import Checkpoint, identity_of
 from reconstruct.splat.learner import LEAST_VALUE, Learner, seed_splats, splats_of
@@ -52,8 +53,11 @@ def fit_published(scan: Scan, settings: Settings, *, device: str = "cpu") -> Vol
     stopwatch = Stopwatch(limit=settings.seconds)
     objective = Objective.of(scan, settings)
     response = settings.make_response(scan.e_max)
-    splats = seed_splats(objective.p, scan.geometry, settings, response)
     clamped = int(objective.valid.size - objective.valid.sum())
+    if is_blind(scan, clamped):
+        details = {"clamped_pixels": clamped, "splats": 0, "view_updates": 0}
+        return Volume(values=torch.zeros(scan.geometry.n_voxel), status=Status.ERROR, reason=NO_SIGNAL, details=details)
+    splats = seed_splats(objective.p, scan.geometry, settings, response)
     if not len(splats):
         reason = f"no voxel of the FDK volume is above {LEAST_VALUE:g} 1/mm, so there is no splat to fit"
         details = {"clamped_pixels": clamped, "splats": 0, "view_updates": 0, "limitation": reason}
