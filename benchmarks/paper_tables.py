@@ -47,19 +47,19 @@ def main(arguments: list[str]) -> int:
 
 def read(folders: tuple[Path, ...]) -> "list[Record]":
     """Read the records of all folders, oldest first. Raises InputError where a folder or all are missing."""
-    from benchmarks import records
+    from benchmarks import lines, records
 
     if not folders:
         raise InputError("no folder is given, expected one or more with records of run-benchmark")
-    found: list[Record] = []
+    found: list[list[Record]] = []
     for folder in folders:
         if not folder.is_dir():
             raise InputError(f"{folder}: there is no such folder, expected one with records of run-benchmark")
         part, torn = records.read_all(folder)
-        found += part
+        found.append(part)
         for rest in torn:
             sys.stderr.write(f"{rest}\n")
-    return sorted(found, key=lambda record: record.time)
+    return lines.merged(found)
 
 
 def text_of(found: "list[Record]", form: Form, protocol: Protocol, numbers: tuple[int, ...] = ()) -> str:

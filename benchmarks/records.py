@@ -1,8 +1,10 @@
 """Records: one JSON line per measurement, appended and flushed, so that a crash loses one line at most.
 
 A run is what a scene, its files, a method, its parameters and its code determine; its identity is a
-SHA-256 over them. Of a run that was recorded several times the last record counts. Workers hand their records
-to the command that started them, which alone appends; the lock on the file is for two commands on one folder.
+SHA-256 over them. Of a run that was recorded several times the last record that is ok counts, without one the last.
+Within a file the order of lines says which is the last; times come from the clocks of several machines and only merge
+files. Workers hand their records to the command that started them, which alone appends; the lock on the file is for
+two commands on one folder.
 """
 
 import hashlib
@@ -13,13 +15,14 @@ from typing import Any
 
 import msgspec
 
+from benchmarks import lines
 from benchmarks.host import Host
 from benchmarks.methods import TABLE
 from benchmarks.protocol import VERSION, Score
-from ctsim.durable import append_synced, locked
+from ctsim.durable import append_synced, locked, write_synced
 from ctsim.errors import InputError
 
-NAME = "records.jsonl"
+NAME, WHAT = "records.jsonl", "a record of run-benchmark"
 OK = "ok"
 
 
@@ -122,11 +125,11 @@ def read(path: Path) -> tuple[list[Record], Torn | None]:
     for number, line in enumerate(data.splitlines(keepends=True), 1):
         if line.strip():
             try:
-                records.append(decoder.decode(line))
-            except msgspec.MsgspecError as error:
+                records.append(lines.decoded(line, decoder, f"{path}, line {number}", WHAT))
+            except InputError:
                 if not line.endswith(b"\n"):
                     return records, Torn(path=path, offset=offset, length=len(line))
-                raise InputError(f"{path}, line {number}: expected a record of run-benchmark: {error}") from None
+                raise
         offset += len(line)
     return records, None
 
@@ -158,37 +161,50 @@ def _mend(path: Path, descriptor: int) -> Torn | None:
 
 def read_all(results: Path) -> tuple[list[Record], list[Torn]]:
     """Read every `records*.jsonl` of a results folder, oldest record first: files of other machines merge so."""
-    records: list[Record] = []
-    torn = []
-    for path in sorted(results.glob("records*.jsonl")):
-        found, rest = read(path)
-        records += found
-        torn += [rest] if rest else []
-    return sorted(records, key=lambda record: record.time), torn
+    found = [read(path) for path in sorted(results.glob("records*.jsonl"))]
+    return lines.merged([records for records, _ in found]), [torn for _, torn in found if torn]
 
 
 def collect(results: Path, others: Sequence[Path]) -> dict[Path, int]:
-    """Append to `results` the records that it lacks of other results folders; return how many came from each.
+    """Take over the records that `results` lacks of other results folders; return how many came from each.
 
     What is there already is left out, and so is a run that failed there as here. Volumes stay where they
-    are: a collected record leads to them. Raises InputError for a folder without records.
+    are: a collected record leads to them. The file is replaced whole, see `lines.merged`. Raises InputError for a
+    folder without records.
     """
-    known, counts = last(read_all(results)[0]), {}
-    for other in others:
-        found = last(read_all(other)[0])
+    if not others:
+        return {}
+    brought = {other: last(read_all(other)[0]) for other in others}
+    for other, found in brought.items():
         if not found:
             raise InputError(f"--collect {other}: there are no records, expected a results folder of run-benchmark")
-        lacked = [r for key, r in found.items() if key not in known or (r.status == OK and known[key].status != OK)]
-        for record in lacked:
-            volume = record.volume and os.path.relpath(other.resolve() / record.volume, results.resolve())
-            append(results / NAME, msgspec.structs.replace(record, volume=volume))
-            known[record.identity] = record
-        counts[other] = len(lacked)
-    return counts
+    results.mkdir(parents=True, exist_ok=True)
+    path = results / NAME
+    with locked(path) as descriptor:  # what another command appends meanwhile would be lost
+        _mend(path, descriptor)
+        known, files = last(read_all(results)[0]), [read(path)[0]]
+        for other, found in brought.items():
+            lacked = {k: _of(other, r, results) for k, r in found.items() if k not in known or _mends(r, known[k])}
+            files.append(list(lacked.values()))
+            known |= lacked
+        if any(files[1:]):
+            write_synced(path, lines.encoded(lines.merged(files)))
+    return {other: len(lacked) for other, lacked in zip(brought, files[1:], strict=True)}
+
+
+def _mends(record: Record, known: Record) -> bool:
+    """Say whether a record ended well of a run that is known to have failed."""
+    return record.status == OK and known.status != OK
+
+
+def _of(other: Path, record: Record, results: Path) -> Record:
+    """Return a record of another results folder with the way from `results` to its volume."""
+    volume = record.volume and os.path.relpath(other.resolve() / record.volume, results.resolve())
+    return msgspec.structs.replace(record, volume=volume)
 
 
 def latest(records: list[Record]) -> list[Record]:
-    """Keep what a table shows: the last record of each scene, seed, variant and method label.
+    """Keep what a table shows: of each scene, seed, variant and method label the run that was recorded last.
 
     Only this protocol version counts, and only the newest data of a scene and seed: a scan that was made
     anew supersedes all that was measured on the old one, and a method's new code supersedes its old.
@@ -196,25 +212,30 @@ def latest(records: list[Record]) -> list[Record]:
     """
     records = [r for r in records if r.run.protocol == VERSION]
     newest = {(r.run.scene, r.run.seed): (r.run.scene_id, r.run.scan) for r in records}
-    kept: dict[tuple[Any, ...], Record] = {}
+    rows: dict[tuple[Any, ...], list[Record]] = {}
     for record in records:
         run = record.run
         if newest[run.scene, run.seed] == (run.scene_id, run.scan):
-            kept[(run.scene, run.seed, run.variant, record.label)] = record
+            rows.setdefault((run.scene, run.seed, run.variant, record.label), []).append(record)
+    kept = [last(found)[found[-1].identity] for found in rows.values()]
     scenes: dict[str, int] = {}
     labels: dict[str, int] = {}
-    for record in kept.values():
+    for record in kept:
         scene, method = record.place
         scenes[record.run.scene] = min(scene, scenes.get(record.run.scene, scene))
         labels[record.label] = min(method, labels.get(record.label, method))
-    columns = sorted(scenes, key=lambda scene: scenes[scene])
-    rows = sorted(labels, key=lambda label: (rank(label), labels[label]))
+    columns = _numbered(sorted(scenes, key=lambda scene: scenes[scene]))
+    methods = _numbered(sorted(labels, key=lambda label: (rank(label), labels[label])))
 
     def order(record: Record) -> tuple[int, int, int, bool]:
         run = record.run
-        return columns.index(run.scene), run.seed, rows.index(record.label), run.variant == "metal"
+        return columns[run.scene], run.seed, methods[record.label], run.variant == "metal"
 
-    return sorted(kept.values(), key=order)
+    return sorted(kept, key=order)
+
+
+def _numbered(names: list[str]) -> dict[str, int]:
+    return {name: k for k, name in enumerate(names)}
 
 
 def rank(label: str) -> int:
@@ -235,10 +256,18 @@ def outdated(records: list[Record]) -> str:
 
 
 def last(records: list[Record]) -> dict[str, Record]:
-    """Return the last record of each identity."""
-    return {record.identity: record for record in records}
+    """Return the record of each identity that counts: the last that is ok, without one the last.
+
+    The same data, parameters and code failed another time for a reason that lies outside them.
+    """
+    found: dict[str, Record] = {}
+    for record in records:
+        known = found.get(record.identity)
+        if known is None or record.status == OK or known.status != OK:
+            found[record.identity] = record
+    return found
 
 
 def done(records: list[Record]) -> set[str]:
-    """Return the identities that need no rerun: those whose last record is ok. Failures are never among them."""
+    """Return the identities that need no rerun: those with a record that is ok. Failures are never among them."""
     return {identity for identity, record in last(records).items() if record.status == OK}

@@ -43,7 +43,29 @@ def test_files_of_several_machines_are_one_in_the_order_of_time(tmp_path):
     assert lines.read(path, Row, "a row") == [row(1), row(2), row(4), row(4, 1.0)]
     lines.append(path, row(3))
     assert lines.collect(path, (there,), Row, "a row") == {there: 0}
-    assert [found.time[11:13] for found in lines.read(path, Row, "a row")] == ["01", "02", "03", "04", "04"]
+    # what was appended here stays the last: within a file its order counts, not its clock
+    assert [found.time[11:13] for found in lines.read(path, Row, "a row")] == ["01", "02", "04", "04", "03"]
+
+
+def test_a_clock_out_of_step_moves_no_record_past_others_of_its_file(tmp_path):
+    here, there = tmp_path / "here", tmp_path / "there"
+    clocks = {here: (2, 4, 6, 8), there: (1, 23, 3, 0, 5, 7)}  # 23 and 0 are out of step
+    for number, (folder, hours) in enumerate(clocks.items()):
+        folder.mkdir()
+        lines.append(folder / "rows.jsonl", *(row(hour, number) for hour in hours))
+    assert lines.collect(here / "rows.jsonl", (there,), Row, "a row") == {there: 6}
+    found = [(int(r.time[11:13]), r.value["error"]) for r in lines.read(here / "rows.jsonl", Row, "a row")]
+    assert found == [(1, 1), (23, 1), (2, 0), (3, 1), (0, 1), (4, 0), (5, 1), (6, 0), (7, 1), (8, 0)]
+
+
+@pytest.mark.parametrize("damage", [b'{"time": "\xff", "value": {}}', b'{"time": ' + b"[" * 100_000, b"\x00" * 9])
+def test_a_damaged_line_is_named(tmp_path, damage):
+    path = tmp_path / "rows.jsonl"
+    lines.append(path, row(1))
+    path.write_bytes(path.read_bytes() + damage + b"\n")
+    lines.append(path, row(2))
+    with pytest.raises(InputError, match=r"rows\.jsonl, line 2: expected a row"):
+        lines.read(path, Row, "a row")
 
 
 def keep_appending(path: Path, who: int) -> None:

@@ -1,10 +1,11 @@
 import errno
 import os
+import sys
 
 import msgspec
 import pytest
 
-from benchmarks import methods, records
+from benchmarks import cli, methods, records
 from benchmarks.host import host, measured
 from benchmarks.protocol import Score
 from benchmarks.records import Record, Run
@@ -16,11 +17,12 @@ def run(**changes):
     return Run(**{**given, **changes})
 
 
-def record(status="ok", label="fdk", **changes):
+def record(status="ok", label="fdk", time="", **changes):
     r = run(**changes)
     score = Score(region="r", reference="e", alignment="none", data_range=0.1, n_voxels=3, values={"psnr3d": None})
+    scores = {"tissue": score}
     return Record(
-        identity=r.identity, run=r, label=label, inputs="counts only", status=status, scores={"tissue": score}
+        identity=r.identity, run=r, label=label, inputs="counts only", status=status, scores=scores, time=time
     )
 
 
@@ -82,6 +84,35 @@ def test_a_bad_line_within_is_an_error_with_its_number(tmp_path):
         records.read(path)
 
 
+DEEP = b'{"details": {"a": ' + b"[" * 100_000
+
+
+@pytest.mark.parametrize(
+    "damage", [b'{"identity": "\xff"}', b"\x00" * 40, DEEP, b'{"identity": "\\ud800"}', b"\xef\xbb\xbf{}"]
+)
+def test_no_damage_is_a_traceback(tmp_path, damage):
+    path = tmp_path / records.NAME
+    records.append(path, record())
+    whole = path.read_bytes()
+    path.write_bytes(whole + damage + b"\n" + whole)
+    with pytest.raises(InputError, match=rf"{records.NAME}, line 2: expected a record of run-benchmark"):
+        records.read(path)
+    path.write_bytes(whole + damage)
+    found, torn = records.read(path)
+    assert found == [record()] and torn is not None and torn.length == len(damage)
+
+
+def test_the_command_names_the_file_and_the_line_of_a_byte_that_is_no_text(tmp_path, monkeypatch, capsys):
+    path = tmp_path / records.NAME
+    records.append(path, record(label="fdk-in-latin-1"))
+    path.write_bytes(path.read_bytes().replace(b"latin-1", b"l\xe4tin-1"))
+    for words in (["data", str(tmp_path), "--table"], ["paper-tables", str(tmp_path)], ["report", str(tmp_path)]):
+        monkeypatch.setattr(sys, "argv", ["run-benchmark", *words])
+        assert cli.run_benchmark() == 2
+        said = capsys.readouterr().err
+        assert f"{path}, line 1: " in said and "0xe4" in said and said.count("\n") == 1
+
+
 def test_a_full_disk_leaves_the_file_as_it_was(tmp_path, monkeypatch):
     path = tmp_path / records.NAME
     records.append(path, record())
@@ -98,11 +129,66 @@ def test_a_full_disk_leaves_the_file_as_it_was(tmp_path, monkeypatch):
     assert path.read_bytes() == before
 
 
-def test_only_ok_is_done_and_the_last_record_counts():
+def test_only_ok_is_done_and_counts_before_a_failure_of_the_same_run():
     a, b, c = record(), record("skipped", seed=1), record("error", seed=2)
     assert records.done([a, b, c]) == {a.identity}
-    assert records.done([a, record("error")]) == set()
-    assert records.done([record("error"), a]) == {a.identity}
+    for given in ([a, record("error")], [record("error"), a], [record("error"), a, record("timeout")]):
+        assert records.done(given) == {a.identity} and records.latest(given) == [a]
+    again = record(label="fdk", time="later")
+    assert records.latest([a, again, record("error")]) == [again]  # of two that ended well the last
+    assert records.latest([record("error"), record("timeout")]) == [record("timeout")]
+
+
+def test_a_failed_run_of_before_does_not_hide_what_is_measured_now():
+    """Which code and data count is what was run last, not what last ended well."""
+    old, new = record(code="1"), record("error", code="2")
+    assert records.latest([old, new]) == [new]
+    assert records.latest([new, old, record("error", code="1")]) == [old]
+
+
+def test_within_a_file_the_last_line_counts_whatever_its_clock_said(tmp_path):
+    path = tmp_path / records.NAME
+    for given in (record("error", time="2031-01-01"), record("timeout", time="2026-01-01")):
+        records.append(path, given)
+    assert [r.status for r in records.latest(records.read_all(tmp_path)[0])] == ["timeout"]
+    records.append(path, record(code="new", time="2026-01-02"))
+    assert [r.run.code for r in records.latest(records.read_all(tmp_path)[0])] == ["new"]
+
+
+def test_a_clock_ahead_on_one_machine_hides_nothing_of_another(tmp_path):
+    """Here new code ran on the second day; there, old code on the first, one record of it dated 2031."""
+    here, there = tmp_path / "here", tmp_path / "there"
+    for k, time in enumerate(("2026-01-01T01", "2031-01-01", "2026-01-01T03", "2026-01-01T04")):
+        records.append(there / records.NAME, record("ok", code="old", seed=k, time=time))
+    for k in range(4):
+        records.append(here / records.NAME, record("ok", code="new", seed=k, time=f"2026-01-02T0{k}"))
+    assert records.collect(here, [there]) == {there: 4}
+    shown = records.latest(records.read_all(here)[0])
+    assert [r.run.code for r in shown] == ["new"] * 4
+    before = (here / records.NAME).read_bytes()
+    assert records.collect(here, [there]) == {there: 0} and (here / records.NAME).read_bytes() == before
+    # files that lie side by side are merged alike
+    (here / records.NAME).unlink()
+    (there / records.NAME).rename(here / "records-there.jsonl")
+    for k in range(4):
+        records.append(here / records.NAME, record("ok", code="new", seed=k, time=f"2026-01-02T0{k}"))
+    assert [r.run.code for r in records.latest(records.read_all(here)[0])] == ["new"] * 4
+
+
+def test_a_failure_dated_in_the_future_is_mended_by_a_collected_success(tmp_path):
+    here, there = tmp_path / "here", tmp_path / "there"
+    records.append(here / records.NAME, record("error", time="2031-01-01"))
+    records.append(there / records.NAME, record(time="2026-01-01"))
+    assert records.collect(here, [there]) == {there: 1}
+    assert [r.status for r in records.latest(records.read_all(here)[0])] == ["ok"]
+
+
+def test_nothing_is_collected_where_a_folder_has_no_records(tmp_path):
+    here, there = tmp_path / "here", tmp_path / "there"
+    records.append(there / records.NAME, record())
+    with pytest.raises(InputError, match=r"--collect .*none: there are no records"):
+        records.collect(here, [there, tmp_path / "none"])
+    assert not here.exists()
 
 
 def test_latest_supersedes_other_code_versions():
