@@ -121,13 +121,13 @@ def validation(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Vali
 
 
 class MetalRods(Recipe, frozen=True, kw_only=True, tag="metal_rods"):
-    """Alloy rods in a water-filled PLA cylinder (Al6061 by default)."""
+    """Three alloy rods in a water-filled PLA cylinder (Al6061 by default)."""
 
     metal: str = "Al6061"
 
 
 def metal_rods(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: MetalRods) -> Phantom:
-    """Draw a printed PLA cup with lid, water up to a level, and rods of unequal width standing in it."""
+    """Draw a printed PLA cup with lid, water up to a level, and rods of unequal width set into its floor."""
     unit = half_box(n, d_voxel)
     level = rng.uniform(0.60, 0.76)
     middle = (0.0, 0.0, (level - 0.78) / 2 * unit)
@@ -137,11 +137,11 @@ def metal_rods(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Meta
         cylinder("water", "water", (0.78 * unit, (level + 0.78) * unit), centre=middle, metal=False),
     ]
     if params.metal != "none":
-        total, turn = 4 if params.n_inserts is None else params.n_inserts, rng.uniform(0, 2 * math.pi)
+        total, turn = 3 if params.n_inserts is None else params.n_inserts, rng.uniform(0, 2 * math.pi)
         for k in range(total):
             angle = turn + 2 * math.pi * k / total
             r = (0.46 + 0.06 * rng.uniform(-1, 1)) * unit
-            width = params.insert_mm or (4.0, 6.0, 8.0, 5.0)[k % 4] * unit / 30
-            centre = (r * math.cos(angle), r * math.sin(angle), -0.03 * unit)
+            width = params.insert_mm or (4.0, 6.0, 8.0)[k % 3] * unit / 30
+            centre = (r * math.cos(angle), r * math.sin(angle), -0.09 * unit)
             solids.append(cylinder(f"rod{k}", params.metal, (width / 2, 1.44 * unit), centre=centre))
     return assemble(np.zeros(n, np.uint8), d_voxel, ("air",), solids)
