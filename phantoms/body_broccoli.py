@@ -56,20 +56,26 @@ def broccoli(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Brocco
 
 
 def _stem(canvas: Canvas, rng: np.random.Generator) -> None:
-    """Thick stalk with a fibrous rind, a ring of bundles and a soft pith."""
+    """Thick stalk with a fibrous rind, a ring of bundles and a soft pith; it narrows into the first branch."""
     ridges = Noise(rng, 7)
-    low, high = ROOT[2], FORK[2] + 0.2
+    neck, high = FORK[2] - 0.10, FORK[2] + 0.24
+    turn = rng.uniform(0, 1)
+    knife = rng.uniform(0, 2 * np.pi)  # the cut below is askew, as a knife leaves it
+    slope = 0.15 * np.array([np.cos(knife), np.sin(knife)])
 
     def inside(scale: float) -> Callable[[Field, Field, Field], Mask]:
-        return lambda x, y, z: (
-            (np.hypot(x, y) <= scale * (0.235 - 0.10 * (z + 0.5) + 0.014 * ridges(x, y, z)))
-            & ((z > low + (1 - scale) * 0.1) & (z < high))
-        )
+        def within(x: Field, y: Field, z: Field) -> Mask:
+            dome = np.sqrt(np.clip(1 - (np.clip(z - neck, 0, None) / (high - neck)) ** 2, 0, 1))
+            width = 0.235 - 0.10 * (z + 0.5) + 0.014 * ridges(x, y, z)
+            cut = ROOT[2] + (1 - scale) * 0.1 + slope[0] * x + slope[1] * y
+            return (np.hypot(x, y) <= scale * dome * width) & (z > cut)
 
-    box = ((-0.4, -0.4, low), (0.4, 0.4, high))
-    canvas.fill(FIBRE, inside(1.0), box)
+        return within
+
+    box = ((-0.4, -0.4, ROOT[2] - 0.06), (0.4, 0.4, high))
+    canvas.fill(FIBRE, inside(1.0), box, over=(AIR,))  # no rind where the stalk runs on as the first branch
     canvas.fill(WATER, inside(0.93), box)
-    for angle in np.linspace(0, 2 * np.pi, 17)[:-1] + rng.uniform(0, 1):
+    for angle in np.linspace(0, 2 * np.pi, 17)[:-1] + turn:
         c = np.array([np.cos(angle), np.sin(angle), 0])
         canvas.tube(FIBRE, [ROOT + 0.17 * c + [0, 0, 0.02], FORK + 0.14 * c], 0.016, over=(WATER,))
 
