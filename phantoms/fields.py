@@ -37,6 +37,13 @@ class Noise:
             out = np.moveaxis(np.tensordot(self._basis(at.ravel()), out, (1, axis)), 0, axis)
         return out
 
+    def at(self, points: Field) -> Field:
+        """Evaluate at points [k, 3] (x, y, z)."""
+        out = np.einsum("ka,abc->kbc", self._basis(points[:, 2]), self.coefficients)
+        for axis in (1, 0):
+            out = np.einsum("ka,ka...->k...", self._basis(points[:, axis]), out)
+        return out
+
     def _basis(self, at: Field) -> Field:
         t = np.clip((at.astype(np.float64) + 1) / 2, 0, 1) * self.cells
         left = np.minimum(t.astype(int), self.cells - 1)
@@ -71,6 +78,12 @@ class Canvas:
             for k, d in zip(self.n, self.d_voxel, strict=True)
         )
         self.axes = (x, y, z)
+
+    @property
+    def grid(self) -> tuple[Field, Field, Field]:
+        """The axes x, y, z, shaped so that they broadcast to [z, y, x]."""
+        x, y, z = self.axes
+        return x[None, None, :], y[None, :, None], z[:, None, None]
 
     def fill(
         self,

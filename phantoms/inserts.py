@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ctsim.geometry import Triple
 from ctsim.solids import Solid, Vector
@@ -46,6 +46,10 @@ class Inserts:
         """Return a coil about z of `size` = (coil radius at the low end, at the high end, wire radius, length)."""
         sagitta = 0.008 * max(size[:2])  # 25 pieces a turn
         return shapes.helix(name, self.material, size, turns, centre=self._mm(centre), sagitta=sagitta)
+
+    def wire(self, name: str, points: NDArray[np.float64], diameter: float) -> Solid:
+        """Return a wire through `points` [k ≥ 2, 3]."""
+        return shapes.wire(name, self.material, points * self.unit, diameter / 2)
 
     def rod(self, name: str, a: ArrayLike, b: ArrayLike, diameter: float, *, round_ends: bool = False) -> Solid:
         """Return a cylinder from a to b, or a capsule inscribed between the same ends and at least a ball."""

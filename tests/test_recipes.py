@@ -152,6 +152,8 @@ def test_noise_has_unit_spread_and_no_grid() -> None:
     # 43³ knots, each seen by a few neighbours: std known to about 1/sqrt(2·40³/8) < 0.8 %
     assert field.std() == pytest.approx(1.0, abs=0.03)
     assert np.allclose(field[::2, ::2, ::2], noise(coarse, coarse, coarse), atol=1e-5)
+    points = np.array([[3, 50, 80], [20, 0, 41]])
+    assert np.allclose(noise.at(fine[points]), [field[80, 50, 3], field[41, 0, 20]], atol=1e-5)
 
 
 def test_tree_reaches_every_target_and_thins() -> None:
