@@ -145,7 +145,7 @@ def methods_of(listed: list[Variant]) -> "dict[str, Method]":
 
 def tasks(listed: list[Variant], data: Path) -> "list[Task]":
     """Return the runs as tasks, scene by scene; those of scenes that are not in `data` are left out."""
-    from benchmarks.run import Task
+    from benchmarks.run import tasks_on
     from ctsim.store import list_scans, open_scan
 
     methods = methods_of(listed)
@@ -155,7 +155,7 @@ def tasks(listed: list[Variant], data: Path) -> "list[Task]":
         if scene in folders:
             stored = open_scan(folders[scene])
             labels = [variant.label for variant in listed if variant.scene == scene]
-            found += [Task(stored=stored, variant="metal", method=methods[label]) for label in labels]
+            found += tasks_on(stored, ("metal",), [(methods[label], (0, 0)) for label in labels])
     return found
 
 

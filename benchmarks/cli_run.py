@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+FEW = 20  # scenes, all of which a message names
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -116,7 +118,7 @@ def _compute(given: Arguments) -> int:
         anchor=given.anchor,
     )
     methods, scans = _methods(given), _scans(given)
-    names = given.scene or tuple(s.name for s in scans)
+    names = frozenset(given.scene or (s.name for s in scans))
     listed = [task for task in run.tasks(scans, methods, options) if task.stored.name in names]
     left = run.pending(listed, given.results, given.force)
     costs = schedule.Costs(records.read_all(given.results)[0])
@@ -188,7 +190,7 @@ def _scans(given: Arguments) -> "list[Stored]":
     scans: list[Stored] = [open_scan(folder) for folder in list_scans(given.data)]
     if not scans:
         raise InputError(f"{given.data}: the dataset has no scenes")
-    names = [s.name for s in scans]
+    names = {s.name: None for s in scans}
     for wanted in given.scene:
         if wanted not in names:
             raise InputError(f"--scene {wanted!r}: {given.data} has {human_choice(names, wanted)}")

@@ -7,7 +7,8 @@ memory is its own, a crash or a time limit ends only it.
 
 import dataclasses
 import datetime
-from collections.abc import Iterator
+import functools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,27 +49,29 @@ class Options:
         refuse_unless_positive(self.seconds)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Task:
     """One run to do: a scan (the twin without metal where `variant` says so) and a method.
 
-    `place` are the numbers of the scan and of the method among those asked for.
+    `scene` and `seed` are those of `repetition`; `place` are the numbers of the scan and of the method among those
+    asked for.
     """
 
     stored: Stored
     variant: str
     method: Method
+    scene: str
+    seed: int
     place: tuple[int, int] = (0, 0)
 
-    @property
+    @functools.cached_property
     def run(self) -> Run:
         """What determines the measurement."""
-        scene, seed = repetition(self.stored)
         return Run(
-            scene=scene,
+            scene=self.scene,
             scene_id=self.stored.scene_id,
             scan=self.stored.content_hash,
-            seed=seed,
+            seed=self.seed,
             method=self.method.target,
             params=self.method.params,
             mask=self.method.mask,
@@ -99,10 +102,18 @@ def tasks(scans: list[Stored], methods: list[Method], options: Options) -> list[
     found = []
     for i, stored in enumerate(scans):
         variants = ("metal_free", "metal") if options.anchor and stored.metal_free is not None else ("metal",)
-        found += [
-            Task(stored=stored, variant=v, method=m, place=(i, k)) for k, m in enumerate(methods) for v in variants
-        ]
+        found += tasks_on(stored, variants, [(method, (i, k)) for k, method in enumerate(methods)])
     return found
+
+
+def tasks_on(stored: Stored, variants: Sequence[str], placed: Sequence[tuple[Method, tuple[int, int]]]) -> list[Task]:
+    """List the runs of methods, each with its place, on a scan and on its twin, as `variants` say."""
+    scene, seed = repetition(stored)
+    return [
+        Task(stored=stored, variant=variant, method=method, scene=scene, seed=seed, place=place)
+        for method, place in placed
+        for variant in variants
+    ]
 
 
 def pending(listed: list[Task], results: Path, force: bool) -> list[Task]:

@@ -17,7 +17,7 @@ from benchmarks.costs import listing
 from benchmarks.devices import check_device
 from benchmarks.isolate import Outcome
 from benchmarks.records import OK, Record
-from benchmarks.run import Options, Runner, Task, describe_run, run_all
+from benchmarks.run import Options, Runner, Task, describe_run, run_all, tasks_on
 from benchmarks.workers import Lost, Pool
 from ctsim.errors import InputError
 
@@ -141,9 +141,8 @@ def do(job: Job) -> list[bytes]:
     check_device(job.options.device)
     stored = pkgutil.resolve_name(job.options.store)(job.folder)
     method = methods.find(job.method, job.overrides)
-    tasks = [Task(stored=stored, variant=variant, method=method, place=job.place) for variant in job.variants]
     runner = _runner(job.results, job.options)
-    return [msgspec.json.encode(runner.run(task)) for task in tasks]
+    return [msgspec.json.encode(runner.run(task)) for task in tasks_on(stored, job.variants, [(method, job.place)])]
 
 
 @functools.lru_cache(maxsize=1)
