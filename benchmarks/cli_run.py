@@ -84,13 +84,13 @@ def main(arguments: list[str]) -> int:
     if given.dry_run and (given.collect or given.table):
         what = "--collect writes records" if given.collect else "--table writes tables"
         raise InputError(f"{what}, --dry-run writes nothing: expected one of them")
-    for folder in (given.results, *given.collect):
-        for rest in records.read_all(folder)[1]:
-            log.warning("%s", rest)
+    found = _read(given.results)
+    for folder in given.collect:
+        _read(folder)
     for other, count in records.collect(given.results, given.collect).items():
         log.warning("%s: %d records taken over", other, count)
     if given.table or given.collect:
-        tables.write(records.read_all(given.results)[0], given.results)
+        tables.write(_read(given.results) if given.collect else found, given.results)
         _show(given.results)
         return 0
     try:
@@ -99,6 +99,16 @@ def main(arguments: list[str]) -> int:
         if error.filename is not None:
             raise
         raise OSError(error.errno, error.strerror or str(error), str(given.results)) from error  # a full disk
+
+
+def _read(results: Path) -> "list[Record]":
+    """Read the records of a folder, and say which line was cut short."""
+    from benchmarks import records
+
+    found, torn = records.read_all(results)
+    for rest in torn:
+        log.warning("%s", rest)
+    return found
 
 
 def _compute(given: Arguments) -> int:

@@ -4,7 +4,7 @@ All of it is derived from scores that are recorded; nothing is reconstructed or 
 """
 
 from collections.abc import Iterable
-from typing import Any
+from typing import NamedTuple
 
 from benchmarks.records import OK
 
@@ -16,9 +16,27 @@ ANCHORED = {
     "artefact": ("roi_std", "cupping", "streak", "rmse", "rmse_near", "rmse_far"),
 }
 """The metrics that have an anchored score; of `artefact` FDK's error without the metal is 0 by definition."""
+COMPARED = {**ANCHORED, "tissue": ("psnr3d", *ANCHORED["tissue"])}
+"""The metrics that anything is derived of."""
 
-Row = dict[Any, Any]
-Found = list[tuple[str, str, float]]
+Place = tuple[str, int, str, str, str, str]
+"""Scene, seed, variant, method, protocol, metric."""
+
+
+class Row(NamedTuple):
+    """One number of a run, None where it does not exist; `identical` and `volume` are those of its score."""
+
+    scene: str
+    seed: int
+    variant: str
+    method: str
+    inputs: str
+    protocol: str
+    metric: str
+    value: float | None
+    status: str = OK
+    volume: str = ""
+    identical: bool = False
 
 
 def row_of(name: str, labels: Iterable[str]) -> str | None:
@@ -53,45 +71,44 @@ def harm(scores: list[float | None]) -> tuple[float | None, str]:
 def derived(rows: list[Row]) -> list[Row]:
     """Derive the rows of `against` (dB of tissue PSNR3D) and `anchored` ("protocol/metric") from scored rows.
 
-    Rows have scene, seed, variant, method, protocol, metric, value and status; comparisons are made
-    within one scene and seed, between runs that ended well.
+    Comparisons are made within one scene and seed, between runs that ended well.
     """
-    scored = [row for row in rows if row["status"] == OK and row["value"] is not None and row["value"] == row["value"]]
-    values = {_key(row, row["method"], row["variant"]): row["value"] for row in scored}
-    labels = [row["method"] for row in scored if row["variant"] == "metal"]
+    scored = [row for row in rows if row.status == OK and row.value is not None and row.value == row.value]
+    labels = dict.fromkeys(row.method for row in scored if row.variant == "metal")
     bases = {name: row_of(name, labels) for name in (FDK, NMAR)}
+    values = {_place(row, row.method, row.variant): row.value for row in scored if row.method in (FDK, *bases.values())}
     found = []
     for row in scored:
-        if row["variant"] == "metal":
+        if row.variant == "metal":
             pairs = _gains(row, values, bases) + _anchors(row, values)
-            found += [{**row, "protocol": p, "metric": m, "value": v, "identical": False} for p, m, v in pairs]
+            found += [row._replace(protocol=p, metric=m, value=v, identical=False) for p, m, v in pairs]
     return found
 
 
-def _key(row: Row, method: str, variant: str) -> tuple[Any, ...]:
-    return row["scene"], row["seed"], variant, method, row["protocol"], row["metric"]
+def _place(row: Row, method: str, variant: str) -> Place:
+    return row.scene, row.seed, variant, method, row.protocol, row.metric
 
 
-def _gains(row: Row, values: dict[tuple[Any, ...], float], bases: dict[str, str | None]) -> Found:
+def _gains(row: Row, values: dict[Place, float | None], bases: dict[str, str | None]) -> list[tuple[str, str, float]]:
     """Return the gain in tissue PSNR3D over FDK and NMAR, where those rows are there."""
-    if (row["protocol"], row["metric"]) != ("tissue", "psnr3d"):
+    if row.metric != "psnr3d" or row.protocol != "tissue" or row.value is None:
         return []
     found = []
     for name, label in bases.items():
-        base = None if label is None else values.get(_key(row, label, "metal"))
-        found += [] if base is None else [("against", f"over_{name}", row["value"] - base)]
+        base = None if label is None else values.get(_place(row, label, "metal"))
+        found += [] if base is None else [("against", f"over_{name}", row.value - base)]
     return found
 
 
-def _anchors(row: Row, values: dict[tuple[Any, ...], float]) -> Found:
+def _anchors(row: Row, values: dict[Place, float | None]) -> list[tuple[str, str, float]]:
     """Return a metric's anchored score, where FDK ran on the scan and its twin."""
-    protocol, metric = row["protocol"], row["metric"]
-    if metric not in ANCHORED.get(protocol, ()):
+    protocol, metric = row.protocol, row.metric
+    if metric not in ANCHORED.get(protocol, ()) or row.value is None:
         return []
-    worst = values.get(_key(row, FDK, "metal"))
+    worst = values.get(_place(row, FDK, "metal"))
     # artefacts are differences from the twin, which differs from itself by nothing
-    best = error(metric, 0.0) if protocol == "artefact" else values.get(_key(row, FDK, "metal_free"))
+    best = error(metric, 0.0) if protocol == "artefact" else values.get(_place(row, FDK, "metal_free"))
     if worst is None or best is None:
         return []
-    s = anchored(error(metric, row["value"]), error(metric, best), error(metric, worst))
+    s = anchored(error(metric, row.value), error(metric, best), error(metric, worst))
     return [] if s is None else [("anchored", f"{protocol}/{metric}", s)]

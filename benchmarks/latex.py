@@ -3,7 +3,12 @@
 import itertools
 from collections.abc import Sequence
 
-from benchmarks.texts import escape
+from benchmarks.texts import escape, one_line
+
+
+def comment(text: str) -> str:
+    """Return a text as a comment, which ends where its one line does."""
+    return f"% {' '.join(one_line(text).split())}\n"
 
 
 def prose(text: str) -> str:

@@ -5,134 +5,147 @@ shows its status in place of numbers, and its reason below the tables.
 """
 
 import re
+from collections import Counter
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
-
-import pandas as pd
+from typing import Literal, NamedTuple
 
 from benchmarks import latex
 from benchmarks.columns import COLUMNS, Column
-from benchmarks.compare import NMAR, derived, harm, row_of
+from benchmarks.compare import NMAR, harm, row_of
 from benchmarks.protocol import AS_RETURNED
 from benchmarks.records import OK, Record, latest, outdated
+from benchmarks.summary import Number, Numbers, csv_text, numbers, summary
 from benchmarks.texts import escape, ranked
 from ctsim.durable import write_synced
 from ctsim.errors import InputError
 
+__all__ = ["caption", "merged", "render", "summary", "write"]
+
 Format = Literal["md", "tex"]
 
 
-def tidy(records: list[Record]) -> pd.DataFrame:
-    """Return one row a number, with its scene, seed, variant, method, inputs, protocol, metric, and the run's status.
+class Cell(NamedTuple):
+    """The number to rank by, None where it has no place, and the text."""
 
-    `identical` and `volume` are those of the score.
+    number: float | None
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """A method: what it needs, its label, and a cell for each column."""
+
+    inputs: str
+    method: str
+    cells: list[Cell]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sheet:
+    """A protocol's table: columns (scene, metric), rows, and what stands around it.
+
+    `places` says which cells (row, column) are "best" or "second" among the methods of the same inputs.
     """
-    rows: list[dict[str, Any]] = []
-    for record in latest(records):
-        base = {
-            "scene": record.run.scene,
-            "seed": record.run.seed,
-            "variant": record.run.variant,
-            "method": record.label,
-            "inputs": record.inputs,
-            "status": record.status,
-        }
-        numbers = [(p, m, v, s.identical, s.volume) for p, s in record.scores.items() for m, v in s.values.items()]
-        if record.cost is not None:
-            numbers += [("cost", m, float(getattr(record.cost, m)), False, "") for m in COLUMNS["cost"]]
-        names = ("protocol", "metric", "value", "identical", "volume")
-        rows += [base | dict(zip(names, row, strict=True)) for row in numbers or [("", "", None, False, "")]]
-    columns = ["scene", "seed", "variant", "method", "inputs", "protocol", "metric", "value", "status"]
-    frame = pd.DataFrame(rows + derived(rows), columns=pd.Index([*columns, "identical", "volume"]))
-    frame["value"] = pd.to_numeric(frame["value"])
-    return frame
+
+    protocol: str
+    columns: list[tuple[str, str]]
+    rows: list[Row]
+    places: dict[tuple[int, int], str]
+    caption: str
+    notes: list[str]
+
+    def column(self, k: int) -> Column:
+        """Return how column `k` is shown."""
+        return COLUMNS[self.protocol][self.columns[k][1]]
 
 
-def _rows(frame: pd.DataFrame) -> list[dict[Any, Any]]:
-    return frame.to_dict("records")
-
-
-def summary(records: list[Record]) -> pd.DataFrame:
-    """Return mean, std (over seeds, ddof 1) and n of every number, as table.csv holds it.
-
-    `volume` says which of the method's volumes was scored.
-    """
-    frame = tidy(records)
-    keys = ["scene", "variant", "method", "inputs", "protocol", "metric"]
-    if frame.empty:
-        return pd.DataFrame(columns=[*keys, "mean", "std", "n", "status", "identical", "volume"])
-    grouped = frame.groupby(keys, sort=False, dropna=False)
-    table = grouped["value"].agg(mean="mean", std="std", n="count")
-    for name in ("status", "volume"):
-        table[name] = grouped[name].agg(lambda s: ", ".join(dict.fromkeys(s)))
-    table["identical"] = grouped["identical"].all()
-    return table.reset_index()
-
-
-def _cell(row: dict[Any, Any] | None, column: Column) -> tuple[float | None, str]:
-    """Return the number to rank by and the text of one cell."""
-    if row is None:
-        return None, "–"
-    if row["n"] == 0:
-        same = row["identical"] and row["metric"].startswith("psnr3d")
-        return (float("inf"), "identical") if same else (None, "–")
-    mean = row["mean"] * column.scale
+def _cell(number: Number | None, metric: str, column: Column) -> Cell:
+    """Return one cell."""
+    if number is None:
+        return Cell(None, "–")
+    mean, std, _, _, _, identical = number
+    if mean is None:
+        same = identical and metric.startswith("psnr3d")
+        return Cell(float("inf"), "identical") if same else Cell(None, "–")
+    mean *= column.scale
     text = f"{mean:.{column.digits}f}"
-    if row["n"] > 1:
-        text += f" ± {row['std'] * column.scale:.{column.digits}f}"
-    return float(mean), text
+    if std is not None:
+        text += f" ± {std * column.scale:.{column.digits}f}"
+    return Cell(mean, text)
 
 
-def _grid(table: pd.DataFrame, protocol: str, records: list[Record]) -> tuple[list[tuple[str, str]], list[list[Any]]]:
-    """Return the columns (scene, metric) and rows [inputs, method, cells] of a protocol's table."""
-    part = table[(table.protocol == protocol) & (table.variant == "metal")]
-    metrics = [m for m in COLUMNS[protocol] if (part.metric == m).any()]
-    own = [r for r in records if r.run.variant == "metal"]
+def sheets(shown: list[Record], found: Numbers, protocols: Iterable[str] = tuple(COLUMNS)) -> list[Sheet]:
+    """Return the protocols' tables of the records that count and of their numbers; a protocol without any has none."""
+    own = [r for r in shown if r.run.variant == "metal"]
+    chosen: dict[str, dict[tuple[str, str, str], Number]] = {}
+    for (scene, variant, method, _, protocol, metric), number in found.items():
+        if variant == "metal":
+            chosen.setdefault(protocol, {})[scene, method, metric] = number
+    grids = ((protocol, _grid(chosen.get(protocol, {}), protocol, own)) for protocol in protocols)
+    return [
+        Sheet(
+            protocol=protocol,
+            columns=columns,
+            rows=rows,
+            places=_places(rows, [COLUMNS[protocol][metric].better for _, metric in columns]),
+            caption=caption(shown, protocol),
+            notes=_notes(shown, protocol),
+        )
+        for protocol, (columns, rows) in grids
+        if columns
+    ]
+
+
+def _grid(
+    chosen: dict[tuple[str, str, str], Number], protocol: str, own: list[Record]
+) -> tuple[list[tuple[str, str]], list[Row]]:
+    """Return the columns and rows of a protocol's table; `chosen` are its numbers by scene, method and metric."""
+    there = {metric for _, _, metric in chosen}
+    metrics = [m for m in COLUMNS[protocol] if m in there]
     scenes = list(dict.fromkeys(r.run.scene for r in own))
     columns = [(s, m) for s in scenes for m in metrics]
     failed = {(r.run.scene, r.label): r.status for r in own if r.status != OK}
-    chosen = {(row["scene"], row["method"], row["metric"]): row for row in _rows(pd.DataFrame(part))}
     rows = []
     for inputs, method in dict.fromkeys((r.inputs, r.label) for r in own):
         cells = []
         for scene, metric in columns:
-            number, text = _cell(chosen.get((scene, method, metric)), COLUMNS[protocol][metric])
+            cell = _cell(chosen.get((scene, method, metric)), metric, COLUMNS[protocol][metric])
             if (scene, method) in failed:
                 status = failed[scene, method]
-                number, text = None, status if number is None or protocol == "cost" else f"{text} ({status})"
-            cells.append((number, text))
-        more = []
+                cell = Cell(None, status if cell.number is None or protocol == "cost" else f"{cell.text} ({status})")
+            cells.append(cell)
+        more: list[Cell] = []
         if len(scenes) > 1:
             more += [_mean(cells, k, len(metrics), COLUMNS[protocol][m]) for k, m in enumerate(metrics)]
         if protocol == "anchored":
-            more += [harm([number for number, _ in cells[k :: len(metrics)]]) for k in range(len(metrics))]
-        rows.append([inputs, method, cells + more])
+            more += [Cell(*harm([c.number for c in cells[k :: len(metrics)]])) for k in range(len(metrics))]
+        rows.append(Row(inputs=inputs, method=method, cells=cells + more))
     if len(scenes) > 1:
         columns += [("mean", m) for m in metrics]
     if protocol == "anchored":
         columns += [("harm rate", m) for m in metrics]
-    rows.sort(key=lambda row: row[0])
+    rows.sort(key=lambda row: row.inputs)
     return columns, rows
 
 
-def _mean(cells: list[tuple[float | None, str]], k: int, step: int, column: Column) -> tuple[float | None, str]:
+def _mean(cells: list[Cell], k: int, step: int, column: Column) -> Cell:
     """Average a metric over scenes; a method that lacks one has no mean, since it would not compare."""
-    numbers = [number for number, _ in cells[k::step]]
-    if any(n is None or n == float("inf") for n in numbers):
-        return None, "–"
-    mean = sum(n for n in numbers if n is not None) / len(numbers)
-    return mean, f"{mean:.{column.digits}f}"
+    known = [cell.number for cell in cells[k::step]]
+    if any(n is None or n == float("inf") for n in known):
+        return Cell(None, "–")
+    mean = sum(n for n in known if n is not None) / len(known)
+    return Cell(mean, f"{mean:.{column.digits}f}")
 
 
 def merged(texts: Iterable[str]) -> str:
     """Join texts that differ in numbers only into one with their ranges, others with " / "."""
-    kinds: dict[str, list[list[str]]] = {}
+    kinds: dict[tuple[str, ...], list[list[str]]] = {}
     for text in texts:
-        kinds.setdefault(_NUMBER.sub("#", text), []).append(_NUMBER.findall(text))
+        kinds.setdefault(tuple(_NUMBER.split(text)), []).append(_NUMBER.findall(text))
     out = []
-    for kind, found in kinds.items():
-        pieces = kind.split("#")
+    for pieces, found in kinds.items():
         ranges = [sorted(set(column), key=float) for column in zip(*found, strict=True)]
         shown = [r[0] if len(r) == 1 else f"{r[0]} to {r[-1]}" for r in ranges]
         out.append("".join(a + b for a, b in zip(pieces, [*shown, ""], strict=True)))
@@ -191,71 +204,84 @@ def _notes(records: list[Record], protocol: str) -> list[str]:
         if record.run.variant == "metal" and protocol in record.scores and record.scores[protocol].note:
             key = (record.run.scene, record.run.seed, record.scores[protocol].note)
             labels.setdefault(key, []).append(record.label)
-    scenes = [(scene, seed) for scene, seed, _ in labels]
+    said = Counter((scene, seed) for scene, seed, _ in labels)
     return [
-        f"{scene} (seed {seed}{'' if scenes.count((scene, seed)) == 1 else ', ' + ', '.join(methods)}): {note}"
+        f"{scene} (seed {seed}{'' if said[scene, seed] == 1 else ', ' + ', '.join(methods)}): {note}"
         for (scene, seed, note), methods in labels.items()
     ]
 
 
-def _lines(columns: list[tuple[str, str]], rows: list[list[Any]], protocol: str, form: Format) -> list[list[str]]:
-    """Return the table's cells as text, header first, the best and second of each class marked."""
-    titles = [f"{scene}: {COLUMNS[protocol][metric].title}" for scene, metric in columns]
-    lines = [[escape(t, form) for t in ("inputs", "method", *titles)]]
-    marked: dict[tuple[int, int], str] = {}
-    for k, (_, metric) in enumerate(columns):
-        for inputs in dict.fromkeys(row[0] for row in rows):
-            group = [i for i, row in enumerate(rows) if row[0] == inputs]
-            places = ranked([rows[i][2][k][0] for i in group], COLUMNS[protocol][metric].better)
-            marked |= {(group[i], k): mark for i, mark in places.items()}
-    wrap = {
-        "md": {"best": "**{}**", "second": "<u>{}</u>"},
-        "tex": {"best": r"\textbf{{{}}}", "second": r"\underline{{{}}}"},
-    }[form]
-    for i, (inputs, method, cells) in enumerate(rows):
-        texts = [escape(text, form) for _, text in cells]
-        texts = [wrap[marked[i, k]].format(t) if (i, k) in marked else t for k, t in enumerate(texts)]
-        lines.append([escape(inputs, form), escape(method, form), *texts])
+_MARKS: dict[Format, dict[str, str]] = {
+    "md": {"best": "**{}**", "second": "<u>{}</u>"},
+    "tex": {"best": r"\textbf{{{}}}", "second": r"\underline{{{}}}"},
+}
+
+
+def _places(rows: list[Row], better: list[str]) -> dict[tuple[int, int], str]:
+    """Return {(row, column): "best" or "second"} within each class of inputs; `better` is each column's direction."""
+    groups: dict[str, list[int]] = {}
+    for i, row in enumerate(rows):
+        groups.setdefault(row.inputs, []).append(i)
+    found: dict[tuple[int, int], str] = {}
+    for k, direction in enumerate(better):
+        for group in groups.values():
+            places = ranked([rows[i].cells[k].number for i in group], direction)
+            found |= {(group[i], k): place for i, place in places.items()}
+    return found
+
+
+def _lines(sheet: Sheet, form: Format) -> list[list[str]]:
+    """Return the table's rows as text, the best and second of each class marked."""
+    lines, places = [], sheet.places
+    for i, row in enumerate(sheet.rows):
+        texts = [escape(cell.text, form) for cell in row.cells]
+        texts = [_MARKS[form][places[i, k]].format(t) if (i, k) in places else t for k, t in enumerate(texts)]
+        lines.append([escape(row.inputs, form), escape(row.method, form), *texts])
     return lines
 
 
 def render(records: list[Record], form: Format, protocols: Iterable[str] = tuple(COLUMNS)) -> str:
     """Render the protocols' tables as Markdown or LaTeX (booktabs); failures and skips follow with their reasons."""
-    left_out, records = outdated(records), latest(records)
-    table = summary(records)
-    parts = []
-    for protocol in protocols:
-        columns, rows = _grid(table, protocol, records)
-        if not columns:
-            continue
-        lines = _lines(columns, rows, protocol, form)
-        text, declared = escape(caption(records, protocol), form), _notes(records, protocol)
-        if form == "md":
-            head = ["| " + " | ".join(lines[0]) + " |", "|---|---|" + "---:|" * len(columns)]
-            body = head + ["| " + " | ".join(line) + " |" for line in lines[1:]]
-            notes = "".join(f"- {escape(note, form)}\n" for note in declared)
-            parts.append(f"## {protocol}\n\n{text}\n\n" + "\n".join(body) + "\n" + (f"\n{notes}" if notes else ""))
-        else:
-            titles = [escape(COLUMNS[protocol][metric].title, form) for _, metric in columns]
-            head = [*latex.spanning(2, [(scene, 1) for scene, _ in columns]), latex.row([*lines[0][:2], *titles])]
-            body = [latex.row(line) for line in lines[1:]]
-            comments = "".join(f"% {note}\n" for note in declared)
-            parts.append(latex.table(text, "ll" + "r" * len(columns), head, body) + comments)
-    parts += [_failures(records, form), f"{'' if form == 'md' else '% '}{left_out}.\n" if left_out else ""]
-    return "\n".join(p for p in parts if p)
+    shown = latest(records)
+    return _page(sheets(shown, numbers(shown), protocols), form, _failures(shown), outdated(records))
 
 
-def _failures(records: list[Record], form: Format) -> str:
-    """List the runs that did not end well, with their reasons."""
-    failed = [r for r in records if r.status != OK]
-    if not failed:
-        return ""
-    lines = [
-        f"{r.run.scene} ({r.run.variant}), {r.label}: {r.status} – {r.reason or 'no reason given'}" for r in failed
+def _page(found: list[Sheet], form: Format, failed: list[str], left_out: str) -> str:
+    """Render sheets, below them the runs that failed and how many records are of other versions."""
+    parts = [_markdown(sheet) if form == "md" else _latex(sheet) for sheet in found]
+    if form == "md" and failed:
+        parts.append("## Failures and skips\n\n" + "\n".join(f"- {escape(line, form)}" for line in failed) + "\n")
+    elif failed:
+        parts.append("".join(map(latex.comment, failed)))
+    if left_out:
+        parts.append(f"{left_out}.\n" if form == "md" else latex.comment(f"{left_out}."))
+    return "\n".join(parts)
+
+
+def _markdown(sheet: Sheet) -> str:
+    titles = [f"{scene}: {sheet.column(k).title}" for k, (scene, _) in enumerate(sheet.columns)]
+    head = [escape(title, "md") for title in ("inputs", "method", *titles)]
+    first, *rows = ("| " + " | ".join(line) + " |" for line in [head, *_lines(sheet, "md")])
+    text = "\n".join([first, "|---|---|" + "---:|" * len(titles), *rows])
+    notes = "".join(f"- {escape(note, 'md')}\n" for note in sheet.notes)
+    return f"## {sheet.protocol}\n\n{escape(sheet.caption, 'md')}\n\n{text}\n" + (f"\n{notes}" if notes else "")
+
+
+def _latex(sheet: Sheet) -> str:
+    titles = [escape(sheet.column(k).title, "tex") for k in range(len(sheet.columns))]
+    head = [*latex.spanning(2, [(scene, 1) for scene, _ in sheet.columns]), latex.row(["inputs", "method", *titles])]
+    body = [latex.row(line) for line in _lines(sheet, "tex")]
+    text = latex.table(escape(sheet.caption, "tex"), "ll" + "r" * len(sheet.columns), head, body)
+    return text + "".join(map(latex.comment, sheet.notes))
+
+
+def _failures(shown: list[Record]) -> list[str]:
+    """Say of each run that did not end well what it was and why."""
+    return [
+        f"{r.run.scene} ({r.run.variant}), {r.label}: {r.status} – {r.reason or 'no reason given'}"
+        for r in shown
+        if r.status != OK
     ]
-    if form == "md":
-        return "## Failures and skips\n\n" + "\n".join(f"- {escape(line, form)}" for line in lines) + "\n"
-    return "\n".join("% " + " ".join(line.split()) for line in lines) + "\n"
 
 
 def write(records: list[Record], results: Path) -> None:
@@ -265,8 +291,11 @@ def write(records: list[Record], results: Path) -> None:
     """
     if not records:
         raise InputError(f"{results}: there are no records to tabulate; run a method first")
-    if not latest(records):
-        raise InputError(f"{results}: {outdated(records)}")
-    texts = {"md": render(records, "md"), "tex": render(records, "tex"), "csv": summary(records).to_csv(index=False)}
+    shown, left_out = latest(records), outdated(records)
+    if not shown:
+        raise InputError(f"{results}: {left_out}")
+    found = numbers(shown)
+    pages, failed = sheets(shown, found), _failures(shown)
+    texts = {form: _page(pages, form, failed, left_out) for form in ("md", "tex")} | {"csv": csv_text(found)}
     for form, text in texts.items():
         write_synced(results / f"table.{form}", text.encode())  # one who looks while runs go on sees a whole table

@@ -1,4 +1,4 @@
-"""Small helpers of the tables: escaping for Markdown and LaTeX, and who is best and second."""
+"""Small helpers of the tables: escaping for Markdown, LaTeX, CSV and pictures, and who is best and second."""
 
 from typing import Literal
 
@@ -17,7 +17,9 @@ _TEX = {
     "–": "--",
     "−": "$-$",
     "≤": r"$\leq$",
+    "<": "$<$",
     ">": "$>$",
+    "|": r"\textbar{}",
     "μ": r"$\mu$",
     "γ": r"$\gamma$",
     "²": "$^2$",
@@ -28,11 +30,27 @@ _TEX = {
 }
 
 
+_LINE = dict.fromkeys((*range(0x20), *range(0x7F, 0xA0), 0x2028, 0x2029), " ")
+"""Control characters, which hold every end of a line that any reader of text knows, and Unicode's own two."""
+
+_ESCAPED = {"md": str.maketrans({**_LINE, "|": "\\|"}), "tex": str.maketrans({**_LINE, **_TEX})}
+_FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")
+
+
+def one_line(text: str) -> str:
+    """Return a text without an end of a line and other control characters: each becomes a space."""
+    return text.translate(_LINE)
+
+
 def escape(text: str, form: Literal["md", "tex"]) -> str:
-    """Escape what Markdown's tables or LaTeX would take as markup."""
-    if form == "md":
-        return text.replace("|", "\\|").replace("\n", " ")
-    return "".join(_TEX.get(c, c) for c in text)
+    """Escape what Markdown's tables or LaTeX would take as markup; the text becomes one line."""
+    return text.translate(_ESCAPED[form])
+
+
+def harmless(text: str) -> str:
+    """Return a text as a cell of CSV that no spreadsheet takes for a formula, on one line."""
+    text = one_line(text)
+    return f"'{text}" if text.lstrip().startswith(_FORMULA) else text
 
 
 def ranked(numbers: list[float | None], better: str) -> dict[int, str]:
@@ -44,6 +62,6 @@ def ranked(numbers: list[float | None], better: str) -> dict[int, str]:
     if better not in keys or sum(n is not None for n in numbers) < 2:
         return {}
     key = keys[better]
-    places = sorted({key(n) for n in numbers if n is not None})[:2]
-    found = {i: places.index(key(n)) for i, n in enumerate(numbers) if n is not None and key(n) in places}
-    return {i: ("best", "second")[place] for i, place in found.items()}
+    found = {i: key(n) for i, n in enumerate(numbers) if n is not None}
+    places = dict(zip(sorted(set(found.values())), ("best", "second"), strict=False))
+    return {i: places[n] for i, n in found.items() if n in places}

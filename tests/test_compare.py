@@ -1,23 +1,16 @@
 import pytest
 
-from benchmarks.compare import anchored, derived, harm, row_of
+from benchmarks.compare import Row, anchored, derived, harm, row_of
 
 
 def row(method, metric, value, *, variant="metal", protocol="tissue", **more):
-    base = {"scene": "lung", "seed": 0, "inputs": "counts only", "status": "ok", "identical": False}
-    return {
-        **base,
-        "variant": variant,
-        "method": method,
-        "protocol": protocol,
-        "metric": metric,
-        "value": value,
-        **more,
-    }
+    base = {"scene": "lung", "seed": 0, "inputs": "counts only"}
+    said = {"variant": variant, "method": method, "protocol": protocol, "metric": metric, "value": value}
+    return Row(**{**base, **said, **more})
 
 
 def found(rows):
-    return {(r["method"], r["seed"], r["protocol"], r["metric"]): r["value"] for r in derived(rows)}
+    return {(r.method, r.seed, r.protocol, r.metric): r.value for r in derived(rows)}
 
 
 def test_similarity_is_anchored_as_an_error():
@@ -41,7 +34,7 @@ def test_seeds_and_scenes_are_not_mixed():
 def test_only_runs_that_ended_well_are_compared():
     rows = [row("fdk", "psnr3d", 20.0), row("net", "psnr3d", 23.0, status="diverged"), row("a", "psnr3d", None)]
     assert set(found(rows)) == {("fdk", 0, "against", "over_fdk")}
-    rows[0]["status"] = "diverged"
+    rows[0] = rows[0]._replace(status="diverged")
     assert found(rows) == {}
 
 

@@ -1,11 +1,16 @@
+import cProfile
+import csv
+import pstats
+import random
 import shutil
 import subprocess
 
 import msgspec
+import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks import latex, tables
+from benchmarks import latex, records, tables
 from benchmarks.protocol import Score
 from benchmarks.records import Cost, Record, Run
 from benchmarks.texts import escape, ranked
@@ -228,7 +233,7 @@ def test_the_csv_says_which_volume_was_scored(tmp_path):
 def test_texts_that_differ_in_numbers_only_are_merged_to_ranges():
     assert tables.merged(["behind 9.5 mm", "behind 30.25 mm", "behind 12.0 mm"]) == "behind 9.5 to 30.25 mm"
     assert tables.merged(["50 keV", "behind 1.0 of 2.0", "behind 1.0 of 3.0"]) == "50 keV / behind 1.0 of 2.0 to 3.0"
-    assert tables.merged([]) == ""
+    assert tables.merged([]) == "" and tables.merged(["# 1.5 #", "# 2.5 #"]) == "# 1.5 to 2.5 #"
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex is not installed")
@@ -251,3 +256,136 @@ def test_latex_heads_name_a_scene_once_over_its_columns():
     head = text[text.index("\\toprule") : text.index("\\midrule")]
     assert head.count("lung") == head.count("teeth") == 1
     assert "\\cmidrule(lr){3-4}\\cmidrule(lr){5-6}" in head
+
+
+def many(n_scenes, n_seeds=1, methods=("fdk", "nmar", "net"), seed=0):
+    """Records with random scores; some runs failed, and some scores are missing."""
+    rng = random.Random(seed)
+    found = []
+    for scene in range(n_scenes):
+        for k in range(n_seeds):
+            for m in methods:
+                psnr = None if rng.random() < 0.1 else rng.gauss(30, 5)
+                more = {"status": "error"} if rng.random() < 0.1 else {}
+                found.append(record(m, f"s{scene}", psnr, rng.random(), seed=k, **more))
+    return found
+
+
+def test_numbers_are_those_of_a_data_frame():
+    """The oracle is pandas, grouping one row for each number."""
+    given = many(3, 7)
+    rows = [
+        {"scene": r.run.scene, "method": r.label, "metric": m, "value": np.nan if v is None else v}
+        for r in given
+        for score in r.scores.values()
+        for m, v in score.values.items()
+    ]
+    grouped = pd.DataFrame(rows).groupby(["scene", "method", "metric"])["value"]
+    expected = grouped.agg(["mean", "std", "count"])
+    table = tables.summary(given)
+    table = table[table.protocol == "tissue"].set_index(["scene", "method", "metric"])
+    assert len(table) == len(expected) == 27 and expected["count"].between(2, 7).all()
+    for place, row in expected.iterrows():
+        ours = table.loc[place]
+        # 7 numbers near 30 are summed in another order: 7 ε of relative error each way; ε = 2.2e-16
+        assert ours["mean"] == pytest.approx(row["mean"], rel=4e-15) and ours["n"] == row["count"]
+        assert ours["std"] == pytest.approx(row["std"], rel=1e-13)
+
+
+def test_tables_take_time_in_proportion_to_the_records(tmp_path):
+    """Calls are counted, for the clock is no judge: what was done once a scene or once a table grows faster."""
+
+    def calls(n_scenes):
+        given = many(n_scenes)
+        profile = cProfile.Profile()
+        profile.runcall(tables.write, given, tmp_path)
+        return pstats.Stats(profile).total_calls
+
+    calls(1)  # imports
+    few, many_more = calls(20), calls(80)
+    assert many_more < 4.4 * few  # 4 times the scenes, and what a table has once
+    assert many_more / len(many(80)) < 500
+
+
+def test_the_numbers_are_made_once_for_all_tables(tmp_path, monkeypatch):
+    made = []
+    for where, name in ((tables, "numbers"), (tables, "latest"), (tables, "sheets")):
+        whole = getattr(where, name)
+        monkeypatch.setattr(where, name, lambda *a, whole=whole, name=name: [made.append(name), whole(*a)][1])
+    tables.write(many(2), tmp_path)
+    assert sorted(made) == ["latest", "numbers", "sheets"]
+
+
+ODD_LINES = "\n\r\x0b\x0c\x1c\x85\u2028\u2029"
+TEX = "".join(f"{end}\\input{{/etc/passwd}}" for end in ODD_LINES) + "^^M$%#&~_{}<|\\"
+
+
+def hostile(text):
+    """A record, and a failed one, that hold a text wherever theirs are somebody else's."""
+    score = Score(
+        region=text, reference=text, alignment=text, data_range=1.0, n_voxels=1, values={"psnr3d": 20.0, text: 1.0},
+        note=text, volume=text,
+    )  # fmt: skip
+    scores = {"tissue": score, text: score}
+    whole = record(f"fdk{text}", f"lung{text}", inputs=text)
+    whole = msgspec.structs.replace(whole, scores=scores)
+    bad = record(f"net{text}", f"lung{text}", inputs=text, status="error")
+    return [whole, msgspec.structs.replace(bad, reason=text, status=text)]
+
+
+def test_nothing_in_a_record_becomes_tex():
+    text = tables.render(hostile(TEX), "tex")
+    for line in text.split("\n"):
+        assert not set(line) & set(ODD_LINES)
+        code = line.replace(r"\%", "").partition("%")[0]  # what TeX reads of it
+        assert r"\input" not in code and "^^" not in code
+        if not line.startswith("%"):
+            assert code.count("{") - code.count(r"\{") == code.count("}") - code.count(r"\}")
+    assert text.count(r"\textbackslash{}input") > 20  # it is there, as text
+    assert len([line for line in text.splitlines() if line.startswith("%")]) == 2  # a note and a failure
+
+
+def test_a_page_of_markdown_keeps_its_lines():
+    plain, odd = (tables.render(hostile(text), "md") for text in ("x", f"x{ODD_LINES}| --- |"))
+    assert odd.count("\n") == plain.count("\n") and not set(odd) & set(ODD_LINES[1:])
+
+
+@pytest.mark.parametrize("text", ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1", " =1", "＝1", '=cmd|"/c calc"!A1,"'])
+def test_no_cell_of_the_csv_is_a_formula(tmp_path, text):
+    given = hostile(text)
+    given = [
+        msgspec.structs.replace(r, label=text * k, run=msgspec.structs.replace(r.run, scene=text))
+        for k, r in enumerate(given, 1)
+    ]
+    tables.write(given, tmp_path)
+    with (tmp_path / "table.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 2 + 2 * 5  # two protocols of two metrics, and two runs' costs
+    for row in rows:
+        assert None not in row  # as many cells as columns
+        texts = [row[k] for k in ("scene", "method", "inputs", "status", "volume", "protocol", "metric")]
+        assert not any(t.strip()[:1] in tuple("=+-@＝") for t in texts if t), row
+        assert row["mean"] == "" or float(row["mean"]) is not None
+
+
+def test_numbers_stay_numbers_in_the_csv(tmp_path):
+    given = [record("fdk", psnr=20.0), record("bad", psnr=-19.5), record("tiny", psnr=1e-300)]
+    tables.write(given, tmp_path)
+    frame = pd.read_csv(tmp_path / "table.csv").set_index(["method", "protocol", "metric"])["mean"]
+    assert frame["bad", "tissue", "psnr3d"] == -19.5 and frame["bad", "against", "over_fdk"] == -39.5
+    assert frame["tiny", "tissue", "psnr3d"] == 1e-300
+
+
+@pytest.mark.parametrize("value", [1e308, -1e308, 5e-324, -0.0, 1e22])
+def test_absurd_values_are_shown_and_crash_nothing(tmp_path, value):
+    given = [
+        record("fdk", psnr=20.0),
+        *(record("net", psnr=v, rmse=value, seed=k) for k, v in enumerate((value, -value))),
+    ]
+    given += [record("nmar", psnr=value, rmse=value, seed=k) for k in range(2)]
+    given += [record("nmar", scene="teeth", psnr=value)]
+    given = [msgspec.structs.replace(r, place=(-(10**25), 10**25)) for r in given]
+    tables.write(given, tmp_path)
+    frame = pd.read_csv(tmp_path / "table.csv").set_index(["scene", "method", "protocol", "metric"])["mean"]
+    assert frame["lung", "nmar", "tissue", "psnr3d"] == value and frame["lung", "net", "tissue", "psnr3d"] == 0.0
+    assert records.latest(given)
