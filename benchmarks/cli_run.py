@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FEW = 20  # scenes, all of which a message names
-
 
 @dataclass(frozen=True)
 class Arguments:
