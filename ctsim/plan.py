@@ -52,8 +52,8 @@ class Output:
 class Plan:
     """The work for one scan. `seconds` is an estimate for this machine, the only entry that differs between runs.
 
-    `materials` are those that are met, air first. In P = −ln(signal/open), `error` bounds what the energy
-    quadrature does and `edge_error` is the largest found in eight windows at edges of inserts, in one view (see
+    `materials` are those that are met, air first. In P = −ln(signal/open), `error` is the greatest found of the
+    energy quadrature and `edge_error` is the largest found in eight windows at edges of inserts, in one view (see
     `ctsim.survey`); `l0` is the median water-equivalent path of the body in mm. `memory_bytes` estimates the arrays;
     Python and its libraries take a quarter of a gigabyte more.
     """
@@ -77,7 +77,7 @@ class Plan:
 
     @property
     def error(self) -> float:
-        """Bound on |ΔP| made by the energy quadrature."""
+        """Greatest |ΔP| found of the energy quadrature."""
         return self.rule.error
 
     def runs(self, name: str) -> bool:

@@ -5,10 +5,11 @@ over m1², Σ w2_k exp(−τ_k). Nodes come from Lanczos with full reorthogonali
 intervals split at the K- and L-edges of the object (Golub and Welsch 1969, doi:10.1090/S0025-5718-69-99647-1).
 """
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +18,13 @@ from ctsim.detector import Detector, response
 from ctsim.errors import InputError
 from ctsim.materials import Material, absorption_edges, attenuation
 from ctsim.spectrum import Spectrum
+from ctsim.trials import Beam, climb, make_trials
 
 P_MAX = 14.6  # −log of the faintest signal that a rule answers for
 _N_MAX = 60
 _TINY = 1e-300  # a rule so short that it leaves no signal is merely very wrong
 _SPLIT = 0.1  # in tolerances
-_STEPS = (1, 2, 20, 11, 6, 5)  # steps per material in combinations of so many materials
+_ROUGH = 16  # nodes per interval that tell P well enough to choose trials
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,8 +33,7 @@ class EnergyRule:
 
     `w1` [N] sums to 1; `w2` [N] sums to m2/m1², so that a pixel that i0 photons would reach has the variance
     Σ w2 exp(−τ)/i0 of its signal over the open one. `mean_signal` is m1, keV per incident photon (1 for a
-    counter: the share counted); `error` is the greatest |ΔP| over the path lengths tried; between them
-    it was up to a tenth more.
+    counter: the share counted); `error` is the greatest |ΔP| that a search over path lengths found.
     """
 
     energies: NDArray[np.float64]
@@ -68,9 +69,9 @@ def energy_rule(
 ) -> EnergyRule:
     """Return the smallest Gauss rule whose |ΔP| stays within `tolerance`.
 
-    `max_lengths` (mm) are the longest path per material; each alone and combinations of them are tried
-    up to P = 14.6, and the greatest error found is in the rule. Where 60 energies do not
-    suffice the fine spectrum itself is the rule.
+    `max_lengths` (mm) are the longest path per material. Each alone and several at once are tried from
+    P = `tolerance` to 14.6, and from the worst of them a search climbs to greater errors (`ctsim.trials`). Where 60
+    energies do not suffice the fine spectrum itself is the rule.
     """
     if len(materials) != len(max_lengths):
         raise InputError(f"max_lengths must have one entry per material ({len(materials)}), got {len(max_lengths)}")
@@ -82,35 +83,84 @@ def energy_rule(
     if fine.energies.size == 1:
         return fine
     used = [(m, length) for m, length in zip(materials, max_lengths, strict=True) if length > 0]
-    names = [m for m, _ in used]
-    lengths = _combinations(np.array([length for _, length in used]))
-    p_fine = _log_signal(fine.w1, lengths, _mu(names, fine.energies))
-    reached = p_fine <= P_MAX
-    lengths, p_fine = lengths[reached], p_fine[reached]
-    edges = absorption_edges(names, fine.energies[0], fine.energies[-1])
-    below = [float(fine.w1[fine.energies < edge].sum()) for edge in edges]
-    # An edge that leaves next to no signal on one side is not worth a node of its own.
-    edges = tuple(e for e, share in zip(edges, below, strict=True) if min(share, 1 - share) > _SPLIT * tolerance)
-    intervals = _intervals(fine, edges)
+    if not used:
+        return replace(_gauss(fine, _intervals(fine, ()), [1]), error=0.0)
+    return _Search(fine, [m for m, _ in used], tolerance).run(np.array([length for _, length in used]))
 
-    def share(energies: NDArray[np.float64], w1: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Part of every combination's signal that these energies carry."""
-        return np.exp(p_fine[:, None] - lengths @ _mu(names, energies)) @ w1
 
-    exact = [share(fine.energies[part], fine.w1[part]) for part in intervals]
-    sizes = [part.stop - part.start for part in intervals]
-    counts = [1] * len(intervals)
-    # The signal is a sum over intervals, so that each one's error is its own and the worst gets the next node.
-    off = [share(*_lanczos(fine.energies[p], fine.w1[p], 1)) - exact[i] for i, p in enumerate(intervals)]
-    while (error := float(np.max(np.abs(np.log(np.maximum(1 + sum(off), _TINY)))))) > tolerance:
-        if sum(counts) >= _N_MAX:
-            return fine
-        worst = max((i for i in range(len(counts)) if counts[i] < sizes[i]), key=lambda i: np.max(np.abs(off[i])))
-        counts[worst] += 1
-        part = intervals[worst]
-        off[worst] = share(*_lanczos(fine.energies[part], fine.w1[part], counts[worst])) - exact[worst]
-    rule = _gauss(fine, intervals, tuple(counts))
-    return EnergyRule(energies=rule.energies, w1=rule.w1, w2=rule.w2, mean_signal=rule.mean_signal, error=error)
+class _Search:
+    """The search for a rule: it adds nodes until no path is found on which the rule is wrong."""
+
+    def __init__(self, fine: EnergyRule, materials: list[str | Material], tolerance: float) -> None:
+        self.fine, self.materials, self.tolerance = fine, materials, tolerance
+        self.beam = Beam(weights=fine.w1, mu=_mu(materials, fine.energies))
+        edges = absorption_edges(materials, fine.energies[0], fine.energies[-1])
+        below = [float(fine.w1[fine.energies < edge].sum()) for edge in edges]
+        # An edge that leaves next to no signal on one side is not worth a node of its own.
+        kept = [e for e, share in zip(edges, below, strict=True) if min(share, 1 - share) > _SPLIT * tolerance]
+        self.intervals = _intervals(fine, kept)
+        self.sizes = [part.stop - part.start for part in self.intervals]
+
+    def run(self, longest: NDArray[np.float64]) -> EnergyRule:
+        """Return the smallest rule, or the fine spectrum where 60 energies do not suffice; `longest` [material] mm."""
+        rough = self._beam([_ROUGH] * len(self.sizes))
+        tried = make_trials(rough, longest, self.tolerance, P_MAX)
+        counts = [1] * len(self.sizes)
+        while True:
+            counts, errors = self._counts(tried.lengths, counts)
+            if not counts:
+                return self.fine
+            # Gauss rules converge so fast that one of twice the nodes serves as the exact sum while climbing.
+            few, many = self._beam(counts), self._beam([2 * n + 4 for n in counts])
+            worse = climb(tried, errors, functools.partial(_difference, few, many), rough, P_MAX)
+            error = float(max(errors.max(), _difference(few, self.beam, worse).max()))
+            if error <= self.tolerance:
+                return replace(_gauss(self.fine, self.intervals, counts), error=error)
+            tried = replace(tried, lengths=np.concatenate([tried.lengths, worse]))
+
+    def _beam(self, counts: Sequence[int]) -> Beam:
+        """Return the beam of the Gauss rule with `counts` nodes per interval."""
+        parts = [self._nodes(i, n) for i, n in enumerate(counts)]
+        nodes, weights = (np.concatenate(x) for x in zip(*parts, strict=True))
+        return Beam(weights=weights, mu=_mu(self.materials, nodes))
+
+    def _nodes(self, i: int, n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        part = self.intervals[i]
+        return _lanczos(self.fine.energies[part], self.fine.w1[part], min(n, self.sizes[i]))
+
+    def _counts(self, lengths: NDArray[np.float64], counts: list[int]) -> tuple[list[int], NDArray[np.float64]]:
+        """Return nodes per interval, from `counts` up, that suffice for the trials [c, material], and errors [c].
+
+        No nodes where more than 60 were needed.
+        """
+        counts = list(counts)
+        depth = lengths @ self.beam.mu
+        low = depth.min(axis=1)[:, None]
+        parts = np.stack([np.exp(low - depth[:, p]) @ self.fine.w1[p] for p in self.intervals])
+        total = parts.sum(axis=0)
+
+        def off(i: int) -> NDArray[np.float64]:
+            """Error of interval i, relative to the whole signal."""
+            nodes, weights = self._nodes(i, counts[i])
+            return (np.exp(low - lengths @ _mu(self.materials, nodes)) @ weights - parts[i]) / total
+
+        # The signal is a sum over intervals, so that each one's error is its own and the worst gets the next node.
+        offs = [off(i) for i in range(len(counts))]
+        while True:
+            errors = np.abs(np.log(np.maximum(1 + sum(offs), _TINY)))
+            if errors.max() <= self.tolerance:
+                return counts, errors
+            if sum(counts) >= _N_MAX:
+                return [], errors
+            open_ = (i for i in range(len(counts)) if counts[i] < self.sizes[i])
+            worst = max(open_, key=lambda i: np.max(np.abs(offs[i])))
+            counts[worst] += 1
+            offs[worst] = off(worst)
+
+
+def _difference(a: Beam, b: Beam, lengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """|ΔP| [c] between two beams behind path lengths [c, material]."""
+    return np.abs(a.log_signal(lengths) - b.log_signal(lengths))
 
 
 def _mu(materials: Sequence[str | Material], energies: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -137,32 +187,12 @@ def effective_weights(
     return fine.energies, weights / weights.sum()
 
 
-def _combinations(max_lengths: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return combinations [c, m] of path lengths: each material alone in 48 steps, all together in coarser ones."""
-    m = max_lengths.size
-    alone = np.kron(np.eye(m), np.linspace(0, 1, 48)[:, None] ** 1.5)
-    if m <= 5:
-        steps = np.linspace(0, 1, _STEPS[m]) ** 1.5  # denser where lengths are short
-        grids = np.meshgrid(*([steps] * m), indexing="ij")
-        together = np.stack([g.ravel() for g in grids], axis=1) if m else np.zeros((1, 0))
-    else:
-        together = np.random.Generator(np.random.Philox(key=m)).random((3000, m)) ** 1.5
-        together[0] = 1.0
-    return np.concatenate([alone, together]) * max_lengths
-
-
-def _log_signal(w1: NDArray[np.float64], lengths: NDArray[np.float64], mu: NDArray[np.float64]) -> NDArray[np.float64]:
-    depth = lengths @ mu
-    low = depth.min(axis=1)
-    return low - np.log(np.exp(low[:, None] - depth) @ w1)
-
-
 def _intervals(fine: EnergyRule, edges: Sequence[float]) -> list[slice]:
     cuts = np.unique(np.concatenate([[0], np.searchsorted(fine.energies, edges), [fine.energies.size]])).astype(int)
     return [slice(a, b) for a, b in itertools.pairwise(cuts)]
 
 
-def _gauss(fine: EnergyRule, intervals: list[slice], counts: tuple[int, ...]) -> EnergyRule:
+def _gauss(fine: EnergyRule, intervals: list[slice], counts: Sequence[int]) -> EnergyRule:
     energies, w1, w2 = [], [], []
     for part, n in zip(intervals, counts, strict=True):
         e, w = fine.energies[part], fine.w1[part]

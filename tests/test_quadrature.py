@@ -70,8 +70,8 @@ def test_rule_keeps_its_tolerance_on_paths_it_did_not_try(kind: str, tolerance: 
     kept = exact <= 14.6
     assert rule.error <= tolerance
     assert rule.energies.size <= 13
-    # The tried combinations stand for all of them to a tenth.
-    assert np.max(np.abs(log_signal(rule, paths) - exact)[kept]) <= 1.1 * tolerance
+    # What is stated is the greatest of a search, not a bound: two percent are left for what it misses.
+    assert np.max(np.abs(log_signal(rule, paths) - exact)[kept]) <= 1.02 * tolerance
 
 
 def test_smaller_objects_take_fewer_energies() -> None:
@@ -124,7 +124,7 @@ def test_k_edge_of_the_object_splits_the_interval() -> None:
     exact = log_signal(fine, paths, ("water", "Au"))
     kept = exact <= 14.6
     assert rule.energies.size < 30
-    assert np.max(np.abs(log_signal(rule, paths, ("water", "Au")) - exact)[kept]) <= 1.1e-4
+    assert np.max(np.abs(log_signal(rule, paths, ("water", "Au")) - exact)[kept]) <= 1.02e-4
     # The same number of nodes without the split is worse by far.
     blind = gauss_rule(source, detector, rule.energies.size)
     assert np.max(np.abs(log_signal(blind, paths, ("water", "Au")) - exact)[kept]) > 3 * rule.error
