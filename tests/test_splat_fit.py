@@ -20,6 +20,7 @@ from ctsim.materials import attenuation
 from ctsim.store import list_scans, open_scan
 from ctsim.types import Status
 from reconstruct.fdk import reconstruct as fdk
+from reconstruct.splat.checkpoint import Checkpoint
 from reconstruct.splat.course import passes_over
 from reconstruct.splat.curve import MATERIALS, MaterialCurve
 from reconstruct.splat.lattice import Lattice
@@ -382,9 +383,8 @@ def test_a_budget_counts_what_was_spent_before_an_interruption(small, tmp_path):
     told = {"passes": (1, 1), "checkpoints": str(tmp_path)}
     reconstruct(small.scan, seconds=1e-9, **told)
     (file,) = tmp_path.iterdir()
-    with np.load(file) as kept:
-        np.savez(tmp_path / "later", **{**kept, "seconds": np.array(1000.0)})
-    (tmp_path / "later.npz").replace(file)
+    kept = Checkpoint(folder=tmp_path, identity=file.stem)
+    kept.write({**(kept.read() or {}), "seconds": np.array(1000.0)})
     left = []
     with listen(left.append, every=0.0):
         found = reconstruct(small.scan, seconds=1000.0, **told)

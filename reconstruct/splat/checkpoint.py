@@ -3,7 +3,6 @@
 import hashlib
 import io
 import time
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ from ctsim.errors import InputError
 from ctsim.types import Scan
 
 EVERY = 60.0  # seconds from one writing to the next
+_CHECKSUM = 32  # bytes
 State = Mapping[str, NDArray[Any]]
 
 
@@ -25,7 +25,8 @@ State = Mapping[str, NDArray[Any]]
 class Checkpoint:
     """Arrays by name in `folder`, in a file that is named after what they belong to.
 
-    A file is replaced whole: after a crash it holds the old arrays or the new ones.
+    A file is replaced whole: after a crash it holds the old arrays or the new ones. It is an .npz with the SHA-256 of
+    its bytes after it.
     """
 
     folder: Path
@@ -47,7 +48,7 @@ class Checkpoint:
         np.savez(buffer, **arrays)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            write_synced(self.path, buffer.getvalue())
+            write_synced(self.path, buffer.getvalue() + hashlib.sha256(buffer.getbuffer()).digest())
         except OSError as error:
             raise InputError(f"checkpoint {self.path} cannot be written: {error}") from None
         self._written = time.perf_counter()
@@ -55,14 +56,20 @@ class Checkpoint:
     def read(self) -> dict[str, NDArray[Any]] | None:
         """Return what was written, None where nothing was. Raises InputError where it cannot be read or is damaged."""
         try:
-            with self.path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
-                return {name: np.asarray(file[name]) for name in file.files}
+            whole = self.path.read_bytes()
         except FileNotFoundError:
             return None
         except OSError as error:
             raise InputError(f"checkpoint {self.path} cannot be read: {error}") from None
-        except (ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f"checkpoint {self.path} is damaged ({error}): delete it to start anew") from None
+        arrays, checksum = whole[:-_CHECKSUM], whole[-_CHECKSUM:]
+        if hashlib.sha256(arrays).digest() != checksum:
+            raise self.damaged("its checksum does not fit, or an earlier version wrote it")
+        with np.load(io.BytesIO(arrays), allow_pickle=False) as file:
+            return {name: np.asarray(file[name]) for name in file.files}
+
+    def damaged(self, why: object) -> InputError:
+        """Return the error of a file that holds no state to go on from."""
+        return InputError(f"checkpoint {self.path} is damaged ({why}): delete it to start anew")
 
     def remove(self) -> None:
         """Delete the file, if there is one."""

@@ -57,7 +57,7 @@ class Course:
         return {**fit.state(), "support": support, "level": np.array(self._level(fit))}
 
     def restored(self, state: Mapping[str, NDArray[Any]]) -> Fit:
-        """Return the fit of a state. Raises KeyError, IndexError or ValueError where it is none of this course."""
+        """Return the fit of a state. Raises KeyError, IndexError, TypeError or ValueError where it is none of it."""
         k = int(state["level"])
         size = self.levels[k].geometry.n_voxel
         bits = np.unpackbits(state["support"], count=math.prod(size))

@@ -145,8 +145,8 @@ def _fitted(course: Course, scan: Scan, settings: Settings, stopwatch: Stopwatch
     if kept is not None and (state := kept.read()) is not None:
         try:
             begun, before = course.restored(state), float(state["seconds"])
-        except (KeyError, IndexError, ValueError) as error:
-            raise InputError(f"checkpoint {kept.path} is damaged ({error}): delete it to start anew") from None
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            raise kept.damaged(error) from None
         stopwatch = Stopwatch(before + stopwatch.seconds, settings.seconds)
 
     def proceed(fit: Fit, whole: bool, share: float) -> bool:

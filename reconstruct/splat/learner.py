@@ -147,8 +147,14 @@ class Learner:
         return {name: value.copy() for name, value in state.items()}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Go on from a state. Raises KeyError where something is missing."""
-        self._take(_below(state, "parameters."))
+        """Go on from a state. Raises KeyError, TypeError or ValueError where it is none of this fit."""
+        parameters = _below(state, "parameters.")
+        expected = {k: (len(parameters["positions"]), *v.shape[1:]) for k, v in self._parameters.items()}
+        for name in ("parameters", "moments.first", "moments.second"):
+            _check_shapes(_below(state, f"{name}."), expected)
+        n = expected["positions"][:1]
+        _check_shapes({name: state[name] for name in ("pulls", "seen")}, {"pulls": n, "seen": n})
+        self._take(parameters)
         self._moments, self._theta_moments = (
             Moments(
                 first=_below(state, f"{name}.first."),
@@ -164,6 +170,12 @@ class Learner:
 
 def _below(state: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
     return {name.removeprefix(prefix): value.copy() for name, value in state.items() if name.startswith(prefix)}
+
+
+def _check_shapes(arrays: Mapping[str, Array], expected: Mapping[str, tuple[int, ...]]) -> None:
+    found = {name: array.shape for name, array in arrays.items()}
+    if found != expected:
+        raise ValueError(f"arrays of shapes {found}, expected {expected}")
 
 
 def sorted_by_z(splats: Splats) -> tuple[Splats, NDArray[np.int64]]:

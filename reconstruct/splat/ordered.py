@@ -121,7 +121,10 @@ class Fit:
         """Go on from a state. Raises KeyError where something is missing, ValueError where it does not fit."""
         self.steps, self._measured, self.view_updates = state["numbers"].tolist()
         self.loss, self.misfit, self._total = state["reals"].tolist()
-        self.u[...], self._curvature[...], self.lattice.dual[...] = state["u"], state["curvature"], state["dual"]
+        for name, own in (("u", self.u), ("curvature", self._curvature), ("dual", self.lattice.dual)):
+            if state[name].shape != own.shape:  # NumPy would spread a single value
+                raise ValueError(f"{name} has shape {state[name].shape}, expected {own.shape}")
+            own[...] = state[name]
 
     def volume(self) -> Image:
         """Return u on the voxel grid, a mean over each voxel: [z, y, x] in 1/mm."""

@@ -131,8 +131,8 @@ class _Run:
             self.learner.restore(state)
             self.done, self.best_step, self.idle = state["run.numbers"].tolist()
             seconds, self.loss, self.best_misfit = state["run.reals"].tolist()
-        except (KeyError, ValueError) as error:
-            raise InputError(f"checkpoint {checkpoint.path} is damaged ({error}): delete it to start anew") from None
+        except (KeyError, TypeError, ValueError) as error:
+            raise checkpoint.damaged(error) from None
         self.best = {k.removeprefix("best."): v for k, v in state.items() if k.startswith("best.")}
         self.stopwatch = Stopwatch(seconds + self.stopwatch.seconds, self.stopwatch.limit)
 
