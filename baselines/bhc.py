@@ -14,7 +14,7 @@ from baselines.inpaint import Filled
 from baselines.limar import check_insert, finished, mended, uncorrected
 from baselines.metal import Trace, find_metal, reinsert
 from baselines.morphology import dilate
-from baselines.prior import RING, check_prior, choose_prior
+from baselines.prior import NO_BODY, RING, check_prior, choose_prior
 from ctsim.types import Scan, Status, Volume
 from reconstruct.fdk import reconstruct as fdk
 from reconstruct.log import line_integrals
@@ -54,10 +54,10 @@ def bhc_poly(
     trace = Trace(metal, scan)
     choice = choose_prior(trace, metal, first.values, prior)
     if choice is None:
-        return _left(uncorrected(first, metal), "nothing stands out from air")
+        return uncorrected(first, metal, NO_BODY)
     fit = _fit(scan, trace, choice.columns, choice.water)
     if not fit.pixels:
-        return _left(uncorrected(first, metal), "no pixel of the trace has a signal")
+        return uncorrected(first, metal, "no pixel of the trace has a signal")
     negative = 0
 
     def correct(p: Array, views: slice, _: Filled) -> None:
@@ -188,13 +188,3 @@ def _terms(metal: NDArray[np.float64], tissue: NDArray[np.float64]) -> NDArray[n
     """Return `TERMS` of lengths in metal and tissue, [n, 6]; all are 0 where there is no metal."""
     m, t = metal, tissue
     return np.stack([m, m**2, m**3, m * t, m**2 * t, m * t**2], 1)
-
-
-def _left(volume: Volume, why: str) -> Volume:
-    """Return a volume that nothing was done to, and say why in its details."""
-    return Volume(
-        values=volume.values,
-        status=volume.status,
-        reason=volume.reason,
-        details=volume.details | {"uncorrected_reason": why},
-    )

@@ -100,13 +100,15 @@ def mended(
     return values, filled
 
 
-def uncorrected(first: Volume, metal: Metal) -> Volume:
-    """Return FDK's volume as it is; the details say what is doubted about the mask."""
+def uncorrected(first: Volume, metal: Metal, why: str = "") -> Volume:
+    """Return FDK's volume as it is; the details say why: that there is no metal, a doubt of the mask, or `why`."""
+    why = why or metal.doubt or ("" if metal.mask.any() else "no metal in the mask")
+    said = {"uncorrected_reason": f"{why}: the volume is FDK's"} if first.status is Status.OK else {}
     return Volume(
         values=first.values,
         status=first.status,
         reason=first.reason,
-        details=first.details | metal.details() | {"corrected": False},
+        details=first.details | metal.details() | {"corrected": False} | said,
     )
 
 

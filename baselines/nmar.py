@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from baselines.inpaint import Filled, fill
 from baselines.limar import Bridging, finished, mended, uncorrected
 from baselines.metal import Trace, find_metal, reinsert
-from baselines.prior import check_prior, choose_prior
+from baselines.prior import NO_BODY, check_prior, choose_prior
 from ctsim.errors import InputError
 from ctsim.types import Scan, Status, Volume
 from reconstruct.fdk import reconstruct as fdk
@@ -104,7 +104,7 @@ def reconstruct(scan: Scan, settings: Settings, device: str) -> Volume:
     trace = Trace(metal, scan, settings.dilation)
     choice = choose_prior(trace, metal, first.values, settings.prior, settings.interpolation)
     if choice is None:
-        return uncorrected(first, metal)
+        return uncorrected(first, metal, NO_BODY)
     bridge = functools.partial(settings.rule.fill, largest=choice.largest, how=settings.interpolation)
     values, filled = normalised(trace, first.values, choice.columns, bridge)
     reinsert(values, x_0, metal, settings.insert)

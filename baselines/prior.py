@@ -23,6 +23,7 @@ CHOICE_VIEWS = 32  # views that decide between the priors
 MARGIN = 0.95  # LIMAR's prior must fit better by this
 RING = 4  # width in pixels of the ring around the trace that the priors are judged on
 PRIORS = ("auto", "fdk", "limar")
+NO_BODY = "nothing stands out from air"
 Array = NDArray[np.float32]
 
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from benchmarks.workers import Pool
 
 log = logging.getLogger(__name__)
+FEW = 20  # scenes, all of which a message names
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,7 @@ def _compute(given: Arguments) -> int:
     )
     methods, scans = _methods(given), _scans(given)
     names = frozenset(given.scene or (s.name for s in scans))
+    _warn([s for s in scans if s.name in names])
     listed = [task for task in run.tasks(scans, methods, options) if task.stored.name in names]
     left = run.pending(listed, given.results, given.force)
     costs = schedule.Costs(records.read_all(given.results)[0])
@@ -203,6 +205,17 @@ def _scans(given: Arguments) -> "list[Stored]":
         if wanted not in names:
             raise InputError(f"--scene {wanted!r}: {given.data} has {human_choice(names, wanted)}")
     return scans
+
+
+def _warn(scans: "list[Stored]") -> None:
+    """Say what scans note of themselves, each note once with the scans that share it."""
+    found: dict[str, list[str]] = {}
+    for stored in scans:
+        for note in stored.info.notes:
+            found.setdefault(note, []).append(stored.name)
+    for note, names in found.items():
+        more = f" and {len(names) - FEW} more" if len(names) > FEW else ""
+        log.warning("%s%s: %s", ", ".join(names[:FEW]), more, note)
 
 
 def _report(found: "list[Record]", scans: "list[Stored]", results: Path) -> None:

@@ -185,6 +185,9 @@ def _make(scenes: "tuple[Scene, ...]", out: Path, options: Options) -> int:
             _say(f"{scene.name}: already complete")
     with open_pool(options.workers, options.scheduler) as pool:
         plans = {scene.name: _plan(scene)[0] for scene in todo}  # all phantoms could be more than memory holds
+        for name, plan in plans.items():
+            for note in plan.notes:
+                _say(f"{name}: {note}")
         _check_space(out, sum(plan.disk_bytes for plan in plans.values()))
         if pool:
             where = out.resolve()

@@ -141,6 +141,9 @@ def dice(found: Mask, truth: Mask) -> float | None:
     return None if total == 0 else 2 * int((found & truth).sum()) / total
 
 
+METAL = ("core_ratio", "dice", "boundary_rms")
+
+
 def metal_metrics(
     values: Array, reference: Array, metal: Mask, judged: Mask, d_voxel: tuple[float, float, float]
 ) -> dict[str, float | None]:

@@ -243,6 +243,19 @@ def metal_score(values: NDArray[Any], truth: Truth) -> Score:
     )
 
 
+def no_metal_score(reason: str) -> Score:
+    """Return the score under `metal` of a scan whose scene holds metal that it lacks: no numbers, and why."""
+    return Score(
+        region="metal",
+        reference="none",
+        alignment="none",
+        data_range=None,
+        n_voxels=0,
+        values=dict.fromkeys(metrics.METAL),
+        note=reason,
+    )
+
+
 def evaluate(
     values: NDArray[Any], truth: Truth, *, at_50kev: NDArray[Any] | None = None, anchor: bool = False
 ) -> dict[str, Score]:

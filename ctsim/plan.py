@@ -16,6 +16,7 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.human import human_bytes, human_time
 from ctsim.materials import attenuation
+from ctsim.notes import metal_notes
 from ctsim.project import Response, Tracer
 from ctsim.quadrature import EnergyRule, energy_rule, full_rule
 from ctsim.scatter import open_fraction
@@ -55,7 +56,7 @@ class Plan:
     `materials` are those that are met, air first. In P = −ln(signal/open), `error` is the greatest found of the
     energy quadrature and `edge_error` is the largest found in eight windows at edges of inserts, in one view (see
     `ctsim.survey`); `l0` is the median water-equivalent path of the body in mm. `memory_bytes` estimates the arrays;
-    Python and its libraries take a quarter of a gigabyte more.
+    Python and its libraries take a quarter of a gigabyte more. `notes` are those of `ctsim.notes`.
     """
 
     stream_id: str
@@ -74,6 +75,7 @@ class Plan:
     flops: float
     disk_bytes: int
     memory_bytes: int
+    notes: tuple[str, ...] = ()
 
     @property
     def error(self) -> float:
@@ -104,7 +106,7 @@ class Plan:
             "flops": self.flops,
             "memory_bytes": self.memory_bytes,
             "seconds": self.seconds,
-        }
+        } | ({"notes": list(self.notes)} if self.notes else {})
 
     def text(self) -> str:
         """Return the plan for people: what is done, what is skipped and why, error, and what it takes."""
@@ -121,7 +123,8 @@ class Plan:
             "takes": f"{human_time(self.seconds)}, {human_bytes(self.disk_bytes)} on disk, "
             f"{human_bytes(self.memory_bytes)} of memory, {self.n_rays / 1e6:.3g} M rays, {self.flops / 1e9:.2g} Gflop",
         }
-        return "\n".join(f"  {key:7s} {value}" for key, value in lines.items() if value)
+        told = [(key, value) for key, value in lines.items() if value] + [("note", note) for note in self.notes]
+        return "\n".join(f"  {key:7s} {value}" for key, value in told)
 
 
 def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth: Truth, stream_id: str) -> Plan:
@@ -138,7 +141,8 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
     rule = _rule(phantom, scanner, simulation, source, found.lengths)
     _check_bowtie(scanner, rule)
     twin = _has_twin(phantom, truth)
-    tried = trial(tracer, scanner.geometry, Response.of(rule, tracer.materials), settings=simulation, twin=twin)
+    seen = Response.of(rule, tracer.materials)
+    tried = trial(tracer, scanner.geometry, seen, settings=simulation, twin=twin)
     outputs = _outputs(phantom, scanner, truth, present)
     n_rays, n_voxels = int(np.prod(scanner.geometry.shape)), int(np.prod(scanner.geometry.n_voxel))
     draws = n_rays * (2 if twin else 1) * (scanner.noise.model != "none")
@@ -163,6 +167,7 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
         flops=float(n_rays) * len(rule.energies) * (2 * len(present) + 16),
         disk_bytes=disk,
         memory_bytes=_memory_bytes(phantom, scanner.geometry),
+        notes=metal_notes(phantom, scanner.geometry, seen, simulation.subrays),
     )
 
 

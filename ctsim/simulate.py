@@ -231,4 +231,4 @@ def scan_info(plan: Plan, phantom: Phantom, scanner: Scanner) -> dict:
         "scatter_fraction": plan.scatter_fraction,
         "materials": list(plan.materials),
         "metal": sorted({s.material for s in phantom.solids if s.metal}),
-    }
+    } | ({"notes": list(plan.notes)} if plan.notes else {})
