@@ -1,5 +1,6 @@
 """Scenes: pure recipes of a scan, read from TOML, hashed to an id, built into a phantom."""
 
+import functools
 import hashlib
 import re
 from pathlib import Path
@@ -41,15 +42,28 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise InputError(f"name: {self.name!r} is what the data folder's own index is called; expected another")
         if not 0 <= self.seed < 2**63:
             raise InputError(f"seed must be within 0 to 2^63 - 1, got {self.seed}")
-        try:
-            scanner = self.resolve()
-        except InputError as error:
-            raise InputError(f"scanner.{error}") from error
-        check_geometry(scanner.geometry, self.phantom.size, self.truncated)
+        _check_imaging(self.scanner, self.phantom.size, self.truncated)
 
     def resolve(self) -> Scanner:
         """Return the scanner with the preset and its overrides worked out."""
         return self.scanner.resolve(self.phantom.size)
+
+
+def _check_imaging(settings: ScannerSettings, size: float, truncated: bool) -> None:
+    """Refuse a scanner that cannot image an object of a cube of `size` mm; most scenes of a suite have the same."""
+    try:
+        _known_to_image(settings, size, truncated)
+    except TypeError:  # lists, which cannot be remembered, where a scene was not read from a file
+        _known_to_image.__wrapped__(settings, size, truncated)
+
+
+@functools.lru_cache(16)
+def _known_to_image(settings: ScannerSettings, size: float, truncated: bool) -> None:
+    try:
+        scanner = settings.resolve(size)
+    except InputError as error:
+        raise InputError(f"scanner.{error}") from error
+    check_geometry(scanner.geometry, size, truncated)
 
 
 def build(scene: Scene) -> Phantom:
@@ -71,12 +85,22 @@ def stream_id(scene: Scene) -> str:
 
 
 def _digest(scene: Scene, without: tuple[str, ...]) -> str:
-    # decoding turns 60 into 60.0 where a float is meant, so equal scenes have equal text
-    plain = msgspec.to_builtins(msgspec.convert(msgspec.to_builtins(scene), Scene))
-    kept = {k: v for k, v in plain.items() if k not in without}
+    # decoding turns 60 into 60.0 where a float is meant, so equal scenes have equal text; key by key, for the whole
+    # would be checked again, which takes a hundred times as long
+    kept = {
+        name: msgspec.to_builtins(msgspec.convert(msgspec.to_builtins(getattr(scene, name)), kind))
+        for name, kind in _kinds().items()
+        if name not in without
+    }
     if "sha256" in kept["phantom"]:  # the file is known by its content, wherever it lies
         del kept["phantom"]["path"]
     return hashlib.sha256(msgspec.json.encode(kept, order="deterministic")).hexdigest()[:12]
+
+
+@functools.cache
+def _kinds() -> dict[str, Any]:
+    """Return the types of a scene's keys, which takes longer to find out than to use."""
+    return {item.name: item.type for item in msgspec.structs.fields(Scene)}
 
 
 def scene_to_toml(scene: Scene) -> str:
