@@ -4,8 +4,6 @@ A method attaches them to its volume, `Volume(..., details={"intermediates": {"v
 kept beside the volume as NAME.npz and stand in no record. A method that attaches none is drawn without.
 """
 
-import contextlib
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.arrayfile import read_arrays
+from ctsim.durable import replacing
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 
@@ -56,15 +55,9 @@ def path_of(volume: Path) -> Path:
 def write(path: Path, found: Intermediates, identity: str) -> None:
     """Write intermediates with the identity of their run, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".part")
     arrays: dict[str, Any] = {**found, _RUN: np.array(identity)}
-    try:
-        with aside.open("wb") as file:
-            np.savez(file, **arrays)
-        os.replace(aside, path)
-    finally:
-        with contextlib.suppress(OSError):
-            aside.unlink(missing_ok=True)
+    with replacing(path) as new, new.open("wb") as file:
+        np.savez(file, **arrays)
 
 
 def read(path: Path, identity: str) -> Intermediates:

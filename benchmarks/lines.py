@@ -9,8 +9,9 @@ from typing import Protocol, TypeVar, cast
 
 import msgspec
 
-from ctsim.durable import append_synced, cut_torn, locked, write_synced
+from ctsim.durable import append_synced, cut_torn, write_synced
 from ctsim.errors import InputError
+from ctsim.locks import locked
 
 R = TypeVar("R", bound=msgspec.Struct)
 

@@ -232,7 +232,7 @@ def _make_apart(jobs: list[Job], pool: Pool) -> None:
 
 def do(job: Job) -> None:
     """Be the worker: make a scene unless it is there, after any process that makes it just now."""
-    from ctsim.durable import Busy
+    from ctsim.locks import Busy
     from ctsim.writer import is_complete
     from phantoms.scene import build, scene_id
 

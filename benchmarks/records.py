@@ -19,8 +19,9 @@ from benchmarks import lines
 from benchmarks.host import Host
 from benchmarks.methods import TABLE
 from benchmarks.protocol import VERSION, Score
-from ctsim.durable import append_synced, locked, write_synced
+from ctsim.durable import append_synced, write_synced
 from ctsim.errors import InputError
+from ctsim.locks import locked
 
 NAME, WHAT = "records.jsonl", "a record of run-benchmark"
 OK = "ok"

@@ -1,6 +1,5 @@
 """Kept reconstructions: TIFF stacks that name the run they came from."""
 
-import contextlib
 import json
 import os
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.durable import replacing
 from ctsim.errors import InputError
 from ctsim.tiffstack import write_all
 
@@ -20,23 +20,18 @@ def write_volume(path: Path, values: NDArray[np.float32], identity: str = "") ->
     import tifffile
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".part")
     text = {"axes": "ZYX", "unit": "1/mm", "run": identity}
-    try:
-        tifffile.imwrite(aside, shape=values.shape, dtype=np.float32, photometric="minisblack", metadata=text)
-        with tifffile.TiffFile(aside) as laid_out:
+    with replacing(path) as new:
+        tifffile.imwrite(new, shape=values.shape, dtype=np.float32, photometric="minisblack", metadata=text)
+        with tifffile.TiffFile(new) as laid_out:
             offset = laid_out.series[0].dataoffset
         if offset is None:
-            raise RuntimeError(f"{aside}: tifffile did not lay the volume out in one piece")
-        handle = os.open(aside, os.O_WRONLY)
+            raise RuntimeError(f"{new}: tifffile did not lay the volume out in one piece")
+        handle = os.open(new, os.O_WRONLY)
         try:
             write_all(handle, np.ascontiguousarray(values, np.float32), offset)  # says why a disk refuses
         finally:
             os.close(handle)
-        os.replace(aside, path)
-    finally:
-        with contextlib.suppress(OSError):
-            aside.unlink(missing_ok=True)
 
 
 def keep(path: Path, values: NDArray[np.float32], at_50kev: NDArray[np.float32] | None, identity: str) -> None:

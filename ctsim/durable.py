@@ -1,71 +1,27 @@
-"""Files that survive: locks between processes, flushing, and putting a finished folder in its place."""
+"""Files that survive: flushed, replaced whole, and finished folders put in their place.
+
+A file that is to replace another is written beside it, under a name that no other process uses, and renamed.
+"""
 
 import contextlib
 import ctypes
 import errno
-import fcntl
 import os
+import re
+import secrets
 import shutil
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from ctsim.errors import InputError
+from ctsim import process
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
-
-
-class Busy(InputError):
-    """Another process has the lock."""
-
-
-def lock(path: Path) -> int:
-    """Take the lock file `path` and return its handle; `unlock` gives it back.
-
-    Raises
-    ------
-    Busy
-        When another process has it.
-    """
-    while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            mine = os.fstat(handle)
-            if path.exists() and path.stat().st_ino == mine.st_ino:
-                return handle
-        except BlockingIOError:
-            os.close(handle)
-            scene = path.name.removeprefix(".").removesuffix(".lock")
-            raise Busy(f"{path.parent}: another process is writing the scene {scene!r}") from None
-        except BaseException:
-            os.close(handle)
-            raise
-        os.close(handle)  # its owner removed the file between our open and our lock
-
-
-def unlock(path: Path, handle: int) -> None:
-    """Remove the lock file while it is still held, then let go."""
-    path.unlink(missing_ok=True)
-    os.close(handle)
-
-
-@contextlib.contextmanager
-def locked(path: Path) -> Iterator[int]:
-    """Open a file of lines for appending, made if it is not there, alone among processes; yield its descriptor.
-
-    Whoever replaces the file whole holds it locked, too.
-    """
-    while True:
-        handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX)
-            if os.fstat(handle).st_ino == path.stat().st_ino:  # else it was replaced between our open and our lock
-                yield handle
-                return
-        finally:
-            os.close(handle)
+_NEW = re.compile(r"\..+\.([0-9a-f]{8})-([0-9]+)-[0-9a-f]{8}\.new", re.DOTALL)
+_SILENT = 86400.0  # seconds; a process of another machine that has not written for so long counts as ended
+_swept: set[tuple[int, str]] = set()
 
 
 def cut_torn(handle: int) -> None:
@@ -107,22 +63,58 @@ def sync_tree(folder: Path) -> None:
     sync(folder)
 
 
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a new, empty file beside `path`, which takes its place when the block ends, and is removed if it fails.
+
+    Processes that replace the same file do not meet: the last to end has its way. What killed ones left in the folder
+    is removed. Raises OSError with the name of `path` where it cannot be written.
+    """
+    known = (os.getpid(), str(path.parent))
+    if known not in _swept:
+        sweep(path.parent)
+        _swept.add(known)
+    # a name may have 255 bytes, four of them a letter; the whole of it is not needed
+    new = path.with_name(f".{path.name[:40]}.{process.machine()}-{os.getpid()}-{secrets.token_hex(4)}.new")
+    try:
+        os.close(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666))
+        yield new
+        new.replace(path)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            new.unlink()
+        if isinstance(error, OSError) and error.errno is not None and error.filename in (None, str(new)):
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
+
+
+def is_new(name: str) -> bool:
+    """Say whether a file's name is one that `replacing` makes."""
+    return _NEW.fullmatch(name) is not None
+
+
+def sweep(folder: Path) -> None:
+    """Remove the files that processes were writing when they were killed; those of processes that may run stay."""
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:  # whoever cannot read it, cannot write either
+        for entry in entries:
+            found = _NEW.fullmatch(entry.name)
+            if found is None:
+                continue
+            with contextlib.suppress(OSError):
+                elsewhere = found[1] != process.machine() and time.time() - entry.stat().st_mtime > _SILENT
+                if elsewhere or process.ended(found[1], int(found[2])):
+                    os.unlink(entry.path)
+
+
 def write_synced(path: Path, data: bytes) -> None:
     """Replace a small file whole: after a crash it holds the old or the new bytes.
 
     Raises OSError with its name where it cannot be written, and leaves nothing beside it.
     """
-    aside = path.with_name(path.name + ".new")
-    try:
-        with aside.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        aside.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            aside.unlink()
-        raise OSError(error.errno, error.strerror, str(path)) from error
+    with replacing(path) as new, new.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def put_in_place(new: Path, final: Path) -> None:

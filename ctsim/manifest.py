@@ -11,8 +11,9 @@ from pathlib import Path
 
 import msgspec
 
-from ctsim.durable import append_synced, cut_torn, locked, write_synced
+from ctsim.durable import append_synced, cut_torn, write_synced
 from ctsim.errors import InputError
+from ctsim.locks import locked
 
 MANIFEST = "manifest.json"
 INDEX = "index.jsonl"

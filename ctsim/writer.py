@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from ctsim import durable
 from ctsim import manifest as mf
 from ctsim.errors import InputError
+from ctsim.locks import Busy, Lock, lock
 from ctsim.tiffstack import create_stack, write_all, write_image
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -75,19 +76,15 @@ def is_complete(data_dir: str | Path, name: str, scene_id: str) -> bool:
 
 def _tidy(data_dir: Path, name: str) -> None:
     """Remove what a run killed after the rename left beside a finished scene, unless somebody writes it now."""
-    partial, lock = data_dir / f".{name}.partial", data_dir / f".{name}.lock"
+    partial, path = data_dir / f".{name}.partial", data_dir / f".{name}.lock"
     old = durable.aside(data_dir / name)
     replaced = partial.is_dir() and not (partial / mf.PROGRESS).exists()  # of --force: no note, nothing to go on from
-    if not (lock.exists() or replaced or old.exists()):
+    if not (path.exists() or replaced or old.exists()):
         return
-    with contextlib.suppress(durable.Busy):
-        handle = durable.lock(lock)
-        try:
-            durable.recover(data_dir / name)
-            if replaced:
-                shutil.rmtree(partial)
-        finally:
-            durable.unlock(lock, handle)
+    with contextlib.suppress(Busy), lock(path, f"the scene {name!r}"):
+        durable.recover(data_dir / name)
+        if replaced:
+            shutil.rmtree(partial)
 
 
 def views_noted(data_dir: Path) -> dict[str, int]:
@@ -137,7 +134,7 @@ class SceneWriter:
         self._offsets: dict[str, int] = {}
         self._arrays: dict[str, tuple[tuple[int, ...], str, int]] = {}
         self._lock_path = self.data_dir / f".{name}.lock"
-        self._lock = -1
+        self._lock: Lock | None = None
 
     def __enter__(self) -> Self:
         with self._full_disk():
@@ -145,7 +142,7 @@ class SceneWriter:
                 self.data_dir.mkdir(parents=True, exist_ok=True)
             except FileExistsError:
                 raise InputError(f"{self.data_dir}: is a file, expected a folder") from None
-            self._lock = durable.lock(self._lock_path)
+            self._lock = lock(self._lock_path, f"the scene {self.name!r}")
             try:
                 self._begin()
             except BaseException:
@@ -234,6 +231,9 @@ class SceneWriter:
         else:
             self._offsets = known.offsets
             self.first_view = self._views = self._safe = known.views
+            for path in self._partial.iterdir():
+                if durable.is_new(path.name):  # whoever wrote it does not have the lock any more
+                    path.unlink()
         for stack in self.stacks:
             self._files[stack.name] = os.open(self._partial / f"{stack.name}.tif", os.O_RDWR)
 
@@ -310,6 +310,6 @@ class SceneWriter:
         for handle in self._files.values():
             os.close(handle)
         self._files = {}
-        if self._lock >= 0:
-            durable.unlock(self._lock_path, self._lock)
-            self._lock = -1
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None

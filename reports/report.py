@@ -3,7 +3,6 @@
 Computes no score: tables come from the records, slices from the kept volumes and the dataset they were measured on.
 """
 
-import contextlib
 import datetime
 import logging
 import shlex
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from ctsim.durable import replacing
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:
@@ -57,13 +57,8 @@ def main(arguments: list[str]) -> int:
 def _write(path: Path, text: str) -> None:
     """Write a file whole and say how large it is."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".part")
-    try:
-        aside.write_text(text, encoding="utf-8")
-        aside.replace(path)
-    finally:
-        with contextlib.suppress(OSError):
-            aside.unlink(missing_ok=True)
+    with replacing(path) as new:
+        new.write_text(text, encoding="utf-8")
     sys.stdout.write(f"Written: {path} ({path.stat().st_size / 1e6:.1f} MB)\n")
 
 

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.durable import write_synced
+from ctsim.durable import sweep, write_synced
 from ctsim.errors import InputError
 from ctsim.types import Scan
 
@@ -72,8 +72,9 @@ class Checkpoint:
         return InputError(f"checkpoint {self.path} is damaged ({why}): delete it to start anew")
 
     def remove(self) -> None:
-        """Delete the file, if there is one."""
+        """Delete the file, if there is one, and what a run left that was killed while it wrote one."""
         self.path.unlink(missing_ok=True)
+        sweep(self.folder)
 
 
 def identity_of(scan: Scan, settings: object) -> str:
