@@ -129,6 +129,7 @@ def _compute(given: Arguments) -> int:
     methods, scans = _methods(given), _scans(given)
     names = frozenset(given.scene or (s.name for s in scans))
     _warn([s for s in scans if s.name in names])
+    _warn_of_mixture(given.data, names)
     listed = [task for task in run.tasks(scans, methods, options) if task.stored.name in names]
     left = run.pending(listed, given.results, given.force)
     costs = schedule.Costs(records.read_all(given.results)[0])
@@ -216,6 +217,15 @@ def _warn(scans: "list[Stored]") -> None:
     for note, names in found.items():
         more = f" and {len(names) - FEW} more" if len(names) > FEW else ""
         log.warning("%s%s: %s", ", ".join(names[:FEW]), more, note)
+
+
+def _warn_of_mixture(data: Path, names: frozenset[str]) -> None:
+    """Say where the scans that one table compares were made by different code of the simulator."""
+    from ctsim.folder import mixture
+    from ctsim.manifest import read_index
+
+    if text := mixture(line for line in read_index(data).values() if line.name in names):
+        log.warning("%s: %s", data, text)
 
 
 def _report(found: "list[Record]", scans: "list[Stored]", results: Path) -> None:

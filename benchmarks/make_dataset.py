@@ -1,18 +1,17 @@
 """make-dataset: from scene recipes to scans on disk, resumable at any moment."""
 
-import contextlib
 import dataclasses
 import shutil
 import sys
 import time
 import tomllib
-from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from benchmarks.make_scene import make_scene, memory, say
 from benchmarks.workers import TICK, Lost, Pool, open_pool
 from ctsim.errors import InputError
 from ctsim.human import human_bytes, human_choice, human_time
@@ -20,6 +19,7 @@ from ctsim.human import human_bytes, human_choice, human_time
 if TYPE_CHECKING:
     from importlib.resources.abc import Traversable
 
+    from ctsim.manifest import Manifest
     from ctsim.plan import Plan
     from ctsim.types import Phantom, Scanner
     from phantoms.scene import Scene
@@ -32,7 +32,8 @@ _SPARE = 64 * 2**20  # bytes left free for the file system's own needs
 class Options:
     """Simulate the scans of a suite, with their ground truth, into a data folder.
 
-    An interrupted run goes on where it stopped when it is started again; finished scenes are skipped.
+    An interrupted run goes on where it stopped when it is started again; finished scenes are skipped. Those that
+    other code of the simulator made are named; an unfinished one is begun anew.
     """
 
     suite: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SUITE")]
@@ -66,10 +67,10 @@ def main(argv: list[str]) -> int:
         scenes = select(load(options.suite), options.only, options.seeds)
         return _dry_run(scenes, options) if options.dry_run else _make(scenes, options.out, options)
     except (InputError, OSError, tomllib.TOMLDecodeError) as error:
-        _say(f"make-dataset: {_sentence(error)}")
+        say(f"make-dataset: {_sentence(error)}")
         return 2
     except KeyboardInterrupt:
-        _say("make-dataset: interrupted; the same command goes on from here")
+        say("make-dataset: interrupted; the same command goes on from here")
         return 130
 
 
@@ -116,11 +117,12 @@ def select(scenes: "tuple[Scene, ...]", only: tuple[str, ...], seeds: tuple[int,
 
 
 def _verify(data_dir: Path) -> int:
+    from ctsim.folder import remarks
     from ctsim.manifest import read_index, verify
 
     problems = verify(data_dir)
-    for problem in problems:
-        _say(problem)
+    for text in [*problems, *remarks(data_dir)]:
+        say(text)
     if not problems:
         sys.stdout.write(f"{data_dir}: {len(read_index(data_dir))} scenes, every file is as it was written\n")
     return 2 if problems else 0
@@ -130,37 +132,54 @@ def _plan(scene: "Scene") -> "tuple[Plan, Phantom, Scanner]":
     from ctsim.plan import make_plan
     from phantoms.scene import build, stream_id
 
-    with _memory(scene.name):
+    with memory(scene.name):
         phantom, scanner = build(scene), scene.resolve()
         return make_plan(phantom, scanner, scene.simulation, scene.truth, stream_id(scene)), phantom, scanner
 
 
-@contextlib.contextmanager
-def _memory(name: str) -> Iterator[None]:
-    """Turn a lack of memory into the user's error that names the scene."""
-    try:
-        yield
-    except MemoryError as error:
-        raise InputError(
-            f"{name}: there is not enough memory ({error or 'no size is known'}); expected a smaller "
-            "phantom.n_voxel, scanner.n_voxel or scanner.n_detector"
-        ) from error
-
-
 def _dry_run(scenes: "tuple[Scene, ...]", options: Options) -> int:
-    from ctsim.writer import is_complete
-    from phantoms.scene import scene_id
-
+    there = {} if options.out is None else _finished(scenes, options.out, options.force)
     seconds, size = 0.0, 0
     for scene in scenes:
-        if options.out and not options.force and is_complete(options.out, scene.name, scene_id(scene)):
-            sys.stdout.write(f"{scene.name}: already complete\n")
+        if scene.name in there:
+            sys.stdout.write(f"{_complete(there[scene.name])}\n")
             continue
         plan, *_ = _plan(scene)
         sys.stdout.write(f"{scene.name}\n{plan.text()}\n")
         seconds, size = seconds + plan.seconds, size + plan.disk_bytes
     sys.stdout.write(f"total: {human_time(seconds)}, {human_bytes(size)} on disk\n")
+    for text in _of_other_code(scenes, there, options.out):
+        sys.stdout.write(f"{text}\n")
     return 0
+
+
+def _finished(scenes: "tuple[Scene, ...]", out: Path, force: bool) -> "dict[str, Manifest]":
+    """Return the manifests of the scenes that are there and stay, by name; reads only."""
+    from ctsim.folder import finished
+    from phantoms.scene import scene_id
+
+    found = {} if force else {s.name: finished(out, s.name, scene_id(s)) for s in scenes}
+    return {name: manifest for name, manifest in found.items() if manifest is not None}
+
+
+def _complete(manifest: "Manifest") -> str:
+    from ctsim.sources import source_hash
+
+    return f"{manifest.name}: already complete" + (", by other code" if manifest.code != source_hash() else "")
+
+
+def _of_other_code(scenes: "tuple[Scene, ...]", there: "dict[str, Manifest]", out: Path | None) -> list[str]:
+    """Say what other code of the simulator made: finished scenes, which stay, and unfinished ones, which do not."""
+    from ctsim.folder import listing, other_code, unfinished
+    from ctsim.sources import source_hash
+
+    code = source_hash()
+    said = [other_code([m for m in there.values() if m.code != code], len(there))]
+    left = unfinished(out) if out else {}
+    anew = [s.name for s in scenes if s.name not in there and s.name in left and left[s.name].code != code]
+    if anew:
+        said.append(f"begun by other code of the simulator, so they begin anew: {listing(anew)}")
+    return [text for text in said if text]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -171,40 +190,59 @@ class Job:
     plan: "Plan"
     out: Path
     force: bool
+    code: str
 
 
 def _make(scenes: "tuple[Scene, ...]", out: Path, options: Options) -> int:
-    from ctsim.manifest import arrange_index
-    from ctsim.writer import is_complete
-    from phantoms.scene import scene_id
+    from ctsim.folder import recover, tidy
+    from ctsim.manifest import mend_index
+    from ctsim.sources import source_hash
 
+    source_hash()  # of the code that is loaded, whatever becomes of its files meanwhile
+    recover(out)
     # what is in the way shows before the first hour is spent, not after it
-    todo = [s for s in scenes if options.force or not is_complete(out, s.name, scene_id(s))]
-    for scene in scenes:
-        if scene not in todo:
-            _say(f"{scene.name}: already complete")
-    with open_pool(options.workers, options.scheduler) as pool:
-        plans = {scene.name: _plan(scene)[0] for scene in todo}  # all phantoms could be more than memory holds
-        for name, plan in plans.items():
-            for note in plan.notes:
-                _say(f"{name}: {note}")
-        _check_space(out, sum(plan.disk_bytes for plan in plans.values()))
-        if pool:
-            where = out.resolve()
-            _make_apart([Job(scene=s, plan=plans[s.name], out=where, force=options.force) for s in todo], pool)
-        else:
-            _make_here(todo, plans, out, options.force)
-    arrange_index(out, [scene.name for scene in scenes])
+    there = _finished(scenes, out, options.force)
+    for manifest in there.values():
+        say(_complete(manifest))
+    for text in [*_of_other_code(scenes, there, out), *tidy(out, there.values())]:
+        say(text)
+    if todo := [scene for scene in scenes if scene.name not in there]:
+        _make_all(todo, out, options)
+        there = _finished(scenes, out, force=False)
+        tidy(out, there.values())  # after workers that were killed when their scene was in place
+    mend_index(out, list(there.values()), [scene.name for scene in scenes])
     return 0
 
 
+def _make_all(scenes: "list[Scene]", out: Path, options: Options) -> None:
+    """Plan the scenes, then make them here or on workers."""
+    from ctsim.sources import source_hash
+
+    with open_pool(options.workers, options.scheduler) as pool:
+        plans = {scene.name: _plan(scene)[0] for scene in scenes}  # all phantoms could be more than memory holds
+        for name, plan in plans.items():
+            for note in plan.notes:
+                say(f"{name}: {note}")
+        _check_space(out, plans)
+        if pool is None:
+            _make_here(scenes, plans, out, options.force)
+            return
+        where, code = out.resolve(), source_hash()
+        jobs = [Job(scene=s, plan=plans[s.name], out=where, force=options.force, code=code) for s in scenes]
+        _make_apart(jobs, pool)
+
+
 def _make_here(scenes: "list[Scene]", plans: "dict[str, Plan]", out: Path, force: bool) -> None:
-    """Make scenes one after another in this process."""
-    from phantoms.scene import build
+    """Make scenes one after another in this process; one that another process has finished meanwhile is there."""
+    from ctsim.folder import is_complete
+    from phantoms.scene import build, scene_id
 
     for number, scene in enumerate(scenes, 1):
+        if not force and is_complete(out, scene.name, scene_id(scene)):
+            say(f"{scene.name}: already complete")
+            continue
         title = f"{number}/{len(scenes)} {scene.name}"
-        with _memory(scene.name):
+        with memory(scene.name):
             make_scene(scene, plans[scene.name], (build(scene), scene.resolve()), out, force=force, title=title)
 
 
@@ -212,7 +250,7 @@ def _make_apart(jobs: list[Job], pool: Pool) -> None:
     """Make scenes on workers behind one progress bar, which follows the views that the workers noted as safe."""
     from tqdm import tqdm
 
-    from ctsim.writer import views_noted
+    from ctsim.folder import unfinished
 
     views = [job.scene.resolve().geometry.n_views for job in jobs]
     left = set(range(len(jobs)))
@@ -225,129 +263,53 @@ def _make_apart(jobs: list[Job], pool: Pool) -> None:
                     raise InputError(f"{name}: {end.reason}, as happens when memory is short; expected fewer workers")
                 left.discard(number)
                 bar.set_description(f"{len(jobs) - len(left)}/{len(jobs)} {name}")
-            noted = views_noted(jobs[0].out)
+            noted = {name: progress.views for name, progress in unfinished(jobs[0].out).items()}
             bar.n = sum(noted.get(jobs[k].scene.name, 0) if k in left else n for k, n in enumerate(views))
             bar.refresh()
 
 
 def do(job: Job) -> None:
-    """Be the worker: make a scene unless it is there, after any process that makes it just now."""
-    from ctsim.locks import Busy
-    from ctsim.writer import is_complete
+    """Be the worker: make a scene unless it is there, after any process that makes it just now.
+
+    Raises InputError where this process has other code than the command, whose plan it is, and where the scene's lock
+    stays that a process of another machine has, which may have been killed.
+    """
+    from ctsim.folder import is_complete
+    from ctsim.locks import PATIENCE, Busy
+    from ctsim.sources import source_hash
     from phantoms.scene import build, scene_id
 
-    name = job.scene.name
+    name, waited = job.scene.name, 0.0
+    if source_hash() != job.code:
+        raise InputError(f"{name}: a worker runs other code of the simulator than make-dataset; start the workers anew")
     while job.force or not is_complete(job.out, name, scene_id(job.scene)):
-        with contextlib.suppress(Busy), _memory(name):
-            make_scene(
-                job.scene, job.plan, (build(job.scene), job.scene.resolve()), job.out, force=job.force, title=None
-            )
+        try:
+            with memory(name):
+                parts = build(job.scene), job.scene.resolve()
+                make_scene(job.scene, job.plan, parts, job.out, force=job.force, title=None)
             return
+        except Busy as error:
+            if not error.certain and waited >= PATIENCE:
+                raise
         time.sleep(TICK)  # a worker that was thought lost may still be at it
+        waited += TICK
 
 
-def make_scene(
-    scene: "Scene",
-    plan: "Plan",
-    parts: "tuple[Phantom, Scanner]",
-    out: Path,
-    *,
-    force: bool = False,
-    title: str | None = "",
-) -> Path:
-    """Simulate one scene into `out`, going on from where an earlier run stopped; return its folder.
+def _check_space(out: Path, plans: "dict[str, Plan]") -> None:
+    """Refuse scenes that have no room, counting what unfinished ones have taken already."""
+    from ctsim.folder import partial_of
 
-    Its progress is shown under `title`, not at all where that is None.
-
-    Raises
-    ------
-    InputError
-        When another scene is in the way or the disk is full.
-    """
-    from ctsim.simulate import scan_info, simulate_views, truth_volumes
-    from ctsim.writer import SceneWriter, Stack
-    from phantoms.scene import scene_id, scene_to_toml
-
-    phantom, scanner = parts
-    geometry = scanner.geometry
-    stacks = tuple(
-        Stack(name=o.name, shape=(geometry.n_views, *o.shape), dtype=o.dtype, pixel=geometry.d_detector)
-        for o in plan.outputs
-    )
-    with SceneWriter(
-        out, scene.name, scene_id=scene_id(scene), plan_hash=plan_hash(plan), stacks=stacks, force=force
-    ) as writer:
-        if writer.first_view and title is not None:
-            _say(f"{scene.name}: goes on from view {writer.first_view} of {geometry.n_views}")
-        views = simulate_views(plan, phantom, scanner, first_view=writer.first_view)
-        shown = title if title is None else title or scene.name
-        for view, arrays in _progress(views, writer.first_view, geometry.n_views, shown):
-            writer.put(view, arrays)
-        info = dict(scan_info(plan, phantom, scanner))
-        writer.write_image("flat", info.pop("flat"), geometry.d_detector)
-        for name, volume in truth_volumes(plan, phantom, scanner):
-            writer.write_image(name, volume, geometry.d_voxel)
-        writer.write_text("scene.toml", scene_to_toml(scene))
-        writer.write_text("scan.json", _json(info))
-        writer.write_text("plan.json", _json(plan.to_dict()))
-        writer.write_text("spectrum.csv", spectrum_csv(scanner))
-        return writer.finish()
-
-
-def plan_hash(plan: "Plan") -> str:
-    """Hash what a plan does, leaving out its estimates of time, which change with the machine."""
-    import hashlib
-
-    kept = {k: v for k, v in plan.to_dict().items() if k != "seconds"}
-    return hashlib.sha256(_json(kept)).hexdigest()
-
-
-def spectrum_csv(scanner: "Scanner") -> str:
-    """Return the tube's spectrum and what the detector makes of it as CSV."""
-    from ctsim.detector import response
-    from ctsim.spectrum import spectrum
-
-    tube = spectrum(scanner.tube)
-    signal = tube.weights * response(scanner.detector, tube.energies)[0]
-    signal = signal / signal.sum()
-    rows = zip(tube.energies, tube.weights, signal, strict=True)
-    return "energy_kev,photon_fraction,signal_fraction\n" + "".join(f"{e:.4f},{w:.8g},{s:.8g}\n" for e, w, s in rows)
-
-
-def _check_space(out: Path, need: int) -> None:
+    need = sum(plan.disk_bytes for plan in plans.values())
     folder = out.absolute()
     while not folder.exists():
         folder = folder.parent
-    unfinished = sum(p.stat().st_blocks * 512 for p in out.glob(".*.partial/**/*.tif")) if out.is_dir() else 0
-    free = shutil.disk_usage(folder).free + unfinished
+    begun = (path for name in plans for path in partial_of(out, name).glob("**/*.tif"))
+    free = shutil.disk_usage(folder).free + sum(path.stat().st_blocks * 512 for path in begun)
     if need + _SPARE > free:
         raise InputError(f"{out}: the dataset needs {human_bytes(need)} but only {human_bytes(free)} are free")
-
-
-def _progress(views: Iterator[Any], first: int, n_views: int, title: str | None) -> Iterator[Any]:
-    from tqdm import tqdm
-
-    hidden = True if title is None else None  # None: hidden where nobody watches
-    return iter(tqdm(views, title, n_views, initial=first, unit="view", disable=hidden, file=sys.stderr))
-
-
-def _json(value: Any) -> bytes:
-    import msgspec
-    import numpy as np
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, np.ndarray | np.generic):
-            return value.tolist()
-        raise TypeError(f"{type(value).__name__} cannot be written as JSON")
-
-    return msgspec.json.format(msgspec.json.encode(value, enc_hook=plain), indent=1) + b"\n"
 
 
 def _sentence(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename or 'file system'}: {error.strerror}"
     return " ".join(str(error).split())
-
-
-def _say(text: str) -> None:
-    sys.stderr.write(text + "\n")

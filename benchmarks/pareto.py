@@ -223,7 +223,7 @@ def _dry_run(given: Arguments, suite: "Suite", wanted: dict[Part, list[str]]) ->
 def _planned(given: Arguments, suite: "Suite", part: Part, scene: str) -> list[tuple[str, str, float]]:
     """Return (curve, identity, seconds of a run) of a scene's settings; a scan that is not made has no identity."""
     from benchmarks import estimates, make_dataset, pareto_methods, pareto_simulator
-    from ctsim.writer import is_complete
+    from ctsim.folder import is_complete
     from phantoms.scene import scene_id
 
     if part == "simulator":

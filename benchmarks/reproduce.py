@@ -104,7 +104,7 @@ def _dry_run(given: Arguments) -> int:
     """Print the plans of scans to make, the runs on those that are there, and what runs on the others will take."""
     from benchmarks import cli_run, costs, make_dataset, records
     from benchmarks.schedule import Costs
-    from ctsim.writer import is_complete
+    from ctsim.folder import is_complete
     from phantoms.scene import scene_id
 
     if code := make_dataset.main([*_scans_of(given), "--dry-run"]):

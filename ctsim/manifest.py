@@ -1,12 +1,15 @@
 """What a data folder holds and whether it is still what was written: manifests, the index, verification.
 
 Every scene folder has a `manifest.json` with the size and SHA-256 of each of its files; the data folder
-has an `index.jsonl` with one line per finished scene (the last line of a name counts).
+has an `index.jsonl` with one line per finished scene (the last line of a name counts). Both say which code made
+the scene. Names in them are joined to paths, so one that leaves its folder is refused.
 """
 
 import hashlib
 import math
-from collections.abc import Iterable, Sequence
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -19,9 +22,11 @@ MANIFEST = "manifest.json"
 INDEX = "index.jsonl"
 PROGRESS = ".progress.json"
 OWN = (MANIFEST, PROGRESS, f"{PROGRESS}.new")  # our own notes, in no manifest
-FORMAT = 2
+FORMAT, WITHOUT_CODE = 3, 2  # the format that is written; the older one that is read, too
 DTYPES = ("uint8", "uint16", "uint32", "int8", "int16", "int32", "float32", "float64")
 _NOT_CONTENT = ("plan.json",)  # estimates of time and disk are no part of what a method sees
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,99}")
+_FILE = re.compile(rf"{_NAME.pattern}(?:/{_NAME.pattern})*")
 
 
 class FileEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -35,7 +40,10 @@ class FileEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """All files of one finished scene by their path inside its folder."""
+    """All files of one finished scene by their path inside its folder.
+
+    `code` is the `ctsim.sources.source_hash` of what made it, empty in the format `WITHOUT_CODE`.
+    """
 
     format: int
     name: str
@@ -43,14 +51,25 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     plan_hash: str
     content_hash: str
     files: dict[str, FileEntry]
+    code: str = ""
 
 
-class IndexLine(msgspec.Struct, frozen=True, kw_only=True):
-    """One finished scene in the index."""
+class IndexLine(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One finished scene in the index; `code` as in its manifest."""
 
     name: str
     scene_id: str
     content_hash: str
+    code: str = ""
+
+
+class _Format(msgspec.Struct):
+    format: int
+
+
+def is_name(name: str) -> bool:
+    """Say whether a scene can have this name, which is its folder's."""
+    return _NAME.fullmatch(name) is not None and not is_reserved(name)
 
 
 def is_reserved(name: str) -> bool:
@@ -80,16 +99,36 @@ def read_manifest(folder: Path) -> Manifest:
     """
     path = folder / MANIFEST
     try:
-        manifest = msgspec.json.decode(path.read_bytes(), type=Manifest)
+        data = path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
         if not folder.is_dir():
             raise InputError(f"{folder}: no such scene folder") from None
         raise InputError(f"{folder}: not a finished scene, {MANIFEST} is missing (was it interrupted?)") from None
+    try:
+        manifest = msgspec.json.decode(data, type=Manifest)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        _check_format(path, data)
         raise InputError(f"{path}: damaged manifest ({error})") from None
-    if manifest.format != FORMAT:
-        raise InputError(f"{path}: format {manifest.format}, this version reads format {FORMAT}")
+    _check_format(path, data, manifest)
+    if bool(manifest.code) != (manifest.format > WITHOUT_CODE):
+        raise InputError(f"{path}: damaged manifest (format {manifest.format} with the code {manifest.code!r})")
+    own = folder.name if manifest.name == folder.name else os.path.basename(os.path.abspath(folder))
+    if manifest.name != own or not is_name(own):
+        raise InputError(f"{path}: names the scene {manifest.name!r}, expected its folder's name, {own!r}")
+    for name in manifest.files:
+        if not _FILE.fullmatch(name):
+            raise InputError(f"{path}: names the file {name!r}, expected a path within the scene's folder")
     return manifest
+
+
+def _check_format(path: Path, data: bytes, manifest: Manifest | None = None) -> None:
+    """Refuse another format, also one that has other keys than a `Manifest`."""
+    try:
+        found = (manifest or msgspec.json.decode(data, type=_Format)).format
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        return  # damaged
+    if found not in (FORMAT, WITHOUT_CODE):
+        raise InputError(f"{path}: format {found}, this version reads the formats {WITHOUT_CODE} and {FORMAT}")
 
 
 def read_index(data_dir: Path) -> dict[str, IndexLine]:
@@ -115,30 +154,58 @@ def read_index(data_dir: Path) -> dict[str, IndexLine]:
             if number == len(lines):
                 continue  # no newline: an append that was cut off, repeated by the next run
             raise InputError(f"{path}: line {number} is damaged ({error})") from None
+        if not is_name(entry.name):
+            raise InputError(
+                f"{path}: line {number} names the scene {entry.name!r}, expected a folder's name of letters, digits "
+                "and ._+-"
+            )
         found[entry.name] = entry
     return found
 
 
-def append_index(data_dir: Path, entry: IndexLine) -> None:
-    """Append a line to the index unless it is already the last word on that name."""
-    line = msgspec.json.encode(entry) + b"\n"
+def append_index(data_dir: Path, *manifests: Manifest) -> None:
+    """Append the lines of finished scenes to the index, those apart that are already the last word on their name."""
+    entries = [IndexLine(name=m.name, scene_id=m.scene_id, content_hash=m.content_hash, code=m.code) for m in manifests]
     with locked(data_dir / INDEX) as handle:
         cut_torn(handle)
-        if read_index(data_dir).get(entry.name) != entry:
-            append_synced(data_dir / INDEX, handle, line)
-
-
-def arrange_index(data_dir: Path, names: Sequence[str]) -> None:
-    """Put the lines of `names` into that order, whatever order their scenes were finished in; others keep their place.
-
-    Tables show scenes in the index's order, which so does not depend on which worker was faster.
-    """
-    with locked(data_dir / INDEX):
         index = read_index(data_dir)
-        inner = iter([name for name in names if name in index])
-        ordered = [next(inner) if name in names else name for name in index]
-        if ordered != list(index):
-            write_synced(data_dir / INDEX, b"".join(msgspec.json.encode(index[name]) + b"\n" for name in ordered))
+        new = [msgspec.json.encode(entry) + b"\n" for entry in entries if index.get(entry.name) != entry]
+        append_synced(data_dir / INDEX, handle, b"".join(new))
+
+
+def mend_index(data_dir: Path, manifests: Sequence[Manifest], names: Sequence[str]) -> None:
+    """List these finished scenes where the index lacks them, and put the lines of `names` into that order.
+
+    Others keep their place. Tables show scenes in the index's order, which so does not depend on which worker was
+    faster. An index in order is only read, once.
+    """
+    try:
+        index = read_index(data_dir)
+    except InputError:
+        if (data_dir / INDEX).exists():
+            raise
+        index = {}
+    if lacking := [m for m in manifests if not is_listed(m, index)]:
+        append_index(data_dir, *lacking)
+        index = read_index(data_dir)
+    if _arranged(index, names) != list(index):
+        with locked(data_dir / INDEX):
+            index = read_index(data_dir)
+            lines = (msgspec.json.encode(index[name]) + b"\n" for name in _arranged(index, names))
+            write_synced(data_dir / INDEX, b"".join(lines))
+
+
+def is_listed(manifest: Manifest, index: Mapping[str, IndexLine]) -> bool:
+    """Say whether the index names this very scan."""
+    line = index.get(manifest.name)
+    held = (manifest.scene_id, manifest.content_hash, manifest.code)
+    return line is not None and (line.scene_id, line.content_hash, line.code) == held
+
+
+def _arranged(index: Mapping[str, IndexLine], names: Sequence[str]) -> list[str]:
+    """Return the names of the index, those of `names` in that order in the places that they have together."""
+    inner, chosen = iter([name for name in names if name in index]), set(names)
+    return [next(inner) if name in chosen else name for name in index]
 
 
 def list_scans(data_dir: str | Path) -> tuple[Path, ...]:
@@ -193,9 +260,12 @@ def verify_scene(folder: str | Path) -> list[str]:
     """List everything that differs from what was written: missing, truncated, changed and extra files."""
     folder = Path(folder)
     try:
-        manifest = read_manifest(folder)
+        return _differing(folder, read_manifest(folder))
     except InputError as error:
         return [str(error)]
+
+
+def _differing(folder: Path, manifest: Manifest) -> list[str]:
     problems = check_sizes(folder, manifest)
     for name, entry in manifest.files.items():
         path = folder / name
@@ -227,14 +297,19 @@ def verify(data_dir: str | Path) -> list[str]:
         if not folder.is_dir():
             problems.append(f"{folder}: missing, though {INDEX} names it")
             continue
-        found = verify_scene(folder)
+        try:
+            manifest = read_manifest(folder)
+        except InputError as error:
+            problems.append(str(error))
+            continue
+        problems += _differing(folder, manifest)
         if name not in index:
-            found.append(f"{folder}: not in {INDEX}")
-        elif not found and read_manifest(folder).content_hash != index[name].content_hash:
-            found.append(f"{folder}: its content is not the one that {INDEX} names")
-        problems += found
-    unfinished = sorted(data_dir.glob(".*.partial"))
-    problems += [f"{p}: unfinished, make the scene again to go on from there" for p in unfinished]
+            problems.append(f"{folder}: not in {INDEX}")
+        elif not is_listed(manifest, index):
+            problems.append(f"{folder}: its content is not the one that {INDEX} names")
+    for partial in sorted(data_dir.glob(".*.partial")):
+        if not (data_dir / partial.name[1:].removesuffix(".partial")).is_dir():  # else see `ctsim.folder.remarks`
+            problems.append(f"{partial}: unfinished, make the scene again to go on from there")
     return problems
 
 

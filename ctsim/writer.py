@@ -2,15 +2,14 @@
 
 A scene is written into `DATA/.NAME.partial/`. Stacks are uncompressed TIFF files of full size from the
 start; views are written at their offset as they are made, so memory does not grow with their number.
-After every few seconds the data are flushed and the number of safe views is noted; an interrupted run
-goes on from there. When all is written the files are hashed, flushed and the folder is renamed to
-`DATA/NAME`: it appears whole or not at all. Row 0 of an image is the bottom of the detector.
+After every few seconds the data are flushed and the number of safe views is noted; an interrupted run of
+the same code goes on from there. When all is written the files are hashed, flushed and the folder is
+renamed to `DATA/NAME`: it appears whole or not at all. Row 0 of an image is the bottom of the detector.
 """
 
 import contextlib
 import errno
 import os
-import re
 import shutil
 import time
 from collections.abc import Iterator, Mapping
@@ -25,11 +24,14 @@ from numpy.typing import NDArray
 from ctsim import durable
 from ctsim import manifest as mf
 from ctsim.errors import InputError
-from ctsim.locks import Busy, Lock, lock
+from ctsim.folder import Progress, is_complete, lock_of, partial_of, read_progress
+from ctsim.locks import Lock
+from ctsim.sources import source_hash
 from ctsim.tiffstack import create_stack, write_all, write_image
 
+__all__ = ["SceneWriter", "Stack", "is_complete"]
+
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,99}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,65 +44,11 @@ class Stack:
     pixel: tuple[float, float] = (1.0, 1.0)
 
 
-class _Progress(msgspec.Struct, frozen=True, kw_only=True):
-    scene_id: str
-    plan_hash: str
-    views: int
-    offsets: dict[str, int]
-
-
-def is_complete(data_dir: str | Path, name: str, scene_id: str) -> bool:
-    """Say whether this very scene is already there, finished.
-
-    Raises
-    ------
-    InputError
-        When the folder of that name holds something else.
-    """
-    folder = Path(data_dir) / name
-    if not folder.exists():
-        return False
-    found = mf.read_manifest(folder)
-    if found.scene_id != scene_id:
-        raise InputError(
-            f"{folder}: holds another scene ({found.scene_id[:12]}, expected {scene_id[:12]}); "
-            "choose another folder or replace it with --force"
-        )
-    # the run that wrote it may have ended between the rename and the index
-    (folder / mf.PROGRESS).unlink(missing_ok=True)
-    _tidy(Path(data_dir), name)
-    line = mf.IndexLine(name=name, scene_id=scene_id, content_hash=found.content_hash)
-    mf.append_index(Path(data_dir), line)
-    return True
-
-
-def _tidy(data_dir: Path, name: str) -> None:
-    """Remove what a run killed after the rename left beside a finished scene, unless somebody writes it now."""
-    partial, path = data_dir / f".{name}.partial", data_dir / f".{name}.lock"
-    old = durable.aside(data_dir / name)
-    replaced = partial.is_dir() and not (partial / mf.PROGRESS).exists()  # of --force: no note, nothing to go on from
-    if not (path.exists() or replaced or old.exists()):
-        return
-    with contextlib.suppress(Busy), lock(path, f"the scene {name!r}"):
-        durable.recover(data_dir / name)
-        if replaced:
-            shutil.rmtree(partial)
-
-
-def views_noted(data_dir: Path) -> dict[str, int]:
-    """Return how many views are safe on the disk of each unfinished scene that has noted any, by name."""
-    found = {}
-    for folder in data_dir.glob(".*.partial"):
-        with contextlib.suppress(OSError, msgspec.DecodeError, UnicodeDecodeError):
-            note = msgspec.json.decode((folder / mf.PROGRESS).read_bytes(), type=_Progress)
-            found[folder.name.removeprefix(".").removesuffix(".partial")] = note.views
-    return found
-
-
 class SceneWriter:
     """Writes one scene; a context manager that holds the scene's lock.
 
-    `first_view` is the view to go on from. Leaving the context without `finish` keeps what is there.
+    `first_view` is the view to go on from. Leaving the context without `finish` keeps what is there. What other
+    code began is begun anew.
 
     Raises
     ------
@@ -120,20 +68,19 @@ class SceneWriter:
         force: bool = False,
         sync_seconds: float = 5.0,
     ) -> None:
-        if not _NAME.fullmatch(name):
-            raise InputError(f"scene name {name!r}: expected letters, digits and ._+- and no leading dot")
-        if mf.is_reserved(name):
-            raise InputError(f"scene name {name!r}: is what the data folder's own index is called; expected another")
+        if not mf.is_name(name):
+            raise InputError(
+                f"scene name {name!r}: expected letters, digits and ._+-, no leading dot, and not {mf.INDEX}"
+            )
         self.data_dir, self.name, self.force = Path(data_dir), name, force
         self.scene_id, self.plan_hash, self.stacks = scene_id, plan_hash, stacks
         self.n_views = stacks[0].shape[0] if stacks else 0
         self.first_view = self._views = self._safe = 0
-        self._partial = self.data_dir / f".{name}.partial"
+        self._partial = partial_of(self.data_dir, name)
         self._sync_seconds, self._last_sync = sync_seconds, time.monotonic()
         self._files: dict[str, int] = {}
         self._offsets: dict[str, int] = {}
         self._arrays: dict[str, tuple[tuple[int, ...], str, int]] = {}
-        self._lock_path = self.data_dir / f".{name}.lock"
         self._lock: Lock | None = None
 
     def __enter__(self) -> Self:
@@ -142,7 +89,7 @@ class SceneWriter:
                 self.data_dir.mkdir(parents=True, exist_ok=True)
             except FileExistsError:
                 raise InputError(f"{self.data_dir}: is a file, expected a folder") from None
-            self._lock = lock(self._lock_path, f"the scene {self.name!r}")
+            self._lock = lock_of(self.data_dir, self.name)
             try:
                 self._begin()
             except BaseException:
@@ -202,6 +149,7 @@ class SceneWriter:
                 plan_hash=self.plan_hash,
                 content_hash=mf.content_hash(entries),
                 files=entries,
+                code=source_hash(),
             )
             text = msgspec.json.format(msgspec.json.encode(whole), indent=1)
             (self._partial / mf.MANIFEST).write_bytes(text)
@@ -209,8 +157,7 @@ class SceneWriter:
             final = self.data_dir / self.name
             durable.put_in_place(self._partial, final)
             (final / mf.PROGRESS).unlink(missing_ok=True)  # only now: a crash before the rename must be able to go on
-            line = mf.IndexLine(name=self.name, scene_id=self.scene_id, content_hash=whole.content_hash)
-            mf.append_index(self.data_dir, line)
+            mf.append_index(self.data_dir, whole)
         return final
 
     def _begin(self) -> None:
@@ -237,16 +184,14 @@ class SceneWriter:
         for stack in self.stacks:
             self._files[stack.name] = os.open(self._partial / f"{stack.name}.tif", os.O_RDWR)
 
-    def _known(self) -> _Progress | None:
+    def _known(self) -> Progress | None:
         """Return what an unfinished folder says of itself, None when there is nothing to go on from."""
-        if not self._partial.exists():
-            return None
-        try:
-            known = msgspec.json.decode((self._partial / mf.PROGRESS).read_bytes(), type=_Progress)
-        except (OSError, msgspec.DecodeError, UnicodeDecodeError):
+        known = read_progress(self._partial)
+        if known is None:
             return None  # ended before the first note or after the last: nothing safe is lost by starting over
-        same = known.scene_id == self.scene_id and known.plan_hash == self.plan_hash
-        if not same:
+        if known.scene_id == self.scene_id and known.code != source_hash():
+            return None  # the views of two versions are no scan
+        if known.scene_id != self.scene_id or known.plan_hash != self.plan_hash:
             if self.force:
                 return None
             what = "plan" if known.scene_id == self.scene_id else "scene"
@@ -268,7 +213,13 @@ class SceneWriter:
         self._safe, self._last_sync = self._views, time.monotonic()
 
     def _note(self, views: int) -> None:
-        note = _Progress(scene_id=self.scene_id, plan_hash=self.plan_hash, views=views, offsets=self._offsets)
+        note = Progress(
+            scene_id=self.scene_id,
+            plan_hash=self.plan_hash,
+            views=views,
+            offsets=self._offsets,
+            code=source_hash(),
+        )
         durable.write_synced(self._partial / mf.PROGRESS, msgspec.json.encode(note))
 
     def _entries(self) -> dict[str, mf.FileEntry]:

@@ -12,9 +12,10 @@ import tifffile
 import torch
 from small_scan import GEOMETRY, STACKS, one_view, volume, write
 
+from benchmarks import cli
 from ctsim import store
 from ctsim.errors import InputError
-from ctsim.manifest import INDEX, MANIFEST, read_index
+from ctsim.manifest import INDEX, MANIFEST, IndexLine, read_index
 from ctsim.store import list_scans, open_scan, verify
 from ctsim.tiffstack import create_stack, map_array, write_all
 from ctsim.writer import SceneWriter
@@ -131,6 +132,96 @@ def test_verify_finds_a_manifest_that_was_tampered_with(tmp_path):
     assert ["content hash" in p for p in verify(tmp_path)] == [True]
     (folder / MANIFEST).write_text(text[:50])
     with pytest.raises(InputError, match="damaged manifest"):
+        open_scan(folder)
+
+
+def edited(folder: Path, change) -> None:
+    """Change a manifest by a function of it as JSON."""
+    path = folder / MANIFEST
+    held = msgspec.json.decode(path.read_bytes())
+    change(held)
+    path.write_bytes(msgspec.json.encode(held))
+
+
+OUTSIDE = ["../../../pwn", "/tmp/pwn", "..", "", ".scene", "other", "a/b", "scene\n", "index.jsonl"]
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_a_manifest_that_names_another_folder_is_refused(tmp_path, name, capsys):
+    """It names what is written of the scan: volumes and pictures would lie outside the results."""
+    folder = write(tmp_path / "data")
+    edited(folder, lambda held: held.update(name=name))
+    with pytest.raises(InputError, match=r"manifest\.json: names the scene .*, expected its folder's name, 'scene'"):
+        open_scan(folder)
+    assert ["names the scene" in p for p in verify(tmp_path / "data")] == [True]
+    results = tmp_path / "x" / "y" / "results"
+    command = ("run-benchmark", "benchmarks.cli_run", [str(tmp_path / "data"), str(results), "--scene", name])
+    assert cli.guarded(*command) == 2
+    assert "names the scene" in capsys.readouterr().err and {p.name for p in tmp_path.iterdir()} == {"data"}
+
+
+def test_a_scene_is_opened_by_any_path_to_its_folder_but_not_under_another_name(tmp_path, monkeypatch):
+    folder = write(tmp_path)
+    monkeypatch.chdir(folder / "metal_free")
+    for path in ("..", folder / "metal_free" / "..", "../../scene/."):
+        assert open_scan(path).name == "scene"
+    folder.rename(tmp_path / "renamed")
+    with pytest.raises(InputError, match="names the scene 'scene', expected its folder's name, 'renamed'"):
+        open_scan(tmp_path / "renamed")
+    (tmp_path / "a b").mkdir()
+    (tmp_path / "renamed" / MANIFEST).rename(tmp_path / "a b" / MANIFEST)
+    edited(tmp_path / "a b", lambda held: held.update(name="a b"))
+    with pytest.raises(InputError, match="names the scene 'a b'"):
+        open_scan(tmp_path / "a b")
+
+
+@pytest.mark.parametrize(
+    "name", ["../scene/flat.tif", "/etc/hostname", "metal_free/../flat.tif", "", "a//b", "./a", ".a"]
+)
+def test_a_manifest_that_names_files_outside_its_folder_is_refused(tmp_path, name):
+    folder = write(tmp_path)
+    edited(folder, lambda held: held["files"].update({name: held["files"]["flat.tif"]}))
+    with pytest.raises(
+        InputError, match=r"manifest\.json: names the file .*, expected a path within the scene's folder"
+    ):
+        open_scan(folder)
+    assert any("names the file" in p for p in verify(tmp_path))
+
+
+@pytest.mark.parametrize("name", [name for name in OUTSIDE if name != "other"])
+def test_an_index_that_names_another_folder_is_refused(tmp_path, name):
+    write(tmp_path / "data")
+    line = msgspec.json.encode(IndexLine(name=name, scene_id="a", content_hash="b"))
+    with (tmp_path / "data" / INDEX).open("ab") as file:
+        file.write(line + b"\n")
+    for use in (list_scans, verify):
+        with pytest.raises(InputError, match=r"index\.jsonl: line 2 names the scene .*, expected a folder's name"):
+            use(tmp_path / "data")
+
+
+def test_the_index_and_the_manifest_must_name_the_same_scan(tmp_path):
+    write(tmp_path)
+    for change in ({"scene_id": "b" * 12}, {"content_hash": "c"}, {"code": "d"}):
+        line = msgspec.structs.replace(read_index(tmp_path)["scene"], **change)
+        (tmp_path / INDEX).write_bytes(msgspec.json.encode(line) + b"\n")
+        assert ["its content is not the one that index.jsonl names" in p for p in verify(tmp_path)] == [True]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"format": 9}, "format 9, this version reads the formats 2 and 3"),
+        ({"format": 9, "colour": 1}, "format 9, this version reads the formats 2 and 3"),
+        ({"colour": 1}, "damaged manifest .*colour"),
+        ({"format": "three"}, "damaged manifest"),
+        ({"format": 2}, "damaged manifest .format 2 with the code"),
+        ({"code": ""}, "damaged manifest .format 3 with the code ''"),
+    ],
+)
+def test_a_manifest_of_another_format_is_refused_as_such(tmp_path, change, said):
+    folder = write(tmp_path)
+    edited(folder, lambda held: held.update(change))
+    with pytest.raises(InputError, match=said):
         open_scan(folder)
 
 

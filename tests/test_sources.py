@@ -1,0 +1,69 @@
+"""The hash that says which code made a scan."""
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from ctsim.errors import InputError
+from ctsim.sources import PACKAGES, TABLES, TEXT, hash_of, source_hash
+
+ROOT = Path(__file__).parents[1]
+FOR_PEOPLE = {"ctsim/data/NOTICE.txt"}
+
+
+@pytest.fixture
+def copy(tmp_path) -> dict[str, Path]:
+    """The sources that are tested, elsewhere."""
+    for name in PACKAGES:
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return {name: tmp_path / name for name in PACKAGES}
+
+
+def test_the_place_the_time_and_the_line_ends_of_sources_do_not_matter(copy):
+    cache = copy["ctsim"] / "kernels" / "__pycache__"
+    cache.mkdir()
+    (cache / "noise_cpu.cpython-311.pyc").write_bytes(b"compiled")
+    for path in copy["phantoms"].rglob("*.py"):
+        path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+        os.utime(path, (0, 0))
+    assert hash_of(copy) == source_hash()
+
+
+@pytest.mark.parametrize("changed", ["ctsim/noise.py", "ctsim/kernels/raytrace_cpu.py", "phantoms/bodies.py"])
+def test_a_changed_a_new_and_a_renamed_source_are_other_code(copy, changed):
+    package, _, inner = changed.partition("/")
+    path = copy[package] / inner
+    before, text = hash_of(copy), path.read_text(encoding="utf-8")
+    path.write_text(text + "X = 1\n", encoding="utf-8")
+    found = {before, hash_of(copy)}
+    path.write_text(text, encoding="utf-8")
+    (path.parent / "another.py").write_text("")
+    found.add(hash_of(copy))
+    (path.parent / "another.py").unlink()
+    path.rename(path.parent / "renamed.py")
+    found.add(hash_of(copy))
+    assert len(found) == 4
+
+
+def test_a_changed_table_is_other_code(copy):
+    path = copy["ctsim"] / "data" / "tungsten_spectra.npz"
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    assert hash_of(copy) != source_hash()
+
+
+def test_every_file_of_the_packages_is_hashed_or_known_to_be_for_people(copy):
+    """A new kind of table, say CSV, must be added to those that are hashed."""
+    files = (path for folder in copy.values() for path in folder.rglob("*") if path.is_file())
+    left = {f"{path.relative_to(copy['ctsim'].parent)}" for path in files if path.suffix not in (TEXT, TABLES)}
+    assert left == FOR_PEOPLE
+
+
+def test_a_package_without_sources_tells_nothing(copy):
+    for path in copy["phantoms"].rglob("*.py"):
+        path.unlink()
+    with pytest.raises(InputError, match="phantoms has no sources"):
+        hash_of(copy)
