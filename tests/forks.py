@@ -4,11 +4,13 @@
 change of a file (half of what was to be written is then written), or against a small or a read-only disk.
 """
 
+import contextlib
 import ctypes
 import faulthandler
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -55,6 +57,7 @@ class Forks:
     def run(self, *command: object, **how: Any) -> Run:
         """Run a command in a fork, killed at seconds= or change=, on a disk=(empty folder, bytes), or powerless=True.
 
+        A disk that holds= a copy of a folder has no room for anything else.
         With here=True it is run in the process that forks, which has compiled it then.
         """
         assert self._process.stdin and self._process.stdout
@@ -111,7 +114,14 @@ def attempt(command: list[str], here: bool = False, seconds: float | None = None
     return {"code": code, "said": text, "seconds": time.perf_counter() - begun, "changes": changes}
 
 
-def be(command: list[str], counted: int, change: int | None = None, disk: Any = None, powerless: bool = False) -> None:
+def be(
+    command: list[str],
+    counted: int,
+    change: int | None = None,
+    disk: Any = None,
+    holds: str | None = None,
+    powerless: bool = False,
+) -> None:
     """Be the command."""
     code = 99
     faulthandler.dump_traceback_later(HANGS, exit=True)
@@ -119,8 +129,11 @@ def be(command: list[str], counted: int, change: int | None = None, disk: Any = 
         if disk:
             from benchmarks import make_dataset
 
-            make_dataset._SPARE = -(2**40)  # else a disk that is too small would be refused before the first byte
+            if holds is None:
+                make_dataset._SPARE = -(2**40)  # else a disk that is too small would be refused before the first byte
             disk = disk if small_disk(*disk) else None
+            if holds is not None and disk is not None:
+                fill(Path(disk[0]), holds)
         if powerless:
             drop_powers()
         changes = count_changes(change)
@@ -185,6 +198,15 @@ def small_disk(folder: str, size: int) -> bool:
         resource.setrlimit(resource.RLIMIT_FSIZE, (LARGEST, LARGEST))
         return False
     return True
+
+
+def fill(disk: Path, holds: str) -> None:
+    """Copy a folder onto an empty disk, and let nothing of its room remain."""
+    shutil.copytree(holds, disk, dirs_exist_ok=True)
+    with contextlib.suppress(OSError), (disk / ".filler").open("wb", buffering=0) as file:
+        while True:
+            file.write(b"x" * 4096)
+    assert shutil.disk_usage(disk).free == 0
 
 
 def drop_powers() -> None:

@@ -3,11 +3,15 @@
 CTSIM_FAULTS is the number of kills, 50 where it is not set.
 """
 
+import contextlib
 import hashlib
 import os
 import random
 import re
 import shutil
+import signal
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,10 +19,13 @@ import pytest
 from forks import Forks, Run
 from test_workers import scores, tables
 
-from benchmarks import records
-from ctsim.manifest import verify
+from benchmarks import make_dataset, records
+from ctsim.folder import partial_of
+from ctsim.manifest import list_scans, read_manifest, verify
+from ctsim.tiffstack import map_array
 
 KILLS = int(os.environ.get("CTSIM_FAULTS", "50"))
+LONG = 300  # views of scenes that are written for a while
 SUITE = """
 [defaults.scanner]
 n_views = 12
@@ -127,6 +134,58 @@ def test_make_dataset_survives_kills_while_it_makes_scenes_again(bench, tmp_path
         assert bench.same_data(data)
 
 
+def views_written(data: Path, whole: Path) -> int:
+    """Return how many views the unfinished scene that is farthest on has on the disk; the same, whole, lies in `whole`.
+
+    No view has only counts of 0.
+    """
+    most = 0
+    for scene in list_scans(whole):
+        entry = read_manifest(scene).files["counts.tif"]
+        assert entry.shape and entry.dtype and entry.offset
+        with contextlib.suppress(OSError, ValueError):  # it is not begun, or just finished
+            counts = map_array(partial_of(data, scene.name) / "counts.tif", entry.shape, entry.dtype, entry.offset)
+            most = max(most, int(counts.any((1, 2)).sum()))
+    return most
+
+
+def test_make_dataset_survives_kills_of_a_clusters_workers(bench, tmp_path):
+    """Each time that a random number of views is written, one of the workers is killed, whatever it does."""
+    import dask.config
+    from distributed import LocalCluster
+
+    suite, data, kills, ended = tmp_path / "suite.toml", tmp_path / "data", [], threading.Event()
+    suite.write_text(SUITE.replace("n_views = 12", f"n_views = {LONG}"), encoding="utf-8")
+    whole = tmp_path / "whole"
+    assert bench.forks.run("make-dataset", suite, whole).code == 0
+    dask.config.set({"distributed.scheduler.allowed-failures": 100})  # as many as we like
+
+    def kill() -> None:
+        rng = random.Random(20261121)
+        for _ in range(max(2, KILLS // 25)):
+            after = rng.randrange(LONG // 2)
+            while views_written(data, whole) <= after:
+                if ended.wait(0.002):
+                    return
+            kills.append(rng.choice([nanny.pid for nanny in cluster.workers.values() if nanny.pid]))
+            os.kill(kills[-1], signal.SIGKILL)
+            time.sleep(0.1)  # else all are killed for one count
+
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL") as cluster:
+        killer = threading.Thread(target=kill)
+        killer.start()
+        try:
+            code = make_dataset.main([str(suite), str(data), "--scheduler", cluster.scheduler_address])
+        finally:
+            ended.set()
+            killer.join()
+    assert code == 0 and kills
+    assert verify(data) == [] and names(data) == names(whole)
+    assert (data / "index.jsonl").read_bytes() == (whole / "index.jsonl").read_bytes()
+    for path in (path for path in whole.rglob("*.*") if path.name not in ("plan.json", "manifest.json")):
+        assert digest(data / path.relative_to(whole)) == digest(path), path
+
+
 def test_run_benchmark_survives_kills(bench, tmp_path):
     survive(
         lambda k, **how: bench.score(tmp_path / f"results{k}", **how),
@@ -178,6 +237,28 @@ def test_a_dataset_that_cannot_be_written_can_be_scored(bench, tmp_path):
         path.chmod(0o555 if path.is_dir() else 0o444)
     assert bench.score(tmp_path / "results", data=data, powerless=True).code == 0
     assert bench.same_results(tmp_path / "results")
+
+
+def test_a_complete_dataset_that_cannot_be_written_is_complete(bench, tmp_path):
+    data = Path(shutil.copytree(bench.data, tmp_path / "data"))
+    for path in (data, *data.rglob("*")):
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    for flags in ([], ["--dry-run"], ["--workers", "2"]):
+        ended = bench.make(data, *flags, powerless=True)
+        assert ended.code == 0 and ended.said.count("already complete") == 2, ended.said
+    assert bench.forks.run("make-dataset", "--verify", data, powerless=True).code == 0
+    data.chmod(0o755)
+    (data / ".rods.partial").mkdir()  # of --force; it cannot be removed, so it is named
+    data.chmod(0o555)
+    ended = bench.make(data, powerless=True)
+    assert ended.code == 0 and ".rods.partial: an unfinished replacement" in ended.said
+    data.chmod(0o755)
+
+
+def test_a_complete_dataset_on_a_full_disk_is_complete(bench, tmp_path):
+    folder = Path(shutil.copytree(bench.data, tmp_path / "data"))  # for where there is no disk, but a limit
+    ended = bench.make(folder, disk=(str(folder), 2**20), holds=str(bench.data))
+    assert ended.code == 0 and ended.said.count("already complete") == 2, ended.said
 
 
 def test_a_cut_last_record_is_set_aside_and_measured_again(bench, tmp_path):
