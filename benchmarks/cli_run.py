@@ -129,7 +129,6 @@ def _compute(given: Arguments) -> int:
     methods, scans = _methods(given), _scans(given)
     names = frozenset(given.scene or (s.name for s in scans))
     _warn([s for s in scans if s.name in names])
-    _warn_of_mixture(given.data, names)
     listed = [task for task in run.tasks(scans, methods, options) if task.stored.name in names]
     left = run.pending(listed, given.results, given.force)
     costs = schedule.Costs(records.read_all(given.results)[0])
@@ -195,7 +194,7 @@ def _methods(given: Arguments) -> "list[Method]":
 
 
 def _scans(given: Arguments) -> "list[Stored]":
-    """Open the dataset's scans, in its order; check that those of --scene are among them."""
+    """Open the dataset's scans, in its order; check those of --scene, and warn of several simulators."""
     from ctsim.store import list_scans, open_scan
 
     scans: list[Stored] = [open_scan(folder) for folder in list_scans(given.data)]
@@ -205,6 +204,7 @@ def _scans(given: Arguments) -> "list[Stored]":
     for wanted in given.scene:
         if wanted not in names:
             raise InputError(f"--scene {wanted!r}: {given.data} has {human_choice(names, wanted)}")
+    _warn_of_mixture(given.data, frozenset(given.scene or names))
     return scans
 
 
