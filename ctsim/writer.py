@@ -68,10 +68,10 @@ class SceneWriter:
         force: bool = False,
         sync_seconds: float = 5.0,
     ) -> None:
+        if mf.is_reserved(name):
+            raise InputError(f"scene name {name!r}: is what the data folder's own index is called; expected another")
         if not mf.is_name(name):
-            raise InputError(
-                f"scene name {name!r}: expected letters, digits and ._+-, no leading dot, and not {mf.INDEX}"
-            )
+            raise InputError(f"scene name {name!r}: expected letters, digits and ._+- and no leading dot")
         self.data_dir, self.name, self.force = Path(data_dir), name, force
         self.scene_id, self.plan_hash, self.stacks = scene_id, plan_hash, stacks
         self.n_views = stacks[0].shape[0] if stacks else 0

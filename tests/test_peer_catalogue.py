@@ -149,7 +149,7 @@ def test_records_of_other_machines_are_taken_over_and_told_apart(tmp_path, monke
     for folder in (here, there, tmp_path / "none"):
         folder.mkdir()
     lines.append(here / peers.NAME, record("fdk", 1), record("paths", 3))
-    lines.append(there / peers.NAME, record("fdk", 2, "theirs"), record("paths", 0, "theirs"))
+    lines.append(there / peers.NAME, record("paths", 0, "theirs"), record("fdk", 2, "theirs"))
     assert peers.main([str(here), "--table"]) == 0
     assert "Cases of several runs" not in capsys.readouterr().out
     assert peers.main([str(here), "--collect", str(there)]) == 0
