@@ -11,7 +11,7 @@ from ctsim import rng
 from ctsim.errors import InputError
 from ctsim.kernels import noise_cpu
 
-_NO_PATTERN = np.empty((0, 0), np.float32)
+_NO_PATTERN = np.empty((2, 0, 0), np.float32)
 
 
 class Noise(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -19,9 +19,13 @@ class Noise(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     `electronic` is the standard deviation of the electronic noise in photons that reach an open pixel.
     The ADC's open field lies at `adc_fill` and its pedestal at `pedestal`, both fractions of full
-    scale; `adc_bits = None` writes float32 photons without pedestal, and so do "tigre" and "none".
-    `n_flats` flats are averaged (0: a perfect flat). `fixed_pattern` is the relative standard deviation of
-    the pixels' gains, `dead_fraction` the share of pixels that always read the pedestal.
+    scale; `adc_bits = None` writes float32 photons without pedestal, and so do "tigre" and "none". TIGRE's demos
+    have an `electronic` of 10.
+    `n_flats` flats are averaged (0: a perfect flat). `fixed_pattern` is the relative standard deviation of the pixels'
+    gains in the open field, which dividing by the flat takes out; a pixel's gain also grows by `pattern_residual` times
+    as much, drawn anew, from the open field to no signal. That part stays, the same in all views: rings. The default,
+    a tenth, is a choice. `dead_fraction` is the share of pixels that always read the pedestal. Model
+    "tigre" has no pattern and no dead pixels.
     """
 
     model: Literal["compound", "tigre", "none"] = "compound"
@@ -31,6 +35,7 @@ class Noise(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     pedestal: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.02
     n_flats: Annotated[int, msgspec.Meta(ge=0, le=10_000)] = 64
     fixed_pattern: Annotated[float, msgspec.Meta(ge=0, le=0.3)] = 0.0
+    pattern_residual: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.1
     dead_fraction: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
 
     def __post_init__(self) -> None:
@@ -48,6 +53,8 @@ class Noise(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise InputError(f"noise.n_flats must be within 0..10000, got {self.n_flats}")
         if not 0 <= self.fixed_pattern <= 0.3:
             raise InputError(f"noise.fixed_pattern must be within [0, 0.3], got {self.fixed_pattern}")
+        if not 0 <= self.pattern_residual <= 1:
+            raise InputError(f"noise.pattern_residual must be within [0, 1], got {self.pattern_residual}")
         if not 0 <= self.dead_fraction < 1:
             raise InputError(f"noise.dead_fraction must be within [0, 1), got {self.dead_fraction}")
 
@@ -77,16 +84,21 @@ class Noise(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 def pixel_pattern(shape: tuple[int, int], *, noise: Noise, scene_id: str) -> NDArray[np.float32] | None:
-    """Return each pixel's gain around 1, float32 [v, u], 0 where the pixel is dead; None if all are 1.
+    """Return how each pixel differs, float32 [2, v, u]; None if none does. Model "tigre" has no such pixels.
 
-    Gains are Gaussian with standard deviation `fixed_pattern`, not below 0.05.
+    [0] is the gain in the open field, around 1 and 0 where the pixel is dead; [1] by which share it is larger at no
+    signal, linear between. Both are Gaussian, with standard deviations `fixed_pattern` and `fixed_pattern` times
+    `pattern_residual`; no gain is below 0.05, no share below −0.95.
     """
-    if noise.fixed_pattern == 0 and noise.dead_fraction == 0:
+    if noise.model == "tigre" or (noise.fixed_pattern == 0 and noise.dead_fraction == 0):
         return None
     n = shape[0] * shape[1]
     gains = 1.0 + noise.fixed_pattern * rng.normal(rng.stream_key(scene_id, "pixel gain", 0), n)[:, 0]
+    bends = rng.normal(rng.stream_key(scene_id, "pixel residual", 0), n)[:, 0]
+    bends *= noise.fixed_pattern * noise.pattern_residual
     dead = rng.uniform(rng.stream_key(scene_id, "dead pixels", 0), n)[:, 0] < noise.dead_fraction
-    return np.where(dead, 0.0, np.maximum(gains, 0.05)).reshape(shape).astype(np.float32)
+    pattern = np.where(dead, 0.0, np.maximum(gains, 0.05)), np.maximum(bends, -0.95)
+    return np.stack(pattern).reshape(2, *shape).astype(np.float32)
 
 
 def detect(
@@ -105,18 +117,18 @@ def detect(
     without electronics the relative signal has variance m2/i0. One draw has that mean, that variance and nearly
     the compound Poisson's skewness: g·Poisson(i0·m1²/m2), g = m2/(m1·i0). `key` names the view's stream
     (`rng.stream_key`); `pattern` comes from `pixel_pattern`. `known` = (counts, spans) are counts to be drawn
-    again, in place, in columns spans[v] = (from, to) only; models "tigre" and "none" fill all. Model "none" draws
-    nothing. Model "tigre" takes p relative to the view's largest p before the draw (TIGRE: the largest of the whole
-    scan), ignoring m2 and pattern.
+    again, in place, in columns spans[v] = (from, to) only; model "none", which draws nothing, fills all. For model
+    "tigre" there is `detect_tigre`.
 
     Raises InputError on moments that are negative, not finite, or m2 = 0 where m1 > 0.
     """
+    if noise.model == "tigre":
+        raise ValueError("one view is not enough for the model tigre; use detect_tigre")
     if m1.ndim != 2 or m1.shape != m2.shape:
         raise InputError(f"expected m1 and m2 of one shape [v, u], got {m1.shape} and {m2.shape}")
-    if not 0 < i0 <= 1e12:
-        raise InputError(f"i0 must be within (0, 1e12] photons, got {i0}")
-    if pattern is not None and pattern.shape != m1.shape:
-        raise InputError(f"pattern has shape {pattern.shape}, the view {m1.shape}")
+    _check_i0(i0)
+    if pattern is not None and pattern.shape != (2, *m1.shape):
+        raise InputError(f"pattern has shape {pattern.shape}, expected {(2, *m1.shape)} for this view")
     if known is None:
         known = np.empty(m1.shape, noise.dtype), np.tile(np.array([0, m1.shape[1]]), (m1.shape[0], 1))
     out, spans = known
@@ -132,14 +144,43 @@ def detect(
         if bad.any():
             raise InputError(f"detector row {int(bad.argmax())}: m1 and m2 must be finite and m2 > 0 where m1 > 0")
         return out
+    _check_signal(m1)
+    out[...] = m1 * i0 if pattern is None else _read(m1, pattern) * i0
+    return out
+
+
+def _read(signal: NDArray[Any], pattern: NDArray[np.float32]) -> NDArray[Any]:
+    """Return what pixels with a pattern read of a mean signal relative to the open field."""
+    return signal * pattern[0] * (1 + pattern[1] * np.maximum(1 - signal, 0))
+
+
+def _check_i0(i0: float) -> None:
+    if not 0 < i0 <= 1e12:
+        raise InputError(f"i0 must be within (0, 1e12] photons, got {i0}")
+
+
+def _check_signal(m1: NDArray[Any]) -> None:
     if not (np.isfinite(m1).all() and (m1 >= 0).all()):
         raise InputError("m1 must be finite and not negative")
-    if noise.model == "none":
-        out[...] = m1 * i0 if pattern is None else m1 * i0 * pattern
-        return out
-    lowest = float(m1[m1 > 0].min(initial=1.0))
-    top = -math.log(lowest)
-    # An open view has nothing to normalise by; 1 leaves p as it is.
+
+
+def largest_p(m1: NDArray[Any]) -> float:
+    """Return the largest −ln m1 where m1 > 0, at least 0."""
+    return -math.log(float(m1[m1 > 0].min(initial=1.0)))
+
+
+def detect_tigre(m1: NDArray[Any], *, top: float, noise: Noise, i0: float, key: np.uint64) -> NDArray[np.float32]:
+    """Draw one view's photons, float32 [v, u], as TIGRE's CTnoise would.
+
+    `m1` is the mean signal [v, u] relative to the open field; p = −ln m1 is divided by `top` before the draw and
+    multiplied by it afterwards. TIGRE takes the largest p of the whole scan (`largest_p` over its views).
+
+    Raises InputError on a signal that is negative or not finite.
+    """
+    _check_i0(i0)
+    _check_signal(m1)
+    out = np.empty(m1.shape, np.float32)
+    # Where all views are open nothing is to be normalised; 1 leaves p as it is.
     noise_cpu.detect_tigre(m1, top if top > 0 else 1.0, float(i0), noise.electronic, np.uint64(key), out)
     return out
 
@@ -160,7 +201,7 @@ def flat_field(
     """
     m1, m2 = open_field
     if noise.n_flats == 0 or noise.model != "compound":
-        gains = m1 if pattern is None else m1 * pattern
+        gains = m1 if pattern is None else _read(m1, pattern)
         return (noise.dark + noise.gain(i0) * gains).astype(np.float32)
     total = np.zeros(m1.shape)
     for k in range(noise.n_flats):

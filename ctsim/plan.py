@@ -147,6 +147,7 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
     n_rays, n_voxels = int(np.prod(scanner.geometry.shape)), int(np.prod(scanner.geometry.n_voxel))
     draws = n_rays * (2 if twin else 1) * (scanner.noise.model != "none")
     disk = _disk_bytes(outputs, scanner.geometry, twin)
+    passes = 2 if scanner.noise.model == "tigre" else 1  # the first finds the scan's largest P
     return Plan(
         stream_id=stream_id,
         settings=simulation,
@@ -160,7 +161,7 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
         scatter_fraction=open_fraction(scanner.scatter, scanner.geometry),
         edge_error=tried.edge_error,
         n_rays=n_rays,
-        seconds=scanner.geometry.n_views * tried.seconds
+        seconds=passes * scanner.geometry.n_views * tried.seconds
         + draws * NOISE_SECONDS / numba.get_num_threads()
         + n_voxels * (2 if twin else 1) * VOLUME_SECONDS
         + disk * WRITE_SECONDS,
@@ -260,7 +261,8 @@ def _stages(
     bowtie = scanner.tube.bowtie is not None
     stages.append(Stage(name="bow-tie", runs=bowtie, reason="" if bowtie else "off"))
     noise = scanner.noise.model
-    stages.append(Stage(name="noise", runs=noise != "none", reason=noise if noise != "none" else "off"))
+    why = {"none": "off", "tigre": "tigre, in two passes"}.get(noise, noise)
+    stages.append(Stage(name="noise", runs=noise != "none", reason=why))
     reason = "" if _has_twin(phantom, truth) else ("no metal" if not metal else "not asked")
     stages.append(Stage(name="metal-free twin", runs=not reason, reason=reason))
     for name, asked in (("noise-free", truth.noise_free), ("mono", bool(truth.mono_kev)), ("paths", truth.paths)):

@@ -4,6 +4,7 @@ Nothing here grows with the number of views. A view depends on its own index onl
 interrupted goes on where it stopped and gives the same bytes.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from ctsim.detector import response
 from ctsim.materials import attenuation
-from ctsim.noise import detect, flat_field, pixel_pattern
+from ctsim.noise import detect, detect_tigre, flat_field, largest_p, pixel_pattern
 from ctsim.plan import Plan
 from ctsim.project import Response, Tracer, path_lengths, transmit
 from ctsim.quadrature import effective_weights
@@ -24,6 +25,7 @@ from ctsim.types import Phantom, Scanner
 from ctsim.voxelise import attenuation_volume, label_volume, metal_mask
 
 Image = NDArray[np.float32]
+Moments = tuple[Image, Image]
 REFERENCE_KEV = 50.0  # centre of 10–90 keV
 
 
@@ -89,24 +91,43 @@ class _Simulator:
         self.names = {o.name for o in plan.outputs}
         self.lengths = np.zeros((len(self.tracer.materials), *self.geometry.n_detector), np.float32)
 
+        self.largest = self._largest_p() if scanner.noise.model == "tigre" else [math.nan] * 2
+
     def view(self, k: int) -> dict[str, NDArray]:
         """Everything the plan wants of view k."""
+        scan, twin, spans = self._signals(k)
+        out = self._images(*scan)
+        out["counts"] = self._counts(*scan, k, self.largest[0])
+        if twin is not None:
+            images = self._images(*twin)
+            known = None if spans is None else (out["counts"].copy(), spans)
+            images["counts"] = self._counts(*twin, k, self.largest[1], known)
+            out |= {f"metal_free/{name}": image for name, image in images.items()}
+        return out | self._paths(k)
+
+    def _signals(self, k: int) -> tuple[Moments, Moments | None, NDArray[np.int64] | None]:
+        """Noise-free moments of the scan and of its twin, and the columns of each row in which these can differ."""
         self.tracer.background(self.geometry, k, self.lengths)  # serves the scan, its twin and the path lengths
         if self.beam.layer is not None:
             self.lengths[-1] += self.beam.layer
-        m1, m2 = self._transmit(self.tracer, k)
-        out = self._measured(m1, m2, k)
-        if "metal_free/counts" in self.names:
-            if self.plan.settings.skip:
-                # only pixels in the metal's shadow can differ
-                shape = self.geometry.n_detector
-                spans = row_spans(self.tracer.shadows(self.geometry.pose(k), shape)[:, self.tracer.metal], shape[1])
-                twin = self._transmit(self.bare, k, (m1.copy(), m2.copy(), spans))
-                drawn = self._measured(*twin, k, (out["counts"].copy(), spans))
-            else:
-                drawn = self._measured(*self._transmit(self.bare, k), k)
-            out |= {f"metal_free/{name}": image for name, image in drawn.items()}
-        return out | self._paths(k)
+        scan = self._transmit(self.tracer, k)
+        if "metal_free/counts" not in self.names:
+            return scan, None, None
+        if not self.plan.settings.skip:
+            return scan, self._transmit(self.bare, k), None
+        # only pixels in the metal's shadow can differ
+        shape = self.geometry.n_detector
+        spans = row_spans(self.tracer.shadows(self.geometry.pose(k), shape)[:, self.tracer.metal], shape[1])
+        return scan, self._transmit(self.bare, k, (scan[0].copy(), scan[1].copy(), spans)), spans
+
+    def _largest_p(self) -> list[float]:
+        """Largest P that is read without noise in all views: of the scan and of its twin."""
+        largest = [0.0, 0.0]
+        for k in range(self.geometry.n_views):
+            for which, moments in enumerate(self._signals(k)[:2]):
+                if moments is not None:
+                    largest[which] = max(largest[which], largest_p(self._lit(*moments)[0]))
+        return largest
 
     def _transmit(self, tracer: Tracer, k: int, out: tuple[Image, Image, NDArray] | None = None) -> tuple[Image, Image]:
         return transmit(
@@ -120,28 +141,38 @@ class _Simulator:
             out=out,
         )
 
-    def _measured(
-        self, m1: Image, m2: Image, k: int, known: tuple[NDArray, NDArray[np.int64]] | None = None
-    ) -> dict[str, NDArray]:
-        """Add scatter, then draw the counts; with the noise-free images that were asked for.
+    def _lit(self, m1: Image, m2: Image) -> Moments:
+        """Return the moments of what reaches the detector, scatter included."""
+        if self.beam.gain is not None:
+            m1, m2 = m1 * self.beam.gain, m2 * self.beam.gain
+        s = self.plan.scatter_fraction
+        if s:
+            # scattered photons carry the open field's spectrum, and come from all over the object: no heel of a pixel's
+            m1, m2 = m1 + np.float32(s), m2 + np.float32(s * self.plan.rule.w2.sum())
+        return m1, m2
 
-        `known` = (counts, spans) are counts to be drawn again in those columns only.
-        """
+    def _images(self, m1: Image, m2: Image) -> dict[str, NDArray]:
+        """Return the noise-free images that were asked for."""
         out: dict[str, NDArray] = {}
         if "scatter_free" in self.names:
             out["scatter_free"] = -np.log(m1 / self.beam.open1)
-        s = self.plan.scatter_fraction
-        if s:
-            # scattered photons carry the open field's spectrum
-            m1, m2 = m1 + np.float32(s), m2 + np.float32(s * self.plan.rule.w2.sum())
         if "noise_free" in self.names:
-            out["noise_free"] = -np.log(m1 / self.beam.open1)
-        if self.beam.gain is not None:
-            m1, m2 = m1 * self.beam.gain, m2 * self.beam.gain
-        key = stream_key(self.plan.stream_id, "view", k)
-        noise, i0 = self.scanner.noise, self.scanner.i0
-        out["counts"] = detect(m1, m2, noise=noise, i0=i0, key=key, pattern=self.pattern, known=known)
+            seen, opened = self._lit(m1, m2)[0], self.beam.open1
+            if self.beam.gain is not None:
+                # behind the anode there is no open field to divide by: what the primary alone would give
+                seen, opened = np.where(self.beam.gain > 0, (seen, opened * self.beam.gain), (m1, opened))
+            out["noise_free"] = -np.log(seen / opened)
         return out
+
+    def _counts(
+        self, m1: Image, m2: Image, k: int, largest: float, known: tuple[NDArray, NDArray[np.int64]] | None = None
+    ) -> NDArray:
+        """Draw the counts; `known` = (counts, spans) are counts to be drawn again in those columns only."""
+        m1, m2 = self._lit(m1, m2)
+        key, noise, i0 = stream_key(self.plan.stream_id, "view", k), self.scanner.noise, self.scanner.i0
+        if noise.model == "tigre":
+            return detect_tigre(m1, top=largest, noise=noise, i0=i0, key=key)
+        return detect(m1, m2, noise=noise, i0=i0, key=key, pattern=self.pattern, known=known)
 
     def _paths(self, k: int) -> dict[str, NDArray]:
         """Images made from path lengths along the central rays."""

@@ -8,7 +8,7 @@ from scipy import stats
 from ctsim import rng
 from ctsim.errors import InputError
 from ctsim.kernels import noise_cpu, noise_reference
-from ctsim.noise import Noise, detect, flat_field, pixel_pattern
+from ctsim.noise import Noise, detect, detect_tigre, flat_field, largest_p, pixel_pattern
 
 KEY = rng.stream_key("scene", "photons", 0)
 PHOTONS = Noise(electronic=0.0, adc_bits=None)
@@ -86,8 +86,8 @@ def test_the_kernel_writes_the_same_counts_as_the_reference(noise, dtype):
     m1 = np.exp(-gen.uniform(0, 11, (5, 7))).astype(dtype)
     m1[2, 3] = 0
     m2 = (1.3 * m1**0.9).astype(dtype)
-    pattern = gen.normal(1, 0.05, m1.shape).astype(np.float32)
-    pattern[1, 1] = 0
+    pattern = np.stack([gen.normal(1, 0.05, m1.shape), gen.normal(0, 0.05, m1.shape)]).astype(np.float32)
+    pattern[0, 1, 1] = 0
     i0 = 3e4
     expected, bad = np.empty(m1.shape, noise.dtype), np.ones(5, np.uint8)
     scale = (i0, noise.electronic, noise.gain(i0), noise.dark, float(noise.full_scale))
@@ -238,18 +238,39 @@ def test_fixed_pattern_scales_the_signal_and_dead_pixels_read_the_pedestal():
     pattern = pixel_pattern(shape, noise=noise, scene_id="scene")
     assert pattern is not None
     np.testing.assert_array_equal(pattern, pixel_pattern(shape, noise=noise, scene_id="scene"))
-    dead = pattern == 0
-    n = pattern.size
+    gains, bends = pattern
+    dead = gains == 0
+    n = gains.size
     assert dead.mean() == pytest.approx(0.01, abs=5 * math.sqrt(0.01 / n))
-    assert pattern[~dead].std() == pytest.approx(0.05, rel=5 / math.sqrt(2 * n))
-    assert pattern[~dead].mean() == pytest.approx(1.0, abs=5 * 0.05 / math.sqrt(n))
+    assert gains[~dead].std() == pytest.approx(0.05, rel=5 / math.sqrt(2 * n))
+    assert gains[~dead].mean() == pytest.approx(1.0, abs=5 * 0.05 / math.sqrt(n))
+    assert bends.std() == pytest.approx(0.005, rel=5 / math.sqrt(2 * n))
+    assert abs(np.corrcoef(gains[~dead], bends[~dead])[0, 1]) < 5 / math.sqrt(n)
     counts = detect(constant(0.5, shape), constant(0.5, shape), noise=noise, i0=1e8, key=KEY, pattern=pattern)
     flat = flat_field(open_field(shape), noise=noise, i0=1e8, scene_id="scene", pattern=pattern)
     assert (counts[dead] == noise.dark).all() and (flat[dead] == noise.dark).all()
     relative = (counts[~dead] - noise.dark) / (flat[~dead] - noise.dark)
     # Noise of 1.4e-4 relative and rounding of half a count in 2e4, six standard deviations of the first.
-    np.testing.assert_allclose(relative, 0.5, atol=0.5 * 6 * 1.7e-4 + 0.5 / 4e4)
+    left = 0.5 * (1 + 0.5 * bends[~dead])
+    np.testing.assert_allclose(relative, left, atol=0.5 * 6 * 1.7e-4 + 0.5 / 4e4)
     assert pixel_pattern(shape, noise=Noise(), scene_id="scene") is None
+
+
+@pytest.mark.parametrize("residual", [0.0, 0.1, 1.0])
+def test_what_the_flat_leaves_of_a_fixed_pattern_grows_as_the_signal_falls(residual):
+    noise = Noise(model="none", fixed_pattern=0.02, pattern_residual=residual)
+    shape = (60, 70)
+    pattern = pixel_pattern(shape, noise=noise, scene_id="scene")
+    assert pattern is not None
+    flat = flat_field(open_field(shape), noise=noise, i0=1e5, scene_id="scene", pattern=pattern).astype(np.float64)
+    for signal in (1.0, 0.5, 0.01, 0.0001):
+        m1 = constant(signal, shape)
+        counts = detect(m1, m1, noise=noise, i0=1e5, key=KEY, pattern=pattern)
+        error = -np.log(counts / flat) + math.log(signal)
+        # closed form: a gain that is 1 + b(1 − s) times the open field's; float32 rounds counts and flat, 6e-8 each
+        np.testing.assert_allclose(error, -np.log1p(pattern[1].astype(np.float64) * (1 - signal)), rtol=0, atol=4e-7)
+        spread = 0.02 * residual * (1 - signal)
+        assert error.std() == pytest.approx(spread, rel=6 / math.sqrt(2 * m1.size), abs=4e-7)
 
 
 def open_field(shape, m2=1.0):
@@ -283,7 +304,11 @@ def test_none_draws_and_rounds_nothing():
 def test_extreme_signals_stay_finite(noise, i0):
     m1 = np.array([[0.0, 1e-300, 1e-30, 1e-3, 1.0, 1e3, 1e10]])
     for moment in (m1, m1.astype(np.float32)):
-        assert np.isfinite(detect(moment, 1.5 * moment, noise=noise, i0=i0, key=KEY)).all()
+        if noise.model == "tigre":
+            counts = detect_tigre(moment, top=largest_p(moment), noise=noise, i0=i0, key=KEY)
+        else:
+            counts = detect(moment, 1.5 * moment, noise=noise, i0=i0, key=KEY)
+        assert np.isfinite(counts).all()
 
 
 # --- TIGRE's noise -------------------------------------------------------------------------------
@@ -297,7 +322,11 @@ def test_tigre_noise_makes_tissue_too_noisy_and_a_metal_shadow_too_quiet():
     spread = {}
     for model in ("compound", "tigre"):
         noise = Noise(model=model, electronic=electronic, adc_bits=None)
-        relative = detect(m1, m1, noise=noise, i0=i0, key=KEY).astype(np.float64) / (i0 * m1)
+        if model == "tigre":
+            counts = detect_tigre(m1, top=largest_p(m1), noise=noise, i0=i0, key=KEY)
+        else:
+            counts = detect(m1, m1, noise=noise, i0=i0, key=KEY)
+        relative = counts.astype(np.float64) / (i0 * m1)
         spread[model] = relative[:, :250].std(), relative[:, 250:].std()
     # True: sqrt(N + e²)/N at N = i0·exp(−p). TIGRE: `top` times that at N = i0·exp(−p/top); to first order in the
     # draw, whose relative spread s <= 0.017 enters as (1+x)^8 − 1 with a second-order share of 49/4·s² = 0.3 %.
@@ -335,6 +364,7 @@ def test_tigre_kernel_equals_its_reference():
         ({"adc_fill": 1.2}, "noise.adc_fill"),
         ({"n_flats": -1}, "noise.n_flats"),
         ({"fixed_pattern": 0.5}, "noise.fixed_pattern"),
+        ({"pattern_residual": 1.5}, "noise.pattern_residual"),
         ({"dead_fraction": 1.0}, "noise.dead_fraction"),
     ],
 )
@@ -350,7 +380,10 @@ def test_impossible_moments_are_refused(value):
     bad[3, 2] = value
     for model in ("compound", "none", "tigre"):
         with pytest.raises(InputError, match="m1"):
-            detect(bad, good, noise=Noise(model=model), i0=1e4, key=KEY)
+            if model == "tigre":
+                detect_tigre(bad, top=1.0, noise=Noise(model=model), i0=1e4, key=KEY)
+            else:
+                detect(bad, good, noise=Noise(model=model), i0=1e4, key=KEY)
     with pytest.raises(InputError, match="row 3"):
         detect(good, bad, noise=Noise(), i0=1e4, key=KEY)
     bad[3, 2] = 0
@@ -363,7 +396,7 @@ def test_wrong_shapes_and_types_are_refused():
     with pytest.raises(InputError, match="one shape"):
         detect(m, m[:4], noise=Noise(), i0=1e4, key=KEY)
     with pytest.raises(InputError, match="pattern"):
-        detect(m, m, noise=Noise(), i0=1e4, key=KEY, pattern=constant(1.0, (7, 5)))
+        detect(m, m, noise=Noise(), i0=1e4, key=KEY, pattern=constant(1.0, (5, 7)))
     with pytest.raises(InputError, match="counts must be"):
         detect(m, m, noise=Noise(), i0=1e4, key=KEY, known=(np.empty((5, 7), np.float32), np.zeros((5, 2), np.int64)))
     with pytest.raises(InputError, match="i0"):

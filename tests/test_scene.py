@@ -304,6 +304,7 @@ NOISE = table(
     adc_fill=st.floats(0.5, 1),
     pedestal=st.floats(0, 0.4),
     fixed_pattern=st.floats(0, 0.3),
+    pattern_residual=st.floats(0, 1),
     dead_fraction=st.floats(0, 0.9),
     n_flats=st.integers(0, 3),
 )

@@ -5,6 +5,7 @@ import dataclasses
 import msgspec
 import numpy as np
 import pytest
+import torch
 
 from ctsim.detector import Detector
 from ctsim.errors import InputError
@@ -16,8 +17,9 @@ from ctsim.scatter import Scatter
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import compact, flat_image, scan_info, simulate_views, truth_volumes
 from ctsim.solids import FRUSTUM, Primitive, Solid
-from ctsim.spectrum import Bowtie, Filter, Tube
+from ctsim.spectrum import Bowtie, Filter, Tube, heel_factor
 from ctsim.types import Phantom, Scanner
+from reconstruct.fdk import fdk
 
 GEOMETRY = Geometry(
     dso=250.0,
@@ -126,6 +128,87 @@ def test_scatter_lifts_the_signal_by_its_fraction():
     _, out = run(phantom(), machine, truth=EVERYTHING)
     lifted = np.exp(-out["noise_free"].astype(np.float64)) - np.exp(-out["scatter_free"].astype(np.float64))
     np.testing.assert_allclose(lifted, 0.05, rtol=1e-5)
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.05])
+def test_scatter_does_not_carry_the_heel_of_the_pixel_it_meets(fraction):
+    steep = Tube(heel=True, anode_deg=8.0)  # part of the detector lies behind the anode
+    tall = msgspec.structs.replace(GEOMETRY, n_detector=(48, 30))
+    scatter = Scatter(level=1, fraction=fraction)
+    machine = scanner(tube=steep, scatter=scatter, geometry=tall)
+    plan, out = run(phantom(), machine, truth=EVERYTHING)
+    # the primary alone, from a scan without heel: counts = i0·(heel·primary + S), read against i0·heel
+    _, bare = run(phantom(), scanner(tube=Tube(anode_deg=8.0), scatter=Scatter(), geometry=tall), truth=EVERYTHING)
+    angles = np.arctan2((np.arange(48) - 23.5) * 3.5, 500.0)
+    heel = heel_factor(steep, angles)[:, None]
+    for twin in ("", "metal_free/"):
+        primary = np.exp(-bare[f"{twin}noise_free"].astype(np.float64))
+        expected = heel * primary + fraction
+        # float32 through three roundings of numbers of at most 1.5
+        np.testing.assert_allclose(out[f"{twin}counts"] / machine.i0, expected, rtol=1e-6, atol=1e-7)
+        lit = np.broadcast_to(heel > 0, expected.shape)
+        p = -np.log(np.where(lit, expected, primary) / np.where(lit, heel, 1.0))
+        np.testing.assert_allclose(out[f"{twin}noise_free"], p, rtol=1e-6, atol=2e-6)
+        if fraction:
+            np.testing.assert_allclose(out[f"{twin}scatter_free"], bare[f"{twin}noise_free"], rtol=1e-6, atol=1e-6)
+    assert (heel == 0).any() and heel.max() > 1.05
+    flat = flat_image(plan, machine)
+    np.testing.assert_allclose(flat / machine.i0, np.broadcast_to(heel, flat.shape), rtol=1e-6)
+
+
+@pytest.mark.parametrize("skip", [True, False])
+def test_tigre_noise_is_normalised_by_the_largest_p_of_the_whole_scan(skip):
+    # seen along its length in one view of two, the rods make P far larger there
+    row = tuple(rod(x=x, radius=2.0) for x in (-9.0, 0.0, 9.0))
+    geometry = msgspec.structs.replace(GEOMETRY, n_views=2, n_detector=(160, 200), d_detector=(0.6, 0.6), arc_deg=180.0)
+    body, truth = phantom(solids=row), Truth(noise_free=True)
+    machine = scanner(geometry=geometry, noise=Noise(model="tigre", electronic=0.0), i0=1e4)
+    simulation = Simulation(skip=skip)
+    _, out = run(body, machine, simulation, truth)
+    _, rest = run(body, machine, simulation, truth, first_view=1)
+    np.testing.assert_array_equal(out["counts"][1:], rest["counts"])  # gone on with after an interruption
+    tops = {}
+    for twin in ("", "metal_free/"):
+        p = out[f"{twin}noise_free"].astype(np.float64)
+        tops[twin] = top = p.max()
+        assert p[0].max() < 0.8 * top or p[1].max() < 0.8 * top or twin
+        for k in range(2):
+            # N = i0·exp(−p/top) photons decide: the spread of P is top/sqrt(N), here near p = 0.7
+            near = np.abs(p[k] - 0.7) < 0.1
+            noise = (-np.log(out[f"{twin}counts"][k][near] / 1e4) - p[k][near]) / (
+                top / np.sqrt(1e4 * np.exp(-p[k][near] / top))
+            )
+            assert noise.std() == pytest.approx(1.0, rel=5 / np.sqrt(2 * near.sum()) + 0.01), (twin, k)
+    assert tops[""] > 2 * tops["metal_free/"]
+
+
+def test_a_pattern_that_the_flat_leaves_gives_rings():
+    body = Phantom(labels=phantom().labels.clip(0, 1), materials=("air", "water"), d_voxel=(2.0,) * 3, solids=())
+    geometry = msgspec.structs.replace(
+        GEOMETRY, n_views=120, n_detector=(6, 96), d_detector=(1.0, 1.0), n_voxel=(1, 64, 64), d_voxel=(1.0,) * 3
+    )
+    plain = fdk_of(body, scanner(geometry=geometry))
+    inside = np.hypot(*np.meshgrid(np.arange(64) - 31.5, np.arange(64) - 31.5)) < 13  # of the water
+    water = float(plain[0][inside].mean())
+
+    def added(noise):
+        return (fdk_of(body, scanner(geometry=geometry, noise=noise)) - plain)[0]
+
+    flat_takes_out = added(Noise(model="none", fixed_pattern=0.03, pattern_residual=0.0))
+    assert np.abs(flat_takes_out[inside]).max() < 1e-4 * water
+    rings = added(Noise(model="none", fixed_pattern=0.03))
+    assert rings[inside].std() > 0.003 * water
+    # rings look the same from all sides, noise does not; 120 views and the grid are their own quarter turn
+    assert np.corrcoef(rings[inside], np.rot90(rings)[inside])[0, 1] > 0.95
+    noise = added(Noise(electronic=0.0))
+    assert np.corrcoef(noise[inside], np.rot90(noise)[inside])[0, 1] < 0.3
+
+
+def fdk_of(body, machine):
+    plan, out = run(body, machine, truth=Truth(twin=False))
+    dark = machine.noise.dark
+    p = -np.log((out["counts"] - dark) / (flat_image(plan, machine) - dark)).astype(np.float32)
+    return fdk(torch.from_numpy(p), machine.geometry).numpy()
 
 
 def test_bow_tie_and_heel_cancel_in_the_flat_field():

@@ -172,9 +172,10 @@ def _row_words(key, first, words):
 def detect(m1, m2, pattern, spans, i0, electronic, gain, dark, full, key, out, bad):
     """Draw the counts of one view in columns spans[v] = (from, to) of its rows.
 
-    `m1`, `m2` [v, u] are mean and second moment relative to the open field; `pattern` float32 [v, u] multiplies the
-    photons' signal (size 0: one everywhere; a pixel of 0 is dead and reads `dark`). out = dark + gain·signal,
-    rounded and clipped to 0..full where full > 0. bad[v] becomes 1 in rows with an impossible moment.
+    `m1`, `m2` [v, u] are mean and second moment relative to the open field; `pattern` float32 [2, v, u] multiplies the
+    photons' signal s by p0·(1 + p1·(1 − s)), with s at most 1 in it (size 0: by one everywhere; a pixel with p0 = 0 is
+    dead and reads `dark`). out = dark + gain·signal, rounded and clipped to 0..full where full > 0. bad[v] becomes 1 in
+    rows with an impossible moment.
     """
     n_v, n_u = m1.shape
     key = np.uint64(key)
@@ -199,7 +200,9 @@ def detect(m1, m2, pattern, spans, i0, electronic, gain, dark, full, key, out, b
             elif not (mean == 0.0 and 0.0 <= second < np.inf):
                 wrong = True
             value = dark
-            factor = 1.0 if pattern.size == 0 else float(pattern[v, u])
+            factor = 1.0
+            if pattern.size > 0:
+                factor = float(pattern[0, v, u]) * (1.0 + float(pattern[1, v, u]) * max(1.0 - signal, 0.0))
             if factor > 0.0:
                 if electronic > 0.0:
                     value += gain * (signal * factor + electronic * normal(words[1, u - begin] & _LOW))

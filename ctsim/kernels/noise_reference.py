@@ -85,7 +85,10 @@ def detect(m1, m2, pattern, i0, electronic, gain, dark, full, key, out, bad):
             signal = _poisson(photons, index, key) * (second / (mean * i0))
         elif not (mean == 0 and 0 <= second < math.inf):
             bad[v] = 1
-        factor = float(pattern[v, u]) if pattern.size else 1.0
+        factor = 1.0
+        if pattern.size:
+            gain0, bend = float(pattern[0, v, u]), float(pattern[1, v, u])
+            factor = gain0 * (1 + bend * max(1 - signal, 0))
         value = dark
         if factor > 0:
             value += gain * (signal * factor + electronic / i0 * normal(_block(key, index, 0)[3]))
