@@ -4,11 +4,10 @@ import enum
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ctsim.detector import Detector
@@ -19,6 +18,9 @@ from ctsim.scaninfo import check_readings
 from ctsim.scatter import Scatter
 from ctsim.solids import Solid
 from ctsim.spectrum import Tube
+
+if TYPE_CHECKING:
+    import torch  # loaded where there are readings: most of a second that making data does without
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,55 +109,55 @@ class Scan:
     """
 
     geometry: Geometry
-    counts: torch.Tensor
-    flat: torch.Tensor
+    counts: "torch.Tensor"
+    flat: "torch.Tensor"
     dark: float = 0.0
     i0: float = 1e5
     e_max: float = 90.0
-    metal: torch.Tensor | None = None
+    metal: "torch.Tensor | None" = None
 
     def __post_init__(self) -> None:
         check_readings(self.dark, self.i0, self.e_max)
         _check_array("counts", self.counts, self.geometry.shape, READINGS)
         _check_array("flat", self.flat, self.geometry.n_detector, READINGS)
         if self.metal is not None:
-            _check_array("metal", self.metal, self.geometry.n_voxel, (torch.bool, *READINGS))
+            _check_array("metal", self.metal, self.geometry.n_voxel, ("bool", *READINGS))
         flat = self.flat.double()
         if not bool(((flat > self.dark) & (flat < math.inf)).any()):
             raise InputError(f"flat: no pixel is finite and above the pedestal, dark = {self.dark:g} counts")
 
     @classmethod
     def from_line_integrals(
-        cls, p: torch.Tensor | NDArray[np.floating], geometry: Geometry, *, e_max: float, i0: float = 1e5
+        cls, p: "torch.Tensor | NDArray[np.floating]", geometry: Geometry, *, e_max: float, i0: float = 1e5
     ) -> "Scan":
         """Return the scan whose −log projections are `p` [view, v, u], for measurements that are no longer counts.
 
         `i0` is how many photons an open pixel saw: readings below half a photon, p above ln(2 i0), count as nothing
         seen, as do those that are not finite. Raises InputError as `Scan` does.
         """
+        import torch
+
         check_readings(0.0, i0, e_max)
         counts = i0 * torch.exp(-torch.as_tensor(p, dtype=torch.float64))
         flat = torch.full(geometry.n_detector, i0, dtype=torch.float32)
         return cls(geometry=geometry, counts=counts.float(), flat=flat, i0=i0, e_max=e_max)
 
 
-READINGS = (
-    torch.uint8, torch.uint16, torch.uint32, torch.int8, torch.int16, torch.int32, torch.int64,
-    torch.float16, torch.float32, torch.float64,
-)  # fmt: skip
+READINGS = ("uint8", "uint16", "uint32", "int8", "int16", "int32", "int64", "float16", "float32", "float64")
 """What readings may be stored as: real numbers of types that NumPy has too."""
 
 
-def _check_array(name: str, given: Any, shape: tuple[int, ...], dtypes: tuple[torch.dtype, ...]) -> None:
+def _check_array(name: str, given: Any, shape: tuple[int, ...], dtypes: tuple[str, ...]) -> None:
     """Raise InputError unless `given` is a tensor of that shape and one of these types that needs no gradient."""
+    import torch
+
     if not isinstance(given, torch.Tensor):
         hint = f"; torch.from_numpy({name}) makes one" if isinstance(given, np.ndarray) else ""
         raise InputError(f"{name} must be a torch.Tensor, got {type(given).__module__}.{type(given).__name__}{hint}")
     if tuple(given.shape) != shape:
         raise InputError(f"{name}: shape {tuple(given.shape)}, the geometry says {shape}")
-    if given.dtype not in dtypes:
-        names = ", ".join(str(dtype).removeprefix("torch.") for dtype in dtypes)
-        raise InputError(f"{name} must be real numbers ({names}), got {given.dtype}")
+    if str(given.dtype).removeprefix("torch.") not in dtypes:
+        raise InputError(f"{name} must be real numbers ({', '.join(dtypes)}), got {given.dtype}")
     if given.requires_grad:
         raise InputError(f"{name} must not require gradients; {name}.detach() does not")
 
@@ -179,8 +181,8 @@ class Volume:
     `at_energy` gives the attenuation at an energy (keV), as `values`, where the method knows how it depends on energy.
     """
 
-    values: torch.Tensor
+    values: "torch.Tensor"
     status: Status = Status.OK
     reason: str = ""
     details: dict[str, Any] = field(default_factory=dict)
-    at_energy: Callable[[float], torch.Tensor] | None = None
+    at_energy: "Callable[[float], torch.Tensor] | None" = None

@@ -46,6 +46,10 @@ def test_what_lists_and_checks_datasets_loads_nothing_slow(module):
     assert not loaded(f"import {module}") & (DRAWS | SLOW)
 
 
+def test_making_data_does_without_torch():
+    assert "torch" not in loaded("import phantoms.scene, ctsim.simulate, ctsim.writer, benchmarks.make_dataset")
+
+
 def test_nothing_below_benchmarks_draws_or_talks():
     names = [m for p in BELOW_BENCHMARKS for m in modules(p) if m != "ctsim.data.make_spectrum_table"]
     assert len(names) > 30

@@ -57,7 +57,7 @@ def test_what_cannot_be_is_refused_in_one_sentence(change, said):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("dtype", READINGS, ids=str)
+@pytest.mark.parametrize("dtype", [getattr(torch, name) for name in READINGS], ids=str)
 def test_readings_of_every_type_that_numpy_has_are_taken(dtype):
     counts, flat = (torch.full(shape, 100).to(dtype) for shape in (GEOMETRY.shape, GEOMETRY.n_detector))
     assert Scan(geometry=GEOMETRY, counts=counts, flat=flat, dark=np.float32(1), i0=np.int64(7)).counts is counts
