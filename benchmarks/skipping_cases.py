@@ -322,6 +322,25 @@ def edges(setup: Setup) -> Iterator[Pair[list[NDArray[np.float32]]]]:
     )
 
 
+def refining(setup: Setup) -> Iterator[Pair[Images]]:
+    """Yield scans without and with further sub-rays for edge pixels that are too far off: their cost, not an error."""
+    for scene in setup.inside_and_outside():
+        plan, phantom, scanner = planned(setup, scene=scene)
+        settings = msgspec.structs.replace(plan.settings, edge_tolerance=math.inf)
+        yield Pair(
+            case="refining",
+            scene=scene.name,
+            what=f"further sub-rays for edge pixels estimated to be off by over {plan.settings.edge_tolerance} in P",
+            skipping=next_views(setup, dataclasses.replace(plan, settings=settings), phantom, scanner),
+            whole=next_views(setup, plan, phantom, scanner),
+            difference=lambda a, b: apart(a, b, ("noise_free", "metal_free/noise_free")),
+            unit="P",
+            limit=None,
+            stated="a choice",
+            note="by default they are made: the gain is what they cost",
+        )
+
+
 def scatter(setup: Setup) -> Iterator[Pair[Images]]:
     """Yield a scan without and with the constant scatter of level 1: what level 0 leaves out, not an error."""
     plain, phantom, scanner = planned(setup)
@@ -390,6 +409,7 @@ CASES: dict[str, Pairs] = {
     "rays": rays,
     "energies": energies,
     "edges": edges,
+    "refining": refining,
     "scatter": scatter,
     "twin": twin,
     "truth": truth,

@@ -62,6 +62,7 @@ def test_every_case_is_measured_and_stays_within_what_is_stated(run):
     # fewer energies and no scatter are seen in the result, or the two ways were the same
     assert 0 < by["energies"].difference <= by["energies"].limit < 2e-4
     assert by["scatter"].difference > 1e-3 and by["scatter"].limit is None
+    assert by["refining"].difference > 1e-3 and by["refining"].limit is None
     text = (folder / "skipping.md").read_text(encoding="utf-8")
     assert all(f"| {case} |" in text for case in skipping.CASES) and "Grids this small" in text and "NO" not in text
 
