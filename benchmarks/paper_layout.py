@@ -15,6 +15,7 @@ import msgspec
 from benchmarks import latex
 from benchmarks.columns import COLUMNS, Column
 from benchmarks.methods import Method
+from benchmarks.paper_scenes import title
 from benchmarks.texts import escape, ranked
 from ctsim.errors import InputError
 
@@ -67,6 +68,11 @@ class Planned:
     params: dict[str, Any]
 
     @property
+    def place(self) -> str:
+        """The scene as tables call it."""
+        return title((self.suite, self.scene))
+
+    @property
     def label(self) -> str:
         """The label that its records have."""
         return Method(name=self.method, target="", inputs="", params={}, overrides=self.params).label
@@ -115,6 +121,10 @@ class Table(What, frozen=True, kw_only=True, forbid_unknown_fields=True):
             method=row.method or column.method or self.method,
             params={**self.set, **column.set, **row.set},
         )
+
+    def plan(self) -> list[list[Planned]]:
+        """Return what is run for each cell [row][column]."""
+        return [[self.planned(row, column) for column in self.columns] for row in self.rows]
 
     def printed(self, k: int) -> list[str]:
         """Return the paper's figures in column `k`."""
@@ -197,7 +207,7 @@ def _ranked(table: Table, grid: list[list[Cell]]) -> list[list[Cell]]:
     groups: dict[tuple[Any, ...], list[tuple[int, int]]] = {}
     for i, row in enumerate(table.rows if table.rank else ()):
         for k, column in enumerate(table.columns):
-            key = (column.metric, table.planned(row, column).scene, i if table.rank == "across" else k)
+            key = (column.metric, table.planned(row, column).place, i if table.rank == "across" else k)
             groups.setdefault(key, []).append((i, k))
     out = [list(row) for row in grid]
     for group in groups.values():

@@ -1,7 +1,8 @@
 """`run-benchmark paper-tables RESULTS...`: all tables of the paper, its own figures beside what was measured here.
 
-Ours come from the records of one or several results folders; nothing is computed. A cell without a record is "–", and
-the command that makes it stands below the table.
+Ours come from the records of one or several results folders; nothing is computed. A record counts where it is of the
+very scene, of any seed, that the table plans; those of others of its name are counted below the table. A cell without a
+record is "–", and the command that makes it stands there, too.
 """
 
 import sys
@@ -10,10 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import msgspec
 import tyro
 
 from benchmarks.methods import TABLE
 from benchmarks.paper_layout import Cell, Form, Paper, Planned, Sheet, Table, duration, load, printed, render
+from benchmarks.paper_scenes import Scenes, strangers, title
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:
@@ -65,12 +68,12 @@ def read(folders: tuple[Path, ...]) -> "list[Record]":
 def text_of(found: "list[Record]", form: Form, protocol: Protocol, numbers: tuple[int, ...] = ()) -> str:
     """Return the numbered tables, all where none is named, as text.
 
-    Raises InputError for a table that the paper lacks, and where seeds of one scene have grids of different sizes.
+    Raises InputError for a table that the paper lacks.
     """
     from benchmarks import records
 
     paper = load()
-    measured = Measured.of(found)
+    measured = Measured.of(found, paper)
     parts = [render(fill(t, measured, protocol), form) for t in chosen(paper, numbers)]
     old = records.outdated(found)
     mark = "" if form == "md" else "% "
@@ -89,26 +92,30 @@ def chosen(paper: Paper, numbers: tuple[int, ...]) -> list[Table]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measured:
-    """What the tables take from records: those that count of each scene and label, and their means over seeds.
+    """What the tables take from records: those that count of each planned scene and label, and their means over seeds.
 
-    `replaced` counts by scene the records of data that were made anew since.
+    Scenes are called SUITE/NAME. `replaced` counts by scene the records of data that were made anew since; `all` are
+    the records before, whose scenes have the names of the scans.
     """
 
     runs: "dict[tuple[str, str], list[Record]]"
     numbers: dict[tuple[str, str, str, str], dict[Any, Any]]
     replaced: dict[str, int]
+    all: "list[Record]"
+    scenes: Scenes
 
     @classmethod
-    def of(cls, found: "list[Record]") -> "Measured":
+    def of(cls, found: "list[Record]", paper: Paper) -> "Measured":
         """Keep what counts of records that are sorted by time."""
         from benchmarks import records, tables
 
-        known = [r for r in found if r.run.variant == "metal" and r.run.protocol == records.VERSION]
+        scenes = Scenes((p.suite, p.scene) for table in paper.table for row in table.plan() for p in row)
+        own = [r for r in found if r.run.variant == "metal" and r.run.protocol == records.VERSION]
+        known = [_called(r, title(key)) for r in own if (key := scenes.of(r.run)) is not None]
         latest = records.latest(known)
         runs: dict[tuple[str, str], list[Record]] = {}
         for record in latest:
             runs.setdefault((record.run.scene, record.label), []).append(record)
-        _check_grids(latest)
         data = {(r.run.scene, r.run.seed): r.run.scan for r in latest}
         replaced: dict[str, int] = {}
         for record in known:
@@ -116,36 +123,28 @@ class Measured:
                 replaced[record.run.scene] = replaced.get(record.run.scene, 0) + 1
         rows: list[dict[Any, Any]] = tables.summary(latest).to_dict("records")
         numbers = {(row["scene"], row["method"], row["protocol"], row["metric"]): row for row in rows}
-        return cls(runs=runs, numbers=numbers, replaced=replaced)
+        return cls(runs=runs, numbers=numbers, replaced=replaced, all=own, scenes=scenes)
 
 
-def _check_grids(latest: "list[Record]") -> None:
-    """Refuse to average seeds of different grids, as of the suites quick and core in one call."""
-    grids: dict[str, set[int]] = {}
-    for record in latest:
-        if "paper" in record.scores:
-            grids.setdefault(record.run.scene, set()).add(record.scores["paper"].n_voxels)
-    for scene, sizes in grids.items():
-        if len(sizes) > 1:
-            raise InputError(
-                f"scene {scene!r}: its seeds have grids of {' and '.join(map(str, sorted(sizes)))} voxels; "
-                "expected results of one suite"
-            )
+def _called(record: "Record", scene: str) -> "Record":
+    """Return a record whose scene has this name; the identity stays that of the run as it was."""
+    return msgspec.structs.replace(record, run=msgspec.structs.replace(record.run, scene=scene))
 
 
 def fill(table: Table, measured: Measured, protocol: str) -> Sheet:
     """Fill a table from records."""
-    planned = [[table.planned(row, column) for column in table.columns] for row in table.rows]
+    planned = table.plan()
     here = [[_cell(table, k, p, measured, protocol) for k, p in enumerate(row)] for row in planned]
     paper = [[printed(text) for text in row.figures or ("",) * len(table.columns)] for row in table.rows]
-    every = {(p.scene, p.label): p for row in planned for p in row}
+    every = {(p.place, p.label): p for row in planned for p in row}
+    strange = strangers(measured.all, measured.scenes, [(p.suite, p.scene, p.label) for p in every.values()])
     used = [record for key in every for record in measured.runs.get(key, [])]
     missing = [p for key, p in every.items() if key not in measured.runs]
     sheet = Sheet(
         table=table,
         caption=caption(table, used, protocol),
         cells={"paper": paper, "here": here},
-        notes=[*([table.note] if table.note else []), *_remarks(used, measured), *commands(table, missing)],
+        notes=[*([table.note] if table.note else []), *_remarks(used, measured), *strange, *commands(table, missing)],
     )
     return sheet.ranked()
 
@@ -155,11 +154,11 @@ def _cell(table: Table, k: int, planned: Planned, measured: Measured, protocol: 
     from benchmarks.records import OK
 
     metric = table.columns[k].metric
-    runs = measured.runs.get((planned.scene, planned.label), [])
+    runs = measured.runs.get((planned.place, planned.label), [])
     bad = [r.status for r in runs if r.status != OK]
     if bad:
         return Cell(text=bad[-1])
-    row = measured.numbers.get((planned.scene, planned.label, "cost" if metric == "wall" else protocol, metric))
+    row = measured.numbers.get((planned.place, planned.label, "cost" if metric == "wall" else protocol, metric))
     if row is None or row["n"] == 0:
         return Cell(text="identical") if row is not None and row["identical"] else Cell()
     if metric == "wall":
@@ -178,8 +177,7 @@ def caption(table: Table, used: "list[Record]", protocol: str) -> str:
     if not timed:
         parts.append("The paper states neither the region, nor the energy of the reference, nor the peak of PSNR3D.")
     parts.append(f"Here: {tables.caption(used, 'cost' if timed else protocol)}")
-    planned = [table.planned(row, column) for row in table.rows for column in table.columns]
-    steps = sorted({p.params["steps"] for p in planned if "steps" in p.params})
+    steps = sorted({p.params["steps"] for row in table.plan() for p in row if "steps" in p.params})
     if steps:
         parts.append(f"A run has {' or '.join(map(str, steps))} steps here, a tenth of the published.")
     if used:
@@ -232,8 +230,7 @@ def _remarks(used: "list[Record]", measured: Measured) -> list[str]:
     failed = [f"{r.run.scene}, {r.label}: {r.status} – {r.reason or 'no reason given'}" for r in used if r.status != OK]
     scenes = dict.fromkeys(r.run.scene for r in used)
     old = [
-        f"{s}: {measured.replaced[s]} records of older data are left out; the scan was made anew, or two suites "
-        "have a scene of this name"
+        f"{s}: {measured.replaced[s]} records of older data are left out; the scan was made anew"
         for s in scenes
         if s in measured.replaced
     ]

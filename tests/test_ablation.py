@@ -37,8 +37,7 @@ def command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
     monkeypatch.setitem(methods.TABLE, "splat", ("stub_splat:reconstruct", methods.COUNTS_ONLY))
-    make = make_dataset.main
-    monkeypatch.setattr(make_dataset, "main", lambda given: make(["tiny.toml", *given[1:]]))
+    monkeypatch.setattr(make_dataset, "load", lambda suite: load_suite("tiny.toml" if suite == "ablation" else suite))
     yield lambda *more: run(monkeypatch, capsys, more)
     sys.modules.pop("stub_splat", None)
 
