@@ -21,6 +21,7 @@ from benchmarks.artefact import water_attenuation
 from benchmarks.intermediates import Intermediates
 from benchmarks.protocol import Stored, Truth, truth_of
 from benchmarks.records import OK, Record, latest
+from benchmarks.texts import pictured
 from benchmarks.volumes import identity_of, map_volume
 
 PLANES = ((0, "z"), (1, "y"))
@@ -111,7 +112,7 @@ def draw(stored: Stored, truth: Truth, rows: list[Row]) -> Figure:
     reference = Row(caption="reference\neffective\nspectrum", volume=truth.references["effective"])
     for i, row in enumerate([reference, *rows]):
         _slices(grid[i], row.volume, truth, at, look)
-        grid[i, 0].set_ylabel(row.caption, rotation=0, ha="right", va="center", fontsize=8)
+        grid[i, 0].set_ylabel(pictured(row.caption), rotation=0, ha="right", va="center", fontsize=8)
         if i:
             _errors(grid[i, len(PLANES) :], row.volume, truth, at, look)
         if i and worked:
@@ -122,7 +123,7 @@ def draw(stored: Stored, truth: Truth, rows: list[Row]) -> Figure:
         grid[0, -2].set_xlabel("as backprojected", fontsize=8)
     _heads(grid, at, worked)
     _bars(figure, plan, grid, look)
-    figure.suptitle(_title(stored, truth, look, worked), fontsize=8)
+    figure.suptitle(pictured(_title(stored, truth, look, worked)), fontsize=8)
     return figure
 
 

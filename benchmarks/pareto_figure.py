@@ -12,6 +12,7 @@ from matplotlib.ticker import LogLocator
 from benchmarks.pareto_front import front
 from benchmarks.pareto_records import Part, Point, at_knee
 from benchmarks.pareto_table import curves, groups
+from benchmarks.texts import pictured
 
 DPI, WIDE, HIGH = 150, 9.0, 4.6
 MARKERS, STYLES = ("o", "^", "s", "D"), ("-", "--", ":", "-.")  # by group
@@ -42,10 +43,10 @@ def _scene(axes: Axes, every: Sequence[Point]) -> None:
             x, y = zip(*sorted(p.pair for p in mine), strict=True)  # a default may stand anywhere on its curve
             colour = COLOURS[known.index(curve) % len(COLOURS)]
             marker = MARKERS[k % len(MARKERS)]
-            handles += axes.plot(x, y, marker=marker, markersize=5, linewidth=0.8, color=colour, label=curve)
+            handles += axes.plot(x, y, marker=marker, markersize=5, linewidth=0.8, color=colour, label=pictured(curve))
         pairs = [p.pair for p in group]
         x, y = zip(*(pairs[i] for i in front(pairs)), strict=True)
-        label = f"front: {group[0].setting.group}"
+        label = pictured(f"front: {group[0].setting.group}")
         handles += axes.step(
             x, y, where="post", color=FRONT, linewidth=1.0, linestyle=STYLES[k % len(STYLES)], zorder=1, label=label
         )
@@ -60,7 +61,7 @@ def _scene(axes: Axes, every: Sequence[Point]) -> None:
     ]
     setting = every[0].setting
     x, y = AXES[setting.part]
-    axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y, title=f"{setting.part}, {setting.scene}")
+    axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y, title=pictured(f"{setting.part}, {setting.scene}"))
     axes.grid(which="both", alpha=0.2)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter("{x:g}")

@@ -47,6 +47,11 @@ def escape(text: str, form: Literal["md", "tex"]) -> str:
     return text.translate(_ESCAPED[form])
 
 
+def pictured(text: str) -> str:
+    """Escape what matplotlib would take as mathematics, so that it draws the very text."""
+    return text.replace("$", r"\$")
+
+
 def harmless(text: str) -> str:
     """Return a text as a cell of CSV that no spreadsheet takes for a formula, on one line."""
     text = one_line(text)

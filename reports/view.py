@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from benchmarks.texts import pictured
 from ctsim.errors import InputError
 from reports.kept import Case
 
@@ -130,12 +131,13 @@ def figure(case: Case, state: State) -> Figure:
             cell.imshow(image.values, origin="lower", aspect=d_v / d_u, interpolation="nearest", **colours)
             if image.metal.any() and not image.metal.all() and min(image.metal.shape) > 1:
                 cell.contour(image.metal, levels=[0.5], colors="#ffb000", linewidths=0.7)
-            cell.set_title(image.title, fontsize=8)
+            cell.set_title(pictured(image.title), fontsize=8)
     low, high = state.level - state.width / 2, state.level + state.width / 2
     said = f"window {low:.4g} … {high:.4g} {unit(case)}"
     if state.errors:
         said += f", errors ± {state.error:.4g} {unit(case)}"
-    drawing.suptitle(f"{case.stored.name}, slice {state.index} normal to {state.axis}; {said}", fontsize=8)
+    title = f"{case.stored.name}, slice {state.index} normal to {state.axis}; {said}"
+    drawing.suptitle(pictured(title), fontsize=8)
     return drawing
 
 

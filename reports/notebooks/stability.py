@@ -27,6 +27,7 @@ import torch
 from matplotlib.figure import Figure
 
 from benchmarks import stress_records
+from benchmarks.texts import pictured
 from ctsim.detector import Detector
 from ctsim.geometry import Geometry
 from ctsim.kernels import joseph_reference
@@ -135,8 +136,8 @@ if rows:
     for ok, colour in ((True, COLOURS[0]), (False, COLOURS[5])):
         at = [(subjects.index(r.subject), cases.index(r.case)) for r in rows if r.ok == ok]
         axes.scatter([x for x, _ in at], [y for _, y in at], s=28, marker="s", color=colour)
-    axes.set_xticks(range(len(subjects)), labels=subjects, rotation=90, fontsize=8)
-    axes.set_yticks(range(len(cases)), labels=cases, fontsize=8)
+    axes.set_xticks(range(len(subjects)), labels=[pictured(s) for s in subjects], rotation=90, fontsize=8)
+    axes.set_yticks(range(len(cases)), labels=[pictured(c) for c in cases], fontsize=8)
     axes.invert_yaxis()
     show.figure(drawing, "stability-stress")
 else:
