@@ -5,11 +5,14 @@ effective-spectrum reference, and, where a method attached them (`benchmarks.int
 it backprojected with the metal's trace, and its prior.
 """
 
+import hashlib
+import json
 import textwrap
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -23,12 +26,14 @@ from benchmarks.protocol import Stored, Truth, truth_of
 from benchmarks.records import OK, Record, latest
 from benchmarks.texts import pictured
 from benchmarks.volumes import identity_of, map_volume
+from ctsim.durable import replacing, sync
 
 PLANES = ((0, "z"), (1, "y"))
 TOP, ERROR = 2.5, 1.0
 """The window ends at 2.5 times the median of the body, errors at once that: for soft tissue 1500 and ± 1000 HU."""
 
 METAL, UNJUDGED = "#ffb000", "#8c8c8c"
+KEY = "ctsim shows"  # of the digest in a picture
 CELL, LABEL, DPI = 1.75, 1.1, 150  # inches, inches, dots an inch
 
 
@@ -60,22 +65,64 @@ def cut(metal: NDArray[np.bool_], body: NDArray[np.bool_]) -> tuple[int, int, in
 
 
 def write_panels(records: list[Record], scans: list[Stored], results: Path) -> list[Path]:
-    """Draw panels/SCENE.png for every scan that has kept volumes; return what was written."""
+    """Draw panels/SCENE.png for every scan that has kept volumes; return what was written.
+
+    A picture holds a digest of what it shows (`_digest`); one that shows what is there already stays.
+    """
+    mine: dict[str, list[Record]] = {}
+    for record in latest(records):
+        if record.volume and "tissue" in record.scores and record.run.variant == "metal":
+            mine.setdefault(record.run.scan, []).append(record)
     written = []
     for stored in scans:
-        rows = []
-        for record in latest(records):
-            path = results / record.volume if record.volume else None
-            mine = record.run.scan == stored.content_hash and record.run.variant == "metal" and record.scores
-            if mine and path is not None and identity_of(path) == record.identity:
-                shown = intermediates.read(intermediates.path_of(path), record.identity)
-                rows.append(Row(caption=_caption(record), volume=map_volume(path), shown=shown))
-        if rows:
-            path = results / "panels" / f"{stored.name}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            draw(stored, truth_of(stored), rows).savefig(path, dpi=DPI)
-            written.append(path)
+        kept = [(r, results / str(r.volume)) for r in mine.get(stored.content_hash, [])]
+        kept = [(record, path) for record, path in kept if identity_of(path) == record.identity]
+        picture, digest = results / "panels" / f"{stored.name}.png", _digest(stored, kept)
+        if kept and _held(picture) != digest:
+            picture.parent.mkdir(parents=True, exist_ok=True)
+            figure = draw(stored, truth_of(stored), [_row(*pair) for pair in kept])
+            with replacing(picture) as new:
+                figure.savefig(new, format="png", dpi=DPI, metadata={KEY: digest})
+                sync(new)  # a picture with its digest counts as whole
+            written.append(picture)
     return written
+
+
+def _row(record: Record, path: Path) -> Row:
+    shown = intermediates.read(intermediates.path_of(path), record.identity)
+    return Row(caption=_caption(record), volume=map_volume(path), shown=shown)
+
+
+def _digest(stored: Stored, kept: list[tuple[Record, Path]]) -> str:
+    """Hash what a picture depends on: the scan, the runs with their scores, their files, and how it is drawn.
+
+    A file counts by its size and time: a run that is done again has the same identity.
+    """
+    rows = [
+        (record.identity, _caption(record), [_stamp(file) for file in (path, intermediates.path_of(path))])
+        for record, path in kept
+    ]
+    what = (stored.name, stored.content_hash, rows, matplotlib.__version__, Path(__file__).read_text(encoding="utf-8"))
+    return hashlib.sha256(json.dumps(what).encode()).hexdigest()
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return None
+    return found.st_size, found.st_mtime_ns
+
+
+def _held(picture: Path) -> str | None:
+    """Return the digest that a picture holds; None where there is none, or no picture."""
+    from PIL import Image
+
+    try:
+        with Image.open(picture) as image:
+            return image.info.get(KEY)
+    except (OSError, SyntaxError, ValueError):  # what Pillow raises for a damaged one
+        return None
 
 
 def _caption(record: Record) -> str:

@@ -20,6 +20,7 @@ from benchmarks import lines, pareto_suite
 from benchmarks.host import commit, host, use_threads
 from benchmarks.pareto_records import NAME, WHAT, Part, Timed, latest, read, runs
 from benchmarks.records import OK
+from ctsim.durable import replacing, write_synced
 from ctsim.errors import InputError
 from ctsim.human import human_choice, human_time
 
@@ -256,9 +257,10 @@ def _report(out: Path) -> None:
         which = f"there are {len(found)} records of another version only" if found else "there are no records"
         raise InputError(f"{out / NAME}: {which}; run without --table first")
     summary = pareto_table.summary(shown)
-    (out / "pareto.md").write_text(summary + pareto_table.every_point(shown), encoding="utf-8")
+    write_synced(out / "pareto.md", (summary + pareto_table.every_point(shown)).encode())
     written = "pareto.md, with every point"
     if drawn := points(shown):
-        pareto_figure.draw(drawn).savefig(out / "pareto.png", dpi=pareto_figure.DPI)
+        with replacing(out / "pareto.png") as new:
+            pareto_figure.draw(drawn).savefig(new, format="png", dpi=pareto_figure.DPI)
         written += ", and pareto.png"
     sys.stdout.write(f"{summary}\nWritten: {out}/{written}; records in {NAME}\n")

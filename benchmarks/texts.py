@@ -47,9 +47,9 @@ def escape(text: str, form: Literal["md", "tex"]) -> str:
     return text.translate(_ESCAPED[form])
 
 
-def pictured(text: str) -> str:
+def pictured(text: object) -> str:
     """Escape what matplotlib would take as mathematics, so that it draws the very text."""
-    return text.replace("$", r"\$")
+    return str(text).replace("$", r"\$")
 
 
 def harmless(text: str) -> str:

@@ -58,10 +58,8 @@ def quality(records: list[Record], protocol: str = "tissue", metric: str = "psnr
             known = row.dropna()
             axes.plot([known.min(), known.max()], [line, line], color=INK, lw=0.8, alpha=0.5, zorder=1)
         for k, scene in enumerate(wide.columns):
-            axes.scatter(
-                wide[scene], range(len(wide)), s=26, color=COLOURS[k % len(COLOURS)], label=pictured(str(scene))
-            )
-        axes.set_yticks(range(len(wide)), labels=[pictured(str(name)) for name in wide.index])
+            axes.scatter(wide[scene], range(len(wide)), s=26, color=COLOURS[k % len(COLOURS)], label=pictured(scene))
+        axes.set_yticks(range(len(wide)), labels=[pictured(name) for name in wide.index])
         axes.set_ylim(-0.6, len(wide) - 0.4)
         axes.set_xlabel(f"{column.title}, protocol {protocol}")
         axes.grid(axis="x", color=INK, alpha=0.18, lw=0.6)
@@ -84,9 +82,7 @@ def worth(records: list[Record]) -> Figure | None:
         axes = figure.subplots()
         axes.scatter(both.wall, both.psnr, s=26, color=COLOURS[0])
         labels = [
-            axes.annotate(
-                pictured(str(name)), (row.wall, row.psnr), xytext=(4, 3), textcoords="offset points", fontsize=8
-            )
+            axes.annotate(pictured(name), (row.wall, row.psnr), xytext=(4, 3), textcoords="offset points", fontsize=8)
             for name, row in both.sort_values("psnr", ascending=False).iterrows()
         ]
         axes.set(xscale="log", xlabel="wall time a scan (s), warm", ylabel="mean PSNR3D (dB), protocol tissue")

@@ -1,4 +1,4 @@
-"""Text of the user's in pictures."""
+"""Pictures: when they are drawn, how they are saved, and text of the user's in them."""
 
 import io
 import xml.etree.ElementTree as ET
@@ -10,14 +10,16 @@ import matplotlib
 import msgspec
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from test_paper_tables import record
 from test_pareto_points import setting, timed
-from test_run import double
+from test_run import GEOMETRY, Double, double, once
 
-from benchmarks import pareto_figure
+from benchmarks import panels, pareto_figure
 from benchmarks.panels import Row, draw
 from benchmarks.pareto_records import points
 from benchmarks.protocol import truth_of
+from benchmarks.volumes import write_volume
 from reports import figures, view
 
 # what matplotlib cannot parse as mathematics, what it would draw as such, and an escape of its own
@@ -31,6 +33,55 @@ def text_of(figure):
         figure.savefig(buffer, format="svg")
     nodes = (node for node in ET.fromstring(buffer.getvalue()).iter() if node.tag.endswith("}text"))
     return "\n".join("".join(node.itertext()) for node in nodes)
+
+
+def saved(tmp_path, *found, scans=None):
+    """Which pictures were drawn, by their names."""
+    return [path.name for path in panels.write_panels(list(found), scans or [double(tmp_path)], tmp_path)]
+
+
+def test_a_picture_is_drawn_again_only_where_it_would_show_something_else(tmp_path):
+    first = once("good", tmp_path)
+    other = Double(folder=tmp_path, name="other", content_hash="another")
+    picture = tmp_path / "panels" / "box.png"
+    assert saved(tmp_path, first) == ["box.png"]
+    assert saved(tmp_path, first, scans=[double(tmp_path), other]) == []
+    second = once("shows", tmp_path)
+    assert saved(tmp_path, first, second) == ["box.png"] and saved(tmp_path, first, second) == []
+    assert second.volume is not None
+    write_volume(tmp_path / second.volume, np.ones(GEOMETRY.n_voxel, np.float32), second.identity)  # by --force
+    assert saved(tmp_path, first, second) == ["box.png"] and saved(tmp_path, first, second) == []
+    scores = {"tissue": msgspec.structs.replace(first.scores["tissue"], values={"psnr3d": 1.0, "ssim3d": 0.5})}
+    assert saved(tmp_path, msgspec.structs.replace(first, scores=scores)) == ["box.png"]
+    for damage in (b"", picture.read_bytes()[:20], b"no picture"):
+        picture.write_bytes(damage)
+        assert saved(tmp_path, first) == ["box.png"]
+    picture.unlink()
+    assert saved(tmp_path, first) == ["box.png"]
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, OSError])
+def test_a_drawing_that_was_stopped_leaves_the_picture_before(tmp_path, monkeypatch, stop):
+    first, second = once("good", tmp_path), once("shows", tmp_path)
+    saved(tmp_path, first)
+    before = (tmp_path / "panels" / "box.png").read_bytes()
+
+    def half(self, path, **_):
+        Path(path).write_bytes(b"half")
+        raise stop
+
+    with monkeypatch.context() as patch, pytest.raises(stop):
+        patch.setattr(Figure, "savefig", half)
+        saved(tmp_path, first, second)
+    assert [(p.name, p.read_bytes()) for p in (tmp_path / "panels").iterdir()] == [("box.png", before)]
+    assert saved(tmp_path, first, second) == ["box.png"]  # the same command goes on
+
+
+def test_records_are_sorted_out_once_whatever_the_number_of_scans(tmp_path, monkeypatch):
+    calls, latest = [], panels.latest
+    monkeypatch.setattr(panels, "latest", lambda found: calls.append(1) or latest(found))
+    saved(tmp_path, scans=[double(tmp_path)] * 9)
+    assert len(calls) == 1
 
 
 def scored(label, scene, psnr):
