@@ -4,6 +4,7 @@ Everything heavy is imported after the command line is understood, so that --hel
 """
 
 import importlib
+import io
 import os
 import signal
 import sys
@@ -48,6 +49,7 @@ def guarded(name: str, module: str, arguments: list[str], *, resumes: bool = Tru
 
     from ctsim.errors import InputError
 
+    _write_anything()
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         main: Callable[[list[str]], int] = importlib.import_module(module).main
@@ -66,6 +68,13 @@ def guarded(name: str, module: str, arguments: list[str], *, resumes: bool = Tru
         return EXIT_INTERRUPTED
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def _write_anything() -> None:
+    """Let the terminal's encoding end no command: what it lacks is written as an escape, such as \\u2013."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _complain(name: str, sentence: str) -> int:

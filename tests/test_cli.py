@@ -1,5 +1,6 @@
 """How the commands end: by a signal, or at once where the device is not there."""
 
+import io
 import signal
 import subprocess
 import sys
@@ -7,6 +8,7 @@ import time
 
 import pytest
 from conftest import SMALLEST
+from test_paper_tables import record
 
 from benchmarks import cli, make_dataset, records
 from benchmarks.devices import check_device
@@ -98,3 +100,28 @@ def test_what_cannot_go_on_does_not_say_that_it_will(monkeypatch, capsys):
     monkeypatch.setattr("benchmarks.tune_nmar.main", stopped)
     assert cli.guarded("tune_nmar", "benchmarks.tune_nmar", [], resumes=False) == 130
     assert "begins anew" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+@pytest.mark.parametrize(
+    ("command", "words", "shown"),
+    [
+        (cli.make_dataset, ["quick", "out", "--dry-run", "--only", "broccoli-Al"], "broccoli-Al"),
+        (cli.make_dataset, ["–", "out"], ""),
+        (cli.run_benchmark, ["data", "r", "--table"], "21.00 ± 1.41"),
+        (cli.run_benchmark, ["paper-tables", "r", "--table", "3"], "| – |"),
+        (cli.run_benchmark, ["paper-tables", "r\udcff"], ""),
+    ],
+)
+def test_a_terminal_of_another_encoding_ends_no_command(tmp_path, monkeypatch, encoding, command, words, shown):
+    """Tables have –, ³ and ±, and a file's name may be no text at all, which Python writes as such a surrogate."""
+    for seed, psnr in ((1, 20.0), (2, 22.0)):
+        records.append(tmp_path / "r" / records.NAME, record(seed=seed, scan=str(seed), psnr=psnr))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["command", *words])
+    streams = {name: io.TextIOWrapper(io.BytesIO(), encoding=encoding) for name in ("stdout", "stderr")}
+    for name, stream in streams.items():
+        monkeypatch.setattr(sys, name, stream)
+    assert command() == (0 if shown else 2)
+    streams["stdout"].flush()
+    assert shown.encode(encoding, "backslashreplace") in streams["stdout"].buffer.getvalue()
