@@ -71,7 +71,7 @@ def guarded(name: str, module: str, arguments: list[str], *, resumes: bool = Tru
 
 
 def _write_anything() -> None:
-    """Let the terminal's encoding end no command: what it lacks is written as an escape, such as \\u2013."""
+    """Let the terminal's encoding end no command: what it lacks is written as an escape, which can be read."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
