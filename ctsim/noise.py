@@ -17,15 +17,15 @@ _NO_PATTERN = np.empty((2, 0, 0), np.float32)
 class Noise(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How photons become counts.
 
-    `electronic` is the standard deviation of the electronic noise in photons that reach an open pixel.
-    The ADC's open field lies at `adc_fill` and its pedestal at `pedestal`, both fractions of full
-    scale; `adc_bits = None` writes float32 photons without pedestal, and so do "tigre" and "none". TIGRE's demos
-    have an `electronic` of 10.
-    `n_flats` flats are averaged (0: a perfect flat). `fixed_pattern` is the relative standard deviation of the pixels'
-    gains in the open field, which dividing by the flat takes out; a pixel's gain also grows by `pattern_residual` times
-    as much, drawn anew, from the open field to no signal. That part stays, the same in all views: rings. The default,
-    a tenth, is a choice. `dead_fraction` is the share of pixels that always read the pedestal. Model
-    "tigre" has no pattern and no dead pixels.
+    `electronic` is the standard deviation of the electronic noise in photons that reach an open pixel (10 in TIGRE's
+    demos). The ADC's open field lies at `adc_fill` and its pedestal at `pedestal`, both fractions of full scale;
+    `adc_bits = None` writes float32 photons without pedestal, and so do "tigre" and "none". `n_flats` flats are
+    averaged (0: a perfect flat). `dead_fraction` is the share of pixels that always read the pedestal.
+
+    `fixed_pattern` is the relative standard deviation of the pixels' gains in the open field, which dividing by the
+    flat takes out. A pixel's gain also changes linearly from there to no signal, by `pattern_residual` times as much,
+    drawn anew; that stays after the flat, the same in all views, and makes rings. The default, a tenth, is a choice.
+    Model "tigre" has no pattern and no dead pixels.
     """
 
     model: Literal["compound", "tigre", "none"] = "compound"
