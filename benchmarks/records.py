@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 
 from benchmarks import lines
+from benchmarks.collector import uncollected
 from benchmarks.host import Host
 from benchmarks.methods import TABLE
 from benchmarks.protocol import VERSION, Score
@@ -111,6 +112,7 @@ def append(path: Path, record: Record) -> None:
         append_synced(path, descriptor, line)
 
 
+@uncollected()
 def read(path: Path) -> tuple[list[Record], Torn | None]:
     """Read a records file; a last line that was cut short is left out and returned as `Torn`.
 

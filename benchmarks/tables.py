@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from benchmarks import latex
+from benchmarks.collector import uncollected
 from benchmarks.columns import COLUMNS, Column
 from benchmarks.compare import NMAR, harm, row_of
 from benchmarks.protocol import AS_RETURNED
@@ -284,6 +285,7 @@ def _failures(shown: list[Record]) -> list[str]:
     ]
 
 
+@uncollected()
 def write(records: list[Record], results: Path) -> None:
     """Write table.md, table.csv and table.tex into the results folder.
 
