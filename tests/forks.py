@@ -1,7 +1,7 @@
 """Runs commands in forks of one process that has imported and compiled all, so that a run costs what its work costs.
 
 `Forks` starts this file as that process and asks it for runs: to the end, killed after some time, killed at the n-th
-change of a file (half of what was to be written is then written), or against a small or a read-only disk.
+change of a file (half of what was to be written is then written) or after a view, or against a small or read-only disk.
 """
 
 import contextlib
@@ -57,6 +57,7 @@ class Forks:
     def run(self, *command: object, **how: Any) -> Run:
         """Run a command in a fork, killed at seconds= or change=, on a disk=(empty folder, bytes), or powerless=True.
 
+        With view=(number, file) it is killed by `die_after`.
         A disk that holds= a copy of a folder has no room for anything else.
         With here=True it is run in the process that forks, which has compiled it then.
         """
@@ -75,13 +76,39 @@ def serve() -> None:
     import benchmarks.make_dataset
     import benchmarks.panels
     import benchmarks.schedule
+    import ctsim.writer
     import phantoms.scene
 
+    note_every_view(ctsim.writer.SceneWriter)
     assert all((benchmarks.cli_run, benchmarks.make_dataset, benchmarks.panels, benchmarks.schedule, phantoms.scene))
     benchmarks.panels.DPI = 20  # a picture is to be there; most of the time it would be drawn
     for line in sys.stdin:
         sys.stdout.write(json.dumps(attempt(**json.loads(line))) + "\n")
         sys.stdout.flush()
+
+
+def note_every_view(writer: type) -> None:
+    """Note each view as safe. Usually that takes seconds, in which a small scene is done: no run would go on in one."""
+    writer.__init__.__kwdefaults__["sync_seconds"] = 0.0
+
+
+def die_after(writer: type, view: int, mark: Path) -> None:
+    """Kill the process that has noted this view as safe: once, as the file `mark` is there then.
+
+    Each process that writes the next view adds to the file at which view it began.
+    """
+
+    def put(self: Any, number: int, arrays: Any, real: Any = writer.put) -> None:
+        if number == view + 1:
+            with mark.open("a") as file:
+                file.write(f"{self.first_view}\n")
+        real(self, number, arrays)
+        if number == view:
+            with contextlib.suppress(FileExistsError):
+                mark.touch(exist_ok=False)
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    writer.put = put
 
 
 def attempt(command: list[str], here: bool = False, seconds: float | None = None, **how: Any) -> dict[str, Any]:
@@ -121,6 +148,7 @@ def be(
     disk: Any = None,
     holds: str | None = None,
     powerless: bool = False,
+    view: tuple[int, str] | None = None,
 ) -> None:
     """Be the command."""
     code = 99
@@ -136,6 +164,10 @@ def be(
                 fill(Path(disk[0]), holds)
         if powerless:
             drop_powers()
+        if view:
+            from ctsim.writer import SceneWriter
+
+            die_after(SceneWriter, view[0], Path(view[1]))
         changes = count_changes(change)
         code = call(command)
         os.pwrite(counted, str(changes[0]).encode(), 0)

@@ -25,10 +25,11 @@ from ctsim.manifest import list_scans, read_manifest, verify
 from ctsim.tiffstack import map_array
 
 KILLS = int(os.environ.get("CTSIM_FAULTS", "50"))
+VIEWS = 12
 LONG = 300  # views of scenes that are written for a while
-SUITE = """
+SUITE = f"""
 [defaults.scanner]
-n_views = 12
+n_views = {VIEWS}
 n_detector = [10, 12]
 n_voxel = [10, 14, 22]
 [defaults.phantom]
@@ -40,7 +41,17 @@ name = "rods"
 
 [[scene]]
 name = "bare"
-phantom = { metal = "none" }
+phantom = {{ metal = "none" }}
+"""
+
+PRELOAD = """
+from pathlib import Path
+
+from ctsim.writer import SceneWriter
+from forks import die_after, note_every_view
+
+note_every_view(SceneWriter)
+die_after(SceneWriter, {view}, Path({mark!r}))  # Dask runs this file twice, which does no harm
 """
 
 
@@ -123,6 +134,13 @@ def test_make_dataset_survives_kills(bench, tmp_path):
     )
 
 
+def test_make_dataset_goes_on_within_a_scene_that_it_was_killed_in(bench, tmp_path):
+    view = (VIEWS // 2, str(tmp_path / "mark"))
+    ended = [bench.make(tmp_path / "data", view=view).code for _ in range(2)]
+    assert ended == [-9, 0] and bench.same_data(tmp_path / "data")
+    assert (tmp_path / "mark").read_text().split() == [str(VIEWS // 2 + 1), "0"]  # the second scene is begun anew
+
+
 def test_make_dataset_survives_kills_while_it_makes_scenes_again(bench, tmp_path):
     data = Path(shutil.copytree(bench.data, tmp_path / "data"))
     rng = random.Random(7)
@@ -150,12 +168,17 @@ def views_written(data: Path, whole: Path) -> int:
 
 
 def test_make_dataset_survives_kills_of_a_clusters_workers(bench, tmp_path):
-    """Each time that a random number of views is written, one of the workers is killed, whatever it does."""
+    """Each time that a random number of views is written, one of the workers is killed, whatever it does.
+
+    One is killed when it has noted a view, so that another goes on from there.
+    """
     import dask.config
     from distributed import LocalCluster
 
     suite, data, kills, ended = tmp_path / "suite.toml", tmp_path / "data", [], threading.Event()
-    suite.write_text(SUITE.replace("n_views = 12", f"n_views = {LONG}"), encoding="utf-8")
+    preload, mark = tmp_path / "preload.py", tmp_path / "mark"
+    preload.write_text(PRELOAD.format(view=LONG // 2, mark=str(mark)), encoding="utf-8")
+    suite.write_text(SUITE.replace(f"n_views = {VIEWS}", f"n_views = {LONG}"), encoding="utf-8")
     whole = tmp_path / "whole"
     assert bench.forks.run("make-dataset", suite, whole).code == 0
     dask.config.set({"distributed.scheduler.allowed-failures": 100})  # as many as we like
@@ -171,7 +194,9 @@ def test_make_dataset_survives_kills_of_a_clusters_workers(bench, tmp_path):
             os.kill(kills[-1], signal.SIGKILL)
             time.sleep(0.1)  # else all are killed for one count
 
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL") as cluster:
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL", preload=[str(preload)]
+    ) as cluster:
         killer = threading.Thread(target=kill)
         killer.start()
         try:
@@ -184,6 +209,7 @@ def test_make_dataset_survives_kills_of_a_clusters_workers(bench, tmp_path):
     assert (data / "index.jsonl").read_bytes() == (whole / "index.jsonl").read_bytes()
     for path in (path for path in whole.rglob("*.*") if path.name not in ("plan.json", "manifest.json")):
         assert digest(data / path.relative_to(whole)) == digest(path), path
+    assert str(LONG // 2 + 1) in mark.read_text().split()
 
 
 def test_run_benchmark_survives_kills(bench, tmp_path):
