@@ -42,13 +42,20 @@ class Lost:
     reason: str
 
 
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """The answer to a job that raised what is no error of the user's: type and message in one line."""
+
+    reason: str
+
+
 class Pool(Protocol):
     """What runs jobs."""
 
     def answers(self, function: Function, jobs: Sequence[Any]) -> Answers:
-        """Yield (number of a job, what `function` returned of it or `Lost`) as jobs end, None when nothing happened.
+        """Yield (number of a job, what `function` returned or how it ended) as jobs end, None when nothing happened.
 
-        Raises what a job raised; the others are then ended with the pool.
+        A job may end as `Lost` or `Failed`. Raises InputError and OSError of a job; the others end with the pool.
         """
         ...
 
@@ -125,9 +132,7 @@ class Local:
                     else:
                         waiting.appendleft(job)
                     continue
-                if failed:
-                    raise answer
-                yield job, answer
+                yield job, settled(failed, answer)
 
     def _idle(self) -> Worker | None:
         """Return a worker without a job, a new one where there may be more, None where all are busy."""
@@ -200,8 +205,23 @@ def _attempt(function: Function, job: Any) -> tuple[bool, Any]:
     except InputError as error:
         return True, InputError(str(error))
     except Exception as error:
-        error.add_note("".join(traceback.format_exception(error)))  # where it was raised does not cross processes
-        return True, error if _travels(error) else RuntimeError("".join(traceback.format_exception(error)))
+        note = "".join(traceback.format_exception(error))  # where it was raised does not cross processes
+        # Dask teaches pickle to take tracebacks along, and fails at the long one of a RecursionError
+        error.__traceback__ = error.__cause__ = error.__context__ = None
+        error = error if _travels(error) else RuntimeError(f"{type(error).__name__}: {error}")
+        error.add_note(note)
+        return True, error
+
+
+def settled(failed: bool, answer: Any) -> Any:
+    """Return what a job answered, or `Failed`; raise its InputError or OSError, which concern the whole command."""
+    from benchmarks.attempt import describe
+
+    if not failed:
+        return answer
+    if isinstance(answer, InputError | OSError):
+        raise answer
+    return Failed(describe(answer))
 
 
 def _travels(error: Exception) -> bool:
@@ -301,14 +321,17 @@ class Cluster:
             return Lost("its process died each time that Dask began it anew")
         if error is not None:
             raise error
-        return future.result()
+        return settled(*future.result())
 
 
 _ALONE = threading.Lock()
 
 
-def _alone(function: Function, job: Any) -> Any:
-    """Be a Dask task: alone in its process, for neither kernels nor measurements share one."""
+def _alone(function: Function, job: Any) -> tuple[bool, Any]:
+    """Be a Dask task: alone in its process, for neither kernels nor measurements share one.
+
+    An exception is returned: where Dask cannot pickle one, nobody hears of it and the client waits for ever.
+    """
     with _ALONE:
         import numba
         import torch
@@ -319,4 +342,4 @@ def _alone(function: Function, job: Any) -> Any:
         most = int(config.NUMBA_NUM_THREADS)  # pyright: ignore[reportAttributeAccessIssue]
         numba.set_num_threads(min(threads, most))
         torch.set_num_threads(threads)
-        return function(job)
+        return _attempt(function, job)

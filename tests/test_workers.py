@@ -18,7 +18,7 @@ import pytest
 from test_cli import stopped
 
 from benchmarks import cli, workers
-from benchmarks.workers import Cluster, Local, Lost, open_pool, threads_of
+from benchmarks.workers import Cluster, Failed, Local, Lost, open_pool, threads_of
 from ctsim.errors import InputError
 
 SUITE = """
@@ -224,6 +224,14 @@ def test_a_clusters_worker_runs_methods_apart_within_a_time_limit(serial, cluste
     assert len(client.nthreads()) == 2  # no worker was lost over it
 
 
+class Keeps(Exception):
+    """Cannot be pickled."""
+
+    def __init__(self) -> None:
+        super().__init__("a lock")
+        self.lock = threading.Lock()
+
+
 def job(given: str) -> str:
     if given == "die":
         os.kill(os.getpid(), signal.SIGKILL)
@@ -231,6 +239,10 @@ def job(given: str) -> str:
         raise InputError("not this one")
     if given == "fails":
         raise OSError("its own")
+    if given == "recurses":
+        return job(given)
+    if given == "keeps":
+        raise Keeps
     return f"{given} with {os.environ.get('NUMBA_NUM_THREADS')}"
 
 
@@ -242,6 +254,38 @@ def test_a_job_that_kills_its_process_each_time_is_given_up_and_the_others_done(
         found = dict(a for a in pool.answers(job, ["die", "two"]) if a is not None)
     assert answers[0].startswith("one") and isinstance(found[0], Lost) and found[1].startswith("two")
     assert kind == "cluster" or "signal SIGKILL" in found[0].reason
+
+
+@pytest.mark.parametrize("kind", ["local", "cluster"])
+def test_a_job_that_fails_is_answered_in_a_line_whatever_it_raised_and_the_others_done(kind, request):
+    with Local(2) if kind == "local" else Cluster(request.getfixturevalue("cluster")[0]) as pool:
+        found = dict(a for a in pool.answers(job, ["recurses", "keeps", "two"]) if a)
+    assert found[0] == Failed("RecursionError: maximum recursion depth exceeded")
+    assert found[1] == Failed("RuntimeError: Keeps: a lock") and found[2].startswith("two")
+
+
+def test_a_scene_that_fails_on_a_cluster_is_one_sentence(cluster, tmp_path, capsys):
+    address, client = cluster
+    client.run(break_scenes)
+    try:
+        assert make(tmp_path / "data", "--scheduler", address) == 2
+    finally:
+        client.run(break_scenes, False)
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("make-dataset: ") and "a worker failed with RecursionError: maximum recursion" in said
+
+
+def break_scenes(broken: bool = True) -> None:
+    """Let no scene be written in this process, or again."""
+    from ctsim.writer import SceneWriter
+
+    def put(self, view, arrays):
+        put(self, view, arrays)
+
+    if broken:
+        SceneWriter._put, SceneWriter.put = SceneWriter.put, put  # type: ignore[attr-defined]
+    else:
+        SceneWriter.put = SceneWriter._put  # type: ignore[attr-defined]
 
 
 def test_a_cluster_that_loses_all_its_workers_goes_on_with_those_that_come(cluster):
