@@ -22,6 +22,7 @@ from typing import Any, Self
 
 CLONE_NEWNS, CLONE_NEWUSER = 0x00020000, 0x10000000
 CAPABILITIES_3 = 0x20080522
+RUN = "CTSIM_TEST_RUN"  # the output folder, in the environment of all that a run starts
 HANGS = 120.0  # seconds after which a run tells where it is and ends
 LARGEST = 8192  # less than a volume of the tests
 COUNTED = ("write", "pwrite", "fsync", "fdatasync", "replace", "rename", "unlink", "mkdir", "ftruncate")
@@ -29,12 +30,13 @@ COUNTED = ("write", "pwrite", "fsync", "fdatasync", "replace", "rename", "unlink
 
 @dataclass(frozen=True)
 class Run:
-    """How a run ended: exit code (negative for a signal), what it said, seconds, changes of files."""
+    """How a run ended: exit code (negative for a signal), what it said, seconds, changes of files, if it was hit."""
 
     code: int
     said: str
     seconds: float
     changes: int
+    hit: bool = False
 
 
 class Forks:
@@ -57,7 +59,9 @@ class Forks:
     def run(self, *command: object, **how: Any) -> Run:
         """Run a command in a fork, killed at seconds= or change=, on a disk=(empty folder, bytes), or powerless=True.
 
-        With view=(number, file) it is killed by `die_after`.
+        With view=(number, file) it is killed by `die_after`. With target="worker" one of its workers is killed, with
+        target="interrupt" it hears Ctrl-C, each at seconds= and once a worker is there. With begun=file, which has to
+        be there, it is killed at seconds= or later.
         A disk that holds= a copy of a folder has no room for anything else.
         With here=True it is run in the process that forks, which has compiled it then.
         """
@@ -111,9 +115,51 @@ def die_after(writer: type, view: int, mark: Path) -> None:
     writer.put = put
 
 
-def attempt(command: list[str], here: bool = False, seconds: float | None = None, **how: Any) -> dict[str, Any]:
+def patient(scan: Any, *, device: str) -> Any:
+    """Reconstruct by FDK, but the first process that is asked waits for its end: RUN with .waits is a file then."""
+    from reconstruct.fdk import reconstruct
+
+    with contextlib.suppress(FileExistsError):
+        Path(os.environ[RUN] + ".waits").touch(exist_ok=False)
+        time.sleep(HANGS)
+    return reconstruct(scan, device=device)
+
+
+def running(output: Path) -> list[int]:
+    """Return the processes that runs into this folder have started."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/environ"):
+        with contextlib.suppress(OSError):  # it has ended, or is somebody else's
+            if f"{RUN}={output}".encode() in path.read_bytes().split(b"\0"):
+                found.append(int(path.parent.name))
+    return found
+
+
+def strike(child: int, target: str, begun: str | None) -> bool:
+    """Send a signal to a run or one of its workers; return whether the moment has come."""
+    if begun is not None and not os.path.exists(begun):
+        return False
+    workers = []
+    for pid in Path(f"/proc/{child}/task/{child}/children").read_text().split():
+        with contextlib.suppress(OSError):
+            if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                workers.append(int(pid))
+    if target != "command" and not workers:
+        return False
+    os.kill(workers[-1] if target == "worker" else child, signal.SIGINT if target == "interrupt" else signal.SIGKILL)
+    return True
+
+
+def attempt(
+    command: list[str],
+    here: bool = False,
+    seconds: float | None = None,
+    target: str = "command",
+    begun: str | None = None,
+    **how: Any,
+) -> dict[str, Any]:
     """Do what `Forks.run` asks for."""
-    begun = time.perf_counter()
+    start, hit = time.perf_counter(), False
     said, counted = os.memfd_create("said"), os.memfd_create("counted")
     if here:
         before = os.dup(1), os.dup(2)
@@ -129,16 +175,15 @@ def attempt(command: list[str], here: bool = False, seconds: float | None = None
             os.dup2(said, 2)
             be(command, counted, **how)
         while (ended := os.waitpid(child, os.WNOHANG))[0] == 0:
-            if seconds is not None and time.perf_counter() - begun >= seconds:
-                os.kill(child, signal.SIGKILL)
-                seconds = None
+            if seconds is not None and not hit and time.perf_counter() - start >= seconds:
+                hit = strike(child, target, begun)
             time.sleep(0.0005)
         code = os.waitstatus_to_exitcode(ended[1])
     text = os.pread(said, 10**6, 0).decode()
     changes = int(os.pread(counted, 20, 0) or b"0")
     os.close(said)
     os.close(counted)
-    return {"code": code, "said": text, "seconds": time.perf_counter() - begun, "changes": changes}
+    return {"code": code, "said": text, "seconds": time.perf_counter() - start, "changes": changes, "hit": hit}
 
 
 def be(
@@ -153,6 +198,7 @@ def be(
     """Be the command."""
     code = 99
     faulthandler.dump_traceback_later(HANGS, exit=True)
+    os.environ[RUN] = command[2]
     try:
         if disk:
             from benchmarks import make_dataset

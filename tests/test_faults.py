@@ -16,8 +16,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from forks import Forks, Run
-from test_workers import scores, tables
+from forks import Forks, Run, running
+from test_workers import records_of, scores, tables, until
 
 from benchmarks import make_dataset, records
 from ctsim.folder import partial_of
@@ -219,6 +219,39 @@ def test_run_benchmark_survives_kills(bench, tmp_path):
         KILLS // 2,
         lambda k: bench.same_results(tmp_path / f"results{k}"),
     )
+
+
+def test_run_benchmark_with_workers_survives_kills(bench, tmp_path):
+    """The command or one of its workers is killed, or Ctrl-C is heard; then the same command ends well."""
+    rng, hits, k = random.Random(20261123), 0, 0
+    whole = bench.score(tmp_path / "whole", "--workers", "2")
+    assert whole.code == 0 and bench.same_results(tmp_path / "whole")
+    while hits < max(3, KILLS // 16):
+        k += 1
+        results = tmp_path / f"results{k}"
+        target = ("command", "worker", "interrupt")[k % 3]
+        ended = bench.score(results, "--workers", "2", seconds=rng.random() * whole.seconds, target=target)
+        hits += ended.hit
+        assert ended.code in {"command": (0, -9), "worker": (0,), "interrupt": (0, 130)}[target], ended.said
+        assert "Traceback" not in ended.said, ended.said
+        until(lambda at=results: not running(at))
+        assert ended.code or bench.same_results(results)  # a worker that died was replaced
+        path = results / records.NAME
+        kept = path.read_bytes() if path.exists() else b""
+        assert bench.score(results, "--workers", "2").code == 0 and bench.same_results(results)
+        assert path.read_bytes().startswith(kept[: kept.rfind(b"\n") + 1])  # nothing was lost, or measured again
+
+
+def test_no_worker_outlives_a_run_benchmark_that_is_killed(bench, tmp_path):
+    results, waits = tmp_path / "results", tmp_path / "results.waits"
+    asked = (bench.data, results, "--scene", "rods", "--method", "forks:patient", "--workers", "2")
+    assert bench.forks.run("run-benchmark", *asked, seconds=0, begun=str(waits)).code == -9
+    until(lambda: not running(results))
+    assert bench.forks.run("run-benchmark", *asked).code == 0
+    found, fdk = (
+        {r.run.variant: r.scores for r in records_of(f) if "limar" not in r.label} for f in (results, bench.results)
+    )
+    assert found == fdk and len(found) == 2
 
 
 @pytest.mark.parametrize("kilobytes", [8, 32, 56, 80])
