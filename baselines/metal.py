@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from baselines.morphology import dilate, filled, pieces, spread
 from ctsim.arrayfile import read_array
 from ctsim.errors import InputError
-from ctsim.geometry import Geometry
+from ctsim.geometry import Geometry, crosswise
 from ctsim.project import Tracer
 from ctsim.types import Phantom, Scan
 from reconstruct.log import LineIntegrals
@@ -139,14 +139,27 @@ def reach(geometry: Geometry) -> tuple[int, int]:
 
     A voxel belongs to the mask from half its volume on, so metal ends up to half a voxel beyond, and a pixel
     averages over its own width: half a voxel, magnified, and half a pixel, rounded. Of a voxel's edges the one counts
-    that is longest along the pixels' rows or columns in any view.
+    that spans most pixels along rows or columns in any view.
     """
-    d_z, d_y, d_x = geometry.d_voxel
-    axes = geometry.pose_array()[:, 6:12].reshape(-1, 2, 3)
-    along = np.abs(axes / np.linalg.norm(axes, axis=2, keepdims=True)) * np.array([d_x, d_y, d_z])
-    u, v = along.max((0, 2)) * geometry.dsd / geometry.dso
-    d_v, d_u = geometry.d_detector
-    return math.floor(0.5 * v / d_v + 1.0), math.floor(0.5 * u / d_u + 1.0)
+    poses = geometry.pose_array().reshape(-1, 4, 3)
+    axes = np.stack(crosswise(poses[:, 2], poses[:, 3]), 1)
+    lengths = np.linalg.norm(axes, axis=2)
+    along = np.abs(axes / lengths[..., None]) * np.array(geometry.d_voxel[::-1])
+    if geometry.poses is None:
+        u, v = along.max((0, 2)) * geometry.dsd / geometry.dso / np.array(geometry.d_detector[::-1])
+    else:
+        spans = along.max(2) / lengths * _magnification(poses, np.array(geometry.off_origin[::-1]))[:, None]
+        u, v = np.minimum(spans.max(0), max(geometry.n_detector))
+    return math.floor(0.5 * v + 1.0), math.floor(0.5 * u + 1.0)
+
+
+def _magnification(poses: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how much larger each view of `poses` [view, 4, xyz] shows what is at a point; 1 for one it cannot see."""
+    source, centre, e_u, e_v = poses.transpose(1, 0, 2)
+    normal = np.cross(e_u, e_v)
+    height, depth = (((x - source) * normal).sum(1) for x in (centre, point))
+    ahead = height * depth > 0
+    return np.where(ahead, height / np.where(ahead, depth, 1.0), 1.0)
 
 
 class Trace:

@@ -156,6 +156,22 @@ class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         return self.dso * math.sin(math.atan(edge / self.dsd)) if edge > 0 else 0.0
 
 
+def crosswise(e_u: NDArray[np.float64], e_v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the part of each step [..., xyz] at right angles to the other: p_u and p_v, the steps if they are so.
+
+    The point x = a·e_u + b·e_v has a = x·p_u/(p_u·p_u) and b = x·p_v/(p_v·p_v).
+    """
+    if not np.any((e_u * e_v).sum(-1)):
+        return e_u, e_v
+    parts = []
+    for part, other in ((e_u, e_v), (e_v, e_u)):
+        square = (other * other).sum(-1, keepdims=True)
+        for _ in range(2):  # again, since steps that are all but parallel leave the rounding of the first time
+            part = part - (part * other).sum(-1, keepdims=True) / square * other
+        parts.append(part)
+    return parts[0], parts[1]
+
+
 def _longest_rays(poses: NDArray[np.float64], n_detector: tuple[int, int]) -> NDArray[np.float64]:
     """Distance in mm from the source to the farthest corner of the detector in each view: [view]."""
     v, u = (n / 2 for n in n_detector)

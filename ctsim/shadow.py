@@ -4,6 +4,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ctsim.geometry import crosswise
 from ctsim.solids import BOUND, BOX, CAPSULE, ELLIPSOID, FRUSTUM, KIND, MATERIAL, MATRIX, PARAMS, TORUS
 
 THIN = 1.5  # primitives thinner than this many pixels can hide between the corners of a pixel
@@ -36,17 +37,23 @@ def cast(pose: NDArray[np.float64], shape: tuple[int, int], corners: NDArray[np.
     On every side there is a margin of half a pixel's diagonal (see `inflate`), at least a pixel.
     """
     source, centre, e_u, e_v = pose.reshape(4, 3)
-    sides = np.array([np.linalg.norm(e_v), np.linalg.norm(e_u)])
-    margin = np.maximum(np.ceil(np.hypot(*sides) / 2 / sides), 1)
+    p_u, p_v = crosswise(e_u, e_v)
+    heights = np.array([np.linalg.norm(p_v), np.linalg.norm(p_u)])
+    margin = np.maximum(np.ceil(_diagonal(e_u, e_v) / 2 / heights), 1)
     normal = np.cross(e_u, e_v)
     reach = (corners - source) @ normal / ((centre - source) @ normal)
     behind: NDArray[np.bool_] = np.any(reach <= 1e-9, axis=1)
     hit = source + (corners - source) / np.where(behind[:, None], 1.0, reach)[..., None] - centre
-    u = hit @ e_u / (e_u @ e_u) + (shape[1] - 1) / 2
-    v = hit @ e_v / (e_v @ e_v) + (shape[0] - 1) / 2
+    u = hit @ p_u / (p_u @ p_u) + (shape[1] - 1) / 2
+    v = hit @ p_v / (p_v @ p_v) + (shape[0] - 1) / 2
     out = np.empty((shape[0], len(corners), 2), np.int64)
     _fill(u, v, behind, float(margin[0]), int(margin[1]), shape[1], out)
     return out
+
+
+def _diagonal(e_u: NDArray[np.float64], e_v: NDArray[np.float64]) -> float:
+    """Length of a pixel's longer diagonal in mm."""
+    return float(np.sqrt(np.hypot(np.linalg.norm(e_u), np.linalg.norm(e_v)) ** 2 + 2 * abs(e_u @ e_v)))
 
 
 @njit(cache=True)
@@ -98,7 +105,7 @@ def inflate(prims: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np
     """
     source, centre, e_u, e_v = pose.reshape(4, 3)
     fat = prims.copy()
-    pixel = np.hypot(np.linalg.norm(e_u), np.linalg.norm(e_v)) / np.linalg.norm(centre - source)
+    pixel = _diagonal(e_u, e_v) / np.linalg.norm(centre - source)
     pixel = pixel * np.linalg.norm(prims[:, BOUND][:, :3] - source, axis=1)
     kind, sizes = prims[:, KIND].astype(int), prims[:, PARAMS]
     thinnest = np.where(np.isin(kind, (ELLIPSOID, BOX)), sizes[:, :3].min(1), sizes[:, 1])

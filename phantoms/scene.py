@@ -12,7 +12,7 @@ import tomli_w
 from numpy.typing import NDArray
 
 from ctsim.errors import InputError
-from ctsim.geometry import Geometry
+from ctsim.geometry import Geometry, crosswise
 from ctsim.manifest import is_reserved
 from ctsim.settings import Simulation, Truth
 from ctsim.types import Phantom, Scanner
@@ -197,6 +197,7 @@ def _shadow(poses: NDArray[np.float64], size: float) -> tuple[NDArray[np.float64
     reach = ((centre - source) * normal).sum(-1)[:, None]
     ahead = depth * np.sign(reach) > 0
     hit = source[:, None] + ray * (reach / np.where(ahead, depth, 1.0))[..., None] - centre[:, None]
+    du, dv = crosswise(du, dv)
     u = (hit * du[:, None]).sum(-1) / (du * du).sum(-1)[:, None]
     v = (hit * dv[:, None]).sum(-1) / (dv * dv).sum(-1)[:, None]
     return np.where(ahead, u, 1e9), np.where(ahead, v, 1e9)
