@@ -28,7 +28,7 @@ MATERIALS = ("air", "water", "Fe")
 ONE = np.ones(1, np.float32)
 MU = np.array([[0.0], [0.02], [0.9]])  # 1/mm
 MONO = Response(mu=MU.astype(np.float32), w1=ONE, w2=ONE, edge_mu=MU[:, 0])
-# degrees that the u step leans towards v, and v towards u; degrees about u by which a detector faces away
+# degrees that u leans towards v, and v towards u, and by which the detector turns away about u
 CASES = [
     (20.0, 0.0, 0.0), (-20.0, 0.0, 0.0), (45.0, 0.0, 0.0), (-65.0, 0.0, 0.0), (0.0, 30.0, 0.0), (0.0, -60.0, 0.0),
     (30.0, 25.0, 0.0), (-35.0, 25.0, 0.0), (0.0, 0.0, 30.0), (40.0, 0.0, 30.0), (0.0, -50.0, -25.0), (35.0, 20.0, 40.0),
