@@ -57,16 +57,18 @@ def _npy(path: Path, shape: tuple[int, ...] | None) -> NDArray[Any]:
     return np.load(path, allow_pickle=False)
 
 
-def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Read the arrays of an .npz file as `numpy.savez` writes it, not compressed.
+def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
+    """Read the arrays of an .npz file, or of its bytes, as `numpy.savez` writes it, not compressed.
 
     Raises OSError where it cannot be read, and ValueError for what is none or declares more than the file holds.
     """
     try:
-        with zipfile.ZipFile(path) as file:
+        with zipfile.ZipFile(source) as file:
             for member in file.infolist():
                 _check_member(file, member)
-        with np.load(path, allow_pickle=False) as arrays:
+        if not isinstance(source, Path):
+            source.seek(0)
+        with np.load(source, allow_pickle=False) as arrays:
             return {name: np.asarray(arrays[name]) for name in arrays.files}
     except (EOFError, KeyError, RuntimeError, zipfile.BadZipFile) as error:
         raise ValueError(str(error) or type(error).__name__) from None

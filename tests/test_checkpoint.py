@@ -3,6 +3,7 @@
 import hashlib
 import io
 import random
+import zipfile
 
 import numpy as np
 import pytest
@@ -95,3 +96,15 @@ def test_the_checksum_is_sha_256_of_all_before_it(tmp_path):
     kept.write(STATE)
     whole = kept.path.read_bytes()
     assert hashlib.sha256(whole[:-32]).digest() == whole[-32:]
+
+
+def test_a_checkpoint_that_declares_more_than_it_holds_is_refused_before_room_is_made(tmp_path):
+    """Its checksum fits, as of a file that somebody made: 8 TB of zeros are never asked for."""
+    header, bytes_of = io.BytesIO(), io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
+    with zipfile.ZipFile(bytes_of, "w") as file:
+        file.writestr("x.npy", header.getvalue())
+    kept = Checkpoint(folder=tmp_path, identity="it")
+    kept.path.write_bytes(bytes_of.getvalue() + hashlib.sha256(bytes_of.getvalue()).digest())
+    with pytest.raises(InputError, match=r"damaged .*ends before its array of shape"):
+        kept.read()

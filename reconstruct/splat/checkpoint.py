@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.arrayfile import read_arrays
 from ctsim.durable import sweep, write_synced
 from ctsim.errors import InputError
 from ctsim.types import Scan
@@ -64,8 +65,10 @@ class Checkpoint:
         arrays, checksum = whole[:-_CHECKSUM], whole[-_CHECKSUM:]
         if hashlib.sha256(arrays).digest() != checksum:
             raise self.damaged("its checksum does not fit, or an earlier version wrote it")
-        with np.load(io.BytesIO(arrays), allow_pickle=False) as file:
-            return {name: np.asarray(file[name]) for name in file.files}
+        try:
+            return read_arrays(io.BytesIO(arrays))
+        except ValueError as error:
+            raise self.damaged(error) from None
 
     def damaged(self, why: object) -> InputError:
         """Return the error of a file that holds no state to go on from."""
