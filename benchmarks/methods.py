@@ -170,7 +170,7 @@ def parse_overrides(settings: tuple[str, ...], names: tuple[str, ...]) -> dict[s
             raise InputError(f"--set {setting!r}: method {method!r} is not among those to run, {', '.join(names)}")
         try:
             found[method][parameter] = msgspec.json.decode(text)
-        except msgspec.DecodeError:
+        except (msgspec.DecodeError, RecursionError):
             found[method][parameter] = text
     return found
 

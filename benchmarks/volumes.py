@@ -62,7 +62,7 @@ def identity_of(path: Path) -> str | None:
     try:
         with tifffile.TiffFile(path) as file:
             found = json.loads(file.pages.first.description).get("run")
-    except (OSError, ValueError, AttributeError, tifffile.TiffFileError):
+    except (OSError, ValueError, AttributeError, RecursionError, tifffile.TiffFileError):
         return None
     return found if isinstance(found, str) and found else None
 

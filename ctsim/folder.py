@@ -49,7 +49,7 @@ def read_progress(partial: Path) -> Progress | None:
     """Return what an unfinished scene says of itself; None where it says nothing that can be read."""
     try:
         return msgspec.json.decode((partial / mf.PROGRESS).read_bytes(), type=Progress)
-    except (OSError, msgspec.DecodeError, UnicodeDecodeError):
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None
 
 

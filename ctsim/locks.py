@@ -219,7 +219,7 @@ def _read(path: Path) -> Owner | None:
     """Return who a lock file says has it; None where it does not say, as one that is just being made."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=Owner)
-    except (OSError, msgspec.DecodeError, UnicodeDecodeError):
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None
 
 

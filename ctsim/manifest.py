@@ -106,7 +106,7 @@ def read_manifest(folder: Path) -> Manifest:
         raise InputError(f"{folder}: not a finished scene, {MANIFEST} is missing (was it interrupted?)") from None
     try:
         manifest = msgspec.json.decode(data, type=Manifest)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         _check_format(path, data)
         raise InputError(f"{path}: damaged manifest ({error})") from None
     _check_format(path, data, manifest)
@@ -125,7 +125,7 @@ def _check_format(path: Path, data: bytes, manifest: Manifest | None = None) -> 
     """Refuse another format, also one that has other keys than a `Manifest`."""
     try:
         found = (manifest or msgspec.json.decode(data, type=_Format)).format
-    except (msgspec.DecodeError, UnicodeDecodeError):
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return  # damaged
     if found not in (FORMAT, WITHOUT_CODE):
         raise InputError(f"{path}: format {found}, this version reads the formats {WITHOUT_CODE} and {FORMAT}")
@@ -150,7 +150,7 @@ def read_index(data_dir: Path) -> dict[str, IndexLine]:
             continue
         try:
             entry = msgspec.json.decode(line, type=IndexLine)
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             if number == len(lines):
                 continue  # no newline: an append that was cut off, repeated by the next run
             raise InputError(f"{path}: line {number} is damaged ({error})") from None

@@ -53,7 +53,7 @@ def read_info(path: Path) -> ScanInfo:
         raise InputError(f"{path}: missing") from None
     except msgspec.ValidationError as error:
         raise InputError(f"{path}: {error}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path}: damaged ({error})") from None
 
 
