@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from benchmarks.make_dataset import load, select
 from benchmarks.peer_cases import in_turns
+from benchmarks.skipping_limits import rounding
 from benchmarks.skipping_tables import CORE, Measured
 from ctsim.bricks import Bricks, make_bricks
 from ctsim.geometry import Geometry
@@ -33,8 +34,6 @@ from phantoms.bodies import Validation
 from phantoms.scene import Scene, build, stream_id
 
 ABSENT = ("Al", "Ti", "Cu", "Au")  # metals that a table may name and a thorax does not hold
-# float32 sums over a dozen energies, in which the compiler may order vectors' ends otherwise
-ROUNDING, ROUNDING_AT = 4e-6, "tests/test_project.py"
 LINES = Truth(noise_free=True)
 Images = Sequence[dict[str, NDArray[Any]]]
 T = TypeVar("T")
@@ -177,8 +176,8 @@ def materials(setup: Setup) -> Iterator[Pair[Images]]:
         whole=next_views(setup, every, phantom, scanner),
         difference=lambda a, b: apart(a, b, ("noise_free", "metal_free/noise_free")),
         unit="P",
-        limit=ROUNDING,
-        stated=ROUNDING_AT,
+        limit=rounding(plan, phantom, scanner),
+        stated="rounding",
     )
 
 
@@ -234,8 +233,8 @@ def rays(setup: Setup) -> Iterator[Pair[Images]]:
             whole=next_views(setup, every, phantom, scanner),
             difference=lambda a, b: apart(a, b, ("noise_free", "metal_free/noise_free")),
             unit="P",
-            limit=ROUNDING,
-            stated=ROUNDING_AT,
+            limit=rounding(plan, phantom, scanner),
+            stated="rounding",
         )
 
 
