@@ -21,8 +21,8 @@ from phantoms.bodies import REACH
 from phantoms.scene import _shadow
 
 ORBIT = Geometry(
-    dso=200.0, dsd=400.0, n_voxel=(8, 8, 8), d_voxel=(3.0, 3.0, 3.0), n_detector=(23, 31), d_detector=(2.4, 2.0), n_views=3,
-    start_deg=17.0,
+    dso=200.0, dsd=400.0, n_voxel=(8, 8, 8), d_voxel=(3.0, 3.0, 3.0), n_detector=(23, 31), d_detector=(2.4, 2.0),
+    n_views=3, start_deg=17.0,
 )  # fmt: skip
 MATERIALS = ("air", "water", "Fe")
 ONE = np.ones(1, np.float32)
