@@ -1,7 +1,7 @@
 """Which scene of a bundled suite a record is of: a scene's name alone does not say, its identity does.
 
-A record is of a planned scene when its `scene_id` is that of the bundled scene with the record's seed, under the
-bundled name or, from `make-dataset --seeds`, as NAME-sSEED. The simulator's code has no part in it.
+A record is of a planned scene when its `scene_id` is that of the bundled scene with the record's seed. `make-dataset
+--seeds` hashes a repetition as NAME-sSEED, which records and tables call NAME. The simulator's code has no part in it.
 """
 
 from collections.abc import Iterable
@@ -29,22 +29,22 @@ class Scenes:
         self._named: dict[str, list[tuple[str, str]]] = {}
         for key in self._scenes:
             self._named.setdefault(key[1], []).append(key)
-        self._known: dict[tuple[tuple[str, str], str, int], str] = {}
+        self._known: dict[tuple[tuple[str, str], int], tuple[str, ...]] = {}
 
     def named(self, run: "Run") -> list[tuple[str, str]]:
         """Return the planned scenes that have this run's name."""
-        plain = run.scene.removesuffix(f"-s{run.seed}")
-        return self._named.get(run.scene) or self._named.get(plain, [])
+        return self._named.get(run.scene, [])
 
     def of(self, run: "Run") -> tuple[str, str] | None:
         """Return the planned scene that this run is of; None where it has no more in common than the name."""
-        return next((key for key in self.named(run) if self.identity(key, run) == run.scene_id), None)
+        return next((key for key in self.named(run) if run.scene_id in self.identities(key, run)), None)
 
-    def identity(self, key: tuple[str, str], run: "Run") -> str:
-        """Return the identity that the planned scene has under the run's name and seed; "" where it cannot be."""
-        asked = (key, run.scene, run.seed)
+    def identities(self, key: tuple[str, str], run: "Run") -> tuple[str, ...]:
+        """Return the identities of a planned scene with the run's seed, as itself and as a repetition; none if bad."""
+        asked = (key, run.seed)
         if asked not in self._known:
-            self._known[asked] = _identity(self._scenes[key], run.scene, run.seed)
+            names = run.scene, f"{run.scene}-s{run.seed}"
+            self._known[asked] = tuple(filter(None, (_identity(self._scenes[key], name, run.seed) for name in names)))
         return self._known[asked]
 
 
@@ -78,7 +78,7 @@ def strangers(found: "list[Record]", scenes: Scenes, planned: Iterable[tuple[str
 def _stranger(key: tuple[str, str], runs: "list[Run]", scenes: Scenes) -> str:
     count = "1 record is" if len(runs) == 1 else f"{len(runs)} records are"
     ids = _some(run.scene_id for run in runs)
-    expected = _some(f"{scenes.identity(key, run) or 'none'} (seed {run.seed})" for run in runs)
+    expected = _some(f"{' or '.join(scenes.identities(key, run)) or 'none'} (seed {run.seed})" for run in runs)
     return (
         f"{title(key)}: {count} left out, of another scene of this name (scene_id {ids}); "
         f"expected {expected}, which `make-dataset {key[0]}` makes"
