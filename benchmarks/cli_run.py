@@ -204,7 +204,7 @@ def _scans(given: Arguments) -> "list[Stored]":
     for wanted in given.scene:
         if wanted not in names:
             raise InputError(f"--scene {wanted!r}: {given.data} has {human_choice(names, wanted)}")
-    _warn_of_mixture(given.data, frozenset(given.scene or names))
+    _warn_of_other_code(given.data, frozenset(given.scene or names))
     return scans
 
 
@@ -219,12 +219,15 @@ def _warn(scans: "list[Stored]") -> None:
         log.warning("%s%s: %s", ", ".join(names[:FEW]), more, note)
 
 
-def _warn_of_mixture(data: Path, names: frozenset[str]) -> None:
-    """Say where the scans that one table compares were made by different code of the simulator."""
-    from ctsim.folder import mixture
+def _warn_of_other_code(data: Path, names: frozenset[str]) -> None:
+    """Say where the scans that one table compares were made by different code, or by other code than this."""
+    from ctsim.folder import mixture, other_code
     from ctsim.manifest import read_index
+    from ctsim.sources import source_hash
 
-    if text := mixture(line for line in read_index(data).values() if line.name in names):
+    lines = [line for line in read_index(data).values() if line.name in names]
+    other = [line for line in lines if line.code != source_hash()]
+    if text := mixture((line.name, line.code) for line in lines) or other_code(other, len(lines)):
         log.warning("%s: %s", data, text)
 
 

@@ -75,10 +75,10 @@ def text_of(found: "list[Record]", form: Form, protocol: Protocol, numbers: tupl
     paper = load()
     measured = Measured.of(found, paper)
     parts = [render(fill(t, measured, protocol), form) for t in chosen(paper, numbers)]
-    old = records.outdated(found)
+    said = records.remarks(found)
     mark = "" if form == "md" else "% "
     head = f"{mark}Columns “paper”: as printed in {paper.source}. Columns “here”: records of run-benchmark.\n"
-    return "\n".join([head, *parts, f"{mark}{old}.\n"] if old else [head, *parts])
+    return "\n".join([head, *parts, *(f"{mark}{text}.\n" for text in said)])
 
 
 def chosen(paper: Paper, numbers: tuple[int, ...]) -> list[Table]:

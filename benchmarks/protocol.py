@@ -62,6 +62,11 @@ class Stored(Protocol):
         ...
 
     @property
+    def code(self) -> str:
+        """The hash of the code that made the files."""
+        ...
+
+    @property
     def scan(self) -> "Scan":
         """What a method gets."""
         ...

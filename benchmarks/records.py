@@ -22,6 +22,7 @@ from benchmarks.methods import TABLE
 from benchmarks.protocol import VERSION, Score
 from ctsim.durable import append_synced, write_synced
 from ctsim.errors import InputError
+from ctsim.folder import mixture
 from ctsim.locks import locked
 
 NAME, WHAT = "records.jsonl", "a record of run-benchmark"
@@ -70,7 +71,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     `label` is the method with the parameters that differ from its defaults; `inputs` what the method
     needs beside the counts; `volume` the path of the kept volume relative to the results folder; `place`
     the numbers of the scan in its dataset and of the method in its command, by which tables are ordered;
-    `details` what the method says of its result (`benchmarks.details`).
+    `details` what the method says of its result (`benchmarks.details`); `data_code` hashes the code of the simulator
+    that made the scan (empty: not noted).
     """
 
     identity: str
@@ -87,6 +89,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     commit: str = "unknown"
     time: str = ""
     details: dict[str, Any] = {}
+    data_code: str = ""
 
 
 class Torn(msgspec.Struct, frozen=True, kw_only=True):
@@ -256,6 +259,12 @@ def outdated(records: list[Record]) -> str:
         f"{len(others)} of {len(records)} records are of protocol version {versions} and left out: "
         f"this is version {VERSION}, run the methods again"
     )
+
+
+def remarks(records: list[Record]) -> list[str]:
+    """Say, a sentence without its stop each, what tables of these records leave out and what they mix."""
+    shown = dict.fromkeys((f"{r.run.scene} (seed {r.run.seed})", r.data_code) for r in latest(records))
+    return [text for text in (outdated(records), mixture(shown)) if text]
 
 
 def last(records: list[Record]) -> dict[str, Record]:

@@ -252,4 +252,5 @@ def describe_run(task: Task, outcome: Outcome, scores: dict[str, Score], kept: s
         commit=commit(),
         time=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         details=outcome.details,
+        data_code=task.stored.code,
     )

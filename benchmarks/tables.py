@@ -16,7 +16,7 @@ from benchmarks.collector import uncollected
 from benchmarks.columns import COLUMNS, Column
 from benchmarks.compare import NMAR, harm, row_of
 from benchmarks.protocol import AS_RETURNED
-from benchmarks.records import OK, Record, latest, outdated
+from benchmarks.records import OK, Record, latest, outdated, remarks
 from benchmarks.summary import Number, Numbers, csv_text, numbers, summary
 from benchmarks.texts import escape, ranked
 from ctsim.durable import write_synced
@@ -244,18 +244,17 @@ def _lines(sheet: Sheet, form: Format) -> list[list[str]]:
 def render(records: list[Record], form: Format, protocols: Iterable[str] = tuple(COLUMNS)) -> str:
     """Render the protocols' tables as Markdown or LaTeX (booktabs); failures and skips follow with their reasons."""
     shown = latest(records)
-    return _page(sheets(shown, numbers(shown), protocols), form, _failures(shown), outdated(records))
+    return _page(sheets(shown, numbers(shown), protocols), form, _failures(shown), remarks(records))
 
 
-def _page(found: list[Sheet], form: Format, failed: list[str], left_out: str) -> str:
-    """Render sheets, below them the runs that failed and how many records are of other versions."""
+def _page(found: list[Sheet], form: Format, failed: list[str], said: list[str]) -> str:
+    """Render sheets, below them the runs that failed and what is to be said of the records (`records.remarks`)."""
     parts = [_markdown(sheet) if form == "md" else _latex(sheet) for sheet in found]
     if form == "md" and failed:
         parts.append("## Failures and skips\n\n" + "\n".join(f"- {escape(line, form)}" for line in failed) + "\n")
     elif failed:
         parts.append("".join(map(latex.comment, failed)))
-    if left_out:
-        parts.append(f"{left_out}.\n" if form == "md" else latex.comment(f"{left_out}."))
+    parts += [f"{escape(text, form)}.\n" if form == "md" else latex.comment(f"{text}.") for text in said]
     return "\n".join(parts)
 
 
@@ -293,11 +292,11 @@ def write(records: list[Record], results: Path) -> None:
     """
     if not records:
         raise InputError(f"{results}: there are no records to tabulate; run a method first")
-    shown, left_out = latest(records), outdated(records)
+    shown = latest(records)
     if not shown:
-        raise InputError(f"{results}: {left_out}")
+        raise InputError(f"{results}: {outdated(records)}")
     found = numbers(shown)
     pages, failed = sheets(shown, found), _failures(shown)
-    texts = {form: _page(pages, form, failed, left_out) for form in ("md", "tex")} | {"csv": csv_text(found)}
+    texts = {form: _page(pages, form, failed, remarks(records)) for form in ("md", "tex")} | {"csv": csv_text(found)}
     for form, text in texts.items():
         write_synced(results / f"table.{form}", text.encode())  # one who looks while runs go on sees a whole table

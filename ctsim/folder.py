@@ -158,11 +158,11 @@ def other_code(scenes: Sequence[mf.Manifest | mf.IndexLine], of: int) -> str:
     )
 
 
-def mixture(index: Iterable[mf.IndexLine]) -> str:
-    """Say which scenes were made by which code where it was not the same for all; empty where it was."""
+def mixture(scenes: Iterable[tuple[str, str]]) -> str:
+    """Say which of the scenes (name, code) were made by which code; empty where it was the same for all."""
     by: dict[str, list[str]] = {}
-    for line in index:
-        by.setdefault(line.code, []).append(line.name)
+    for name, code in scenes:
+        by.setdefault(code, []).append(name)
     if len(by) < 2:
         return ""
     groups = "; ".join(f"{listing(names)} by {code or 'code that is not noted'}" for code, names in by.items())

@@ -34,13 +34,14 @@ class StoredScan:
 
     It holds no open file: arrays are memory-mapped when they are asked for, each time anew and copy-on-write, so that
     nothing is read before it is used and neither the files nor another one's arrays ever change. `info` is scan.json;
-    `metal_free` is the paired twin.
+    `code` hashes the code of the simulator that made it (empty: not noted); `metal_free` is the paired twin.
     """
 
     folder: Path
     name: str
     scene_id: str
     content_hash: str
+    code: str
     info: ScanInfo
     files: dict[str, mf.FileEntry]
     prefix: str = ""
@@ -130,6 +131,7 @@ def _open(folder: Path, manifest: mf.Manifest, info: ScanInfo, prefix: str, twin
         name=manifest.name,
         scene_id=manifest.scene_id,
         content_hash=manifest.content_hash,
+        code=manifest.code,
         info=info,
         files=manifest.files,
         prefix=prefix,

@@ -125,12 +125,11 @@ def html_page(results: Path, data: Path | None, command: str) -> str:
     """Return the HTML page; with `data`, as many slices as fit into 20 MB."""
     from tqdm import tqdm
 
-    from benchmarks.records import outdated
+    from benchmarks.records import remarks
     from reports import page, slices
     from reports.kept import first_cases
 
     found = read(results)
-    left_out = outdated(found)
     cases = [] if data is None else list(first_cases(data, found, results))
     missing = "There are no slices: the page was made without a dataset (run-benchmark report RESULTS DATA)."
     if data is not None:
@@ -138,7 +137,7 @@ def html_page(results: Path, data: Path | None, command: str) -> str:
     each = sum(map(slices.bytes_a_slice, cases))
     content = page.Content(
         title=f"ctsim: {results.resolve().name}",
-        provenance=f"{generated(command)} {measured(found)}" + (f" {left_out}." if left_out else ""),
+        provenance=" ".join([generated(command), measured(found), *(f"{text}." for text in remarks(found))]),
         records=found,
         cases=cases,
         most=max(1, int(IMAGES * LIMIT / each)) if each else 1,

@@ -169,7 +169,11 @@ def test_a_table_of_scans_of_different_code_is_remarked_upon(made, suite, other_
     assert run([str(made), str(tmp_path / "results"), "--dry-run"]) == 0 and not caplog.messages
     first = sources.source_hash()
     other_code("v2")
-    assert run([str(made), str(tmp_path / "results"), "--dry-run"]) == 0 and not caplog.messages
+    assert run([str(made), str(tmp_path / "results"), "--dry-run"]) == 0
+    assert [text.partition(", so")[0] for text in caplog.messages] == [
+        f"{made}: 2 of 2 scenes were made by other code of the simulator"
+    ]
+    caplog.clear()
     assert main([suite, str(made), "--force", "--only", "bare"]) == 0
     assert run([str(made), str(tmp_path / "results"), "--dry-run"]) == 0
     assert caplog.messages == [

@@ -5,7 +5,7 @@ import sys
 import msgspec
 import pytest
 
-from benchmarks import cli, methods, records
+from benchmarks import cli, methods, records, tables
 from benchmarks.host import host, measured
 from benchmarks.protocol import Score
 from benchmarks.records import Record, Run
@@ -40,6 +40,17 @@ def test_records_of_before_there_were_details_are_read(tmp_path):
     records.append(path, record())
     path.write_bytes(path.read_bytes().replace(b',"details":{}', b""))
     assert b"details" not in path.read_bytes() and records.read(path) == ([record()], None)
+
+
+def test_scans_of_different_code_are_named():
+    one, two = (msgspec.structs.replace(record(seed=k, scan=f"s{k}"), data_code=f"v{k}") for k in (1, 2))
+    assert records.remarks([one, one]) == []
+    assert records.remarks([one, two]) == [
+        "the scenes were made by different code of the simulator, so their scores may not compare: "
+        "lung (seed 1) by v1; lung (seed 2) by v2; make-dataset --force makes them again"
+    ]
+    for text in (tables.render([one, two], "md"), tables.render([one, two], "tex")):
+        assert "lung (seed 1) by v1; lung (seed 2) by v2" in text
 
 
 def test_every_field_of_a_run_changes_its_identity():
