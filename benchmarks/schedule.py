@@ -18,7 +18,7 @@ from benchmarks.devices import check_device
 from benchmarks.isolate import Outcome
 from benchmarks.records import OK, Record
 from benchmarks.run import Options, Runner, Task, describe_run, run_all, tasks_on
-from benchmarks.workers import Failed, Lost, Pool
+from benchmarks.workers import Lost, Pool
 from ctsim.errors import InputError
 
 Group = tuple[Task, ...]
@@ -151,9 +151,9 @@ def _runner(results: Path, options: Options) -> Runner:
     return Runner(results, options)
 
 
-def _records(group: Group, answer: list[bytes] | Lost | Failed) -> list[Record]:
-    """Return the records of a group, those of a failure where its process died or its job failed."""
-    if isinstance(answer, Lost | Failed):
+def _records(group: Group, answer: list[bytes] | Lost) -> list[Record]:
+    """Return the records of a group, those of a failure where its process died."""
+    if isinstance(answer, Lost):
         return [describe_run(task, Outcome(status="error", reason=answer.reason), {}, None) for task in group]
     found = [msgspec.json.decode(line, type=Record) for line in answer]
     for task, record in zip(group, found, strict=True):

@@ -42,20 +42,13 @@ class Lost:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class Failed:
-    """The answer to a job that raised what is no error of the user's: type and message in one line."""
-
-    reason: str
-
-
 class Pool(Protocol):
     """What runs jobs."""
 
     def answers(self, function: Function, jobs: Sequence[Any]) -> Answers:
         """Yield (number of a job, what `function` returned or how it ended) as jobs end, None when nothing happened.
 
-        A job may end as `Lost` or `Failed`. Raises InputError and OSError of a job; the others end with the pool.
+        A job may end as `Lost`. Raises what a job raised, with a note of where; the others end with the pool.
         """
         ...
 
@@ -132,7 +125,9 @@ class Local:
                     else:
                         waiting.appendleft(job)
                     continue
-                yield job, settled(failed, answer)
+                if failed:
+                    raise answer
+                yield job, answer
 
     def _idle(self) -> Worker | None:
         """Return a worker without a job, a new one where there may be more, None where all are busy."""
@@ -211,17 +206,6 @@ def _attempt(function: Function, job: Any) -> tuple[bool, Any]:
         error = error if _travels(error) else RuntimeError(f"{type(error).__name__}: {error}")
         error.add_note(note)
         return True, error
-
-
-def settled(failed: bool, answer: Any) -> Any:
-    """Return what a job answered, or `Failed`; raise its InputError or OSError, which concern the whole command."""
-    from benchmarks.attempt import describe
-
-    if not failed:
-        return answer
-    if isinstance(answer, InputError | OSError):
-        raise answer
-    return Failed(describe(answer))
 
 
 def _travels(error: Exception) -> bool:
@@ -321,7 +305,10 @@ class Cluster:
             return Lost("its process died each time that Dask began it anew")
         if error is not None:
             raise error
-        return settled(*future.result())
+        failed, answer = future.result()
+        if failed:
+            raise answer
+        return answer
 
 
 _ALONE = threading.Lock()

@@ -12,7 +12,7 @@ from benchmarks import cli_run, estimates, records, run, schedule, tables
 from benchmarks.estimates import FDKS, fdk_seconds, in_fdks
 from benchmarks.methods import TABLE, Method, find
 from benchmarks.schedule import Costs, ordered
-from benchmarks.workers import Failed, Lost
+from benchmarks.workers import Lost
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from reconstruct.splat.course import PASSES
@@ -98,10 +98,9 @@ class Fake:
         yield from enumerate(self._answers)
 
 
-@pytest.mark.parametrize("end", [Lost, Failed])
-def test_a_run_whose_process_dies_or_whose_job_fails_is_a_failure_on_record(tmp_path, end):
+def test_a_run_whose_process_dies_is_a_failure_on_record(tmp_path):
     groups = ordered(listed("fdk")[:2], Costs([]))
-    found = [r for _, r in schedule.work(groups, tmp_path, OPTIONS, Fake(end("it died")))]
+    found = [r for _, r in schedule.work(groups, tmp_path, OPTIONS, Fake(Lost("it died")))]
     assert [(r.status, r.reason, r.run.variant) for r in found] == [
         ("error", "it died", "metal_free"),
         ("error", "it died", "metal"),
