@@ -2,6 +2,7 @@
 
 import json
 import os
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,9 @@ from numpy.typing import NDArray
 from ctsim.durable import replacing
 from ctsim.errors import InputError
 from ctsim.tiffstack import write_all
+
+# what tifffile (TiffFileError is a ValueError) and JSON raise for files that are cut short or changed
+DAMAGED = (ValueError, LookupError, AttributeError, TypeError, RecursionError, struct.error)
 
 
 def write_volume(path: Path, values: NDArray[np.float32], identity: str = "") -> None:
@@ -62,7 +66,7 @@ def identity_of(path: Path) -> str | None:
     try:
         with tifffile.TiffFile(path) as file:
             found = json.loads(file.pages.first.description).get("run")
-    except (OSError, ValueError, AttributeError, RecursionError, tifffile.TiffFileError):
+    except (OSError, *DAMAGED):
         return None
     return found if isinstance(found, str) and found else None
 
@@ -76,7 +80,7 @@ def map_volume(path: Path) -> NDArray[np.float32]:
 
     try:
         return tifffile.memmap(path, mode="r")
-    except (ValueError, tifffile.TiffFileError) as error:
+    except DAMAGED as error:
         raise InputError(f"{path}: cannot be read ({error}); run the method again with --force") from None
 
 

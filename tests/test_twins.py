@@ -10,7 +10,7 @@ import torch
 from test_run import GEOMETRY, Double
 
 from benchmarks import artefact, attempt, methods, records, run
-from benchmarks.volumes import identity_of, read_volume, write_volume
+from benchmarks.volumes import identity_of, map_volume, read_volume, write_volume
 from ctsim.errors import InputError
 from ctsim.materials import attenuation
 from ctsim.types import Scan, Volume
@@ -184,6 +184,23 @@ def test_a_volume_that_cannot_be_read_is_one_sentence(tmp_path):
     with pytest.raises(InputError, match="TIFF"):
         read_volume(tmp_path / "v.tif")
     assert identity_of(tmp_path / "v.tif") is None
+
+
+def test_a_volume_cut_short_anywhere_is_whole_or_one_sentence(tmp_path, caplog):
+    caplog.set_level("CRITICAL", "tifffile")
+    path = tmp_path / "v.tif"
+    write_volume(path, np.ones((2, 3, 4), np.float32), "whose")
+    whole = path.read_bytes()
+    assert identity_of(path) == "whose"
+    for size in range(len(whole)):
+        path.write_bytes(whole[:size])
+        assert identity_of(path) in ("whose", None)
+        try:
+            values = map_volume(path)
+        except InputError as error:
+            assert "cannot be read" in str(error)
+        else:  # only what follows the voxels is missing
+            assert values.shape == (2, 3, 4) and (values == 1).all()
 
 
 def masked(scan, *, device, mask="oracle"):
