@@ -24,8 +24,10 @@ class Noise(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     `fixed_pattern` is the relative standard deviation of the pixels' gains in the open field, which dividing by the
     flat takes out. A pixel's gain also changes linearly from there to no signal, by `pattern_residual` times as much,
-    drawn anew; that stays after the flat, the same in all views, and makes rings. The default, a tenth, is a choice.
-    Model "tigre" has no pattern and no dead pixels.
+    drawn anew; that stays after the flat and makes rings. The default, a tenth, is a choice.
+
+    Model "tigre" is TIGRE's: P is normalised by the largest of the scan (of the twin by its own, so that the noise of
+    the two differs everywhere). It has no fixed pattern, dead pixels, bow-tie or heel.
     """
 
     model: Literal["compound", "tigre", "none"] = "compound"
@@ -43,6 +45,8 @@ class Noise(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise InputError(f"noise.model must be 'compound', 'tigre' or 'none', got {self.model!r}")
         if not 0 <= self.electronic <= 1e6:
             raise InputError(f"noise.electronic must be within [0, 1e6] photons, got {self.electronic}")
+        if self.model == "tigre" and (self.fixed_pattern or self.dead_fraction):
+            raise InputError("noise.model = 'tigre' has no noise.fixed_pattern and no noise.dead_fraction; expected 0")
         if self.adc_bits is not None and not 4 <= self.adc_bits <= 16:
             raise InputError(f"noise.adc_bits must be within 4..16 or left out, got {self.adc_bits}")
         if not 0 <= self.pedestal < self.adc_fill <= 1:
@@ -84,13 +88,14 @@ class Noise(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 def pixel_pattern(shape: tuple[int, int], *, noise: Noise, scene_id: str) -> NDArray[np.float32] | None:
-    """Return how each pixel differs, float32 [2, v, u]; None if none does. Model "tigre" has no such pixels.
+    """Return how each pixel differs, float32 [2, v, u]; None if none does.
 
-    [0] is the gain in the open field, around 1 and 0 where the pixel is dead; [1] by which share it is larger at no
-    signal, linear between. Both are Gaussian, with standard deviations `fixed_pattern` and `fixed_pattern` times
-    `pattern_residual`; no gain is below 0.05, no share below −0.95.
+    [0] is the gain at full signal, around 1 and 0 where the pixel is dead; [1] by which share it is larger at no
+    signal, linear between. Full signal is the open field of a tube without bow-tie and heel. Both are Gaussian, with
+    standard deviations `fixed_pattern` and `fixed_pattern` times `pattern_residual`; no gain is below 0.05, no share
+    below −0.95.
     """
-    if noise.model == "tigre" or (noise.fixed_pattern == 0 and noise.dead_fraction == 0):
+    if noise.fixed_pattern == 0 and noise.dead_fraction == 0:
         return None
     n = shape[0] * shape[1]
     gains = 1.0 + noise.fixed_pattern * rng.normal(rng.stream_key(scene_id, "pixel gain", 0), n)[:, 0]

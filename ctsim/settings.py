@@ -26,7 +26,8 @@ class Simulation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 class Truth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Which ground truth is written beside the counts; each costs nothing unless asked for.
 
-    `twin` is the scan without its metal inserts and with the same noise streams; `mono_kev` lists
+    `twin` is the scan without its metal inserts and with the same noise streams, so that open pixels are the same to
+    the count (but for the noise model "tigre", which normalises each scan by its own largest P); `mono_kev` lists
     energies (keV) of noise-free monochromatic line integrals; `trace` marks the pixels whose rays meet
     metal, `metal_path` is their length in metal (mm), `paths` the length in every material (mm).
     """

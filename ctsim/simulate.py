@@ -204,6 +204,8 @@ def simulate_views(
     Line-integral images (noise_free, scatter_free, mono_…) are P = −ln(signal/open), float32 [v, u];
     metal_path and paths are mm; trace is 1 where the central ray meets metal.
     """
+    if first_view == scanner.geometry.n_views:
+        return  # a pass over all views, as TIGRE's noise takes, would be for nothing
     simulator = _Simulator(plan, phantom, scanner)
     for k in range(first_view, scanner.geometry.n_views):
         yield k, simulator.view(k)

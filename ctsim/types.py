@@ -88,6 +88,8 @@ class Scanner(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
             raise InputError(
                 f"detector.threshold must be below tube.kvp = {self.tube.kvp} keV, got {self.detector.threshold}"
             )
+        if (self.tube.heel or self.tube.bowtie) and self.noise.model == "tigre":
+            raise InputError("noise.model = 'tigre' knows P only: expected neither tube.heel nor tube.bowtie with it")
         if (self.tube.heel or self.tube.bowtie) and self.geometry.poses is not None:
             raise InputError("tube.heel and tube.bowtie need a circular orbit, but geometry.poses is given")
 

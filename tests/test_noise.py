@@ -365,6 +365,8 @@ def test_tigre_kernel_equals_its_reference():
         ({"n_flats": -1}, "noise.n_flats"),
         ({"fixed_pattern": 0.5}, "noise.fixed_pattern"),
         ({"pattern_residual": 1.5}, "noise.pattern_residual"),
+        ({"model": "tigre", "fixed_pattern": 0.01}, "tigre.*fixed_pattern"),
+        ({"model": "tigre", "dead_fraction": 0.01}, "tigre.*dead_fraction"),
         ({"dead_fraction": 1.0}, "noise.dead_fraction"),
     ],
 )

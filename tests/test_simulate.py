@@ -256,6 +256,12 @@ def test_heel_needs_a_circular_orbit():
         scanner(geometry=msgspec.structs.replace(GEOMETRY, poses=poses), tube=Tube(heel=True))
 
 
+@pytest.mark.parametrize("more", [{"heel": True}, {"bowtie": Bowtie(center=1.0, edge=5.0, half_angle_deg=10.0)}])
+def test_tigre_noise_is_refused_where_the_open_field_is_not_flat(more):
+    with pytest.raises(InputError, match="tigre"):
+        scanner(tube=Tube(**more), noise=Noise(model="tigre"))
+
+
 def test_arbitrary_poses_give_what_the_orbit_gives():
     poses = tuple(tuple(float(x) for x in row) for row in GEOMETRY.pose_array())
     _, orbit = run(phantom(), scanner())
