@@ -176,7 +176,7 @@ def materials(setup: Setup) -> Iterator[Pair[Images]]:
         whole=next_views(setup, every, phantom, scanner),
         difference=lambda a, b: apart(a, b, ("noise_free", "metal_free/noise_free")),
         unit="P",
-        limit=rounding(plan, phantom, scanner),
+        limit=rounding(every, phantom, scanner),
         stated="rounding",
     )
 
@@ -233,7 +233,7 @@ def rays(setup: Setup) -> Iterator[Pair[Images]]:
             whole=next_views(setup, every, phantom, scanner),
             difference=lambda a, b: apart(a, b, ("noise_free", "metal_free/noise_free")),
             unit="P",
-            limit=rounding(plan, phantom, scanner),
+            limit=rounding(every, phantom, scanner),
             stated="rounding",
         )
 

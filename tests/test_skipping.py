@@ -67,6 +67,19 @@ def test_every_case_is_measured_and_stays_within_what_is_stated(run):
     assert all(f"| {case} |" in text for case in skipping.CASES) and "Grids this small" in text and "NO" not in text
 
 
+def test_a_pixel_that_is_off_by_a_thousandth_is_found(here, tmp_path, monkeypatch, capsys):
+    def off(tracer, *given, **more):
+        found = transmit(tracer, *given, **more)
+        found[0][5, 7] *= 1.001 if tracer.skip else 1.0
+        return found
+
+    monkeypatch.setattr("ctsim.simulate.transmit", off)
+    given = [str(tmp_path), "--case", "rays", "--size", "small", "--repeats", "1"]
+    assert skipping.main(given) == 1
+    assert "| NO |" in capsys.readouterr().out
+    assert all(r.measured.limit < 2e-4 for r in skipping_tables.read(tmp_path / skipping.NAME))
+
+
 @pytest.mark.parametrize("difference", [2.0, math.nan, math.inf])
 def test_a_difference_beyond_what_is_stated_ends_with_one(here, tmp_path, monkeypatch, capsys, difference):
     monkeypatch.setitem(skipping_cases.CASES, "rays", lambda setup: iter([fake(0.5), fake(difference)]))
