@@ -67,7 +67,7 @@ def cut(metal: NDArray[np.bool_], body: NDArray[np.bool_]) -> tuple[int, int, in
 def write_panels(records: list[Record], scans: list[Stored], results: Path) -> list[Path]:
     """Draw panels/SCENE.png for every scan that has kept volumes; return what was written.
 
-    A picture holds a digest of what it shows (`_digest`); one that shows what is there already stays.
+    A picture holds a digest of the runs and files that it shows (`_digest`); where they are the same it stays.
     """
     mine: dict[str, list[Record]] = {}
     for record in latest(records):
