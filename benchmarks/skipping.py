@@ -31,8 +31,8 @@ CASES: tuple[Case, ...] = get_args(Case)
 NAME = "skipping.jsonl"
 # seconds of one run both ways at size core, on two idle cores (docs/skipping.md)
 SECONDS: dict[Case, float] = {
-    "materials": 0.45, "bricks": 1.7, "rays": 0.53, "energies": 0.88, "edges": 2.4, "refining": 0.5, "scatter": 0.41,
-    "twin": 0.48, "truth": 0.51, "metal-free": 4.7, "rows": 2.9, "scan": 6.4, "record": 7.8,
+    "materials": 0.46, "bricks": 1.1, "rays": 10.3, "energies": 0.63, "edges": 2.0, "refining": 1.6, "scatter": 0.45,
+    "twin": 2.6, "truth": 0.49, "metal-free": 4.4, "rows": 2.0, "scan": 6.7, "record": 4.8,
 }  # fmt: skip
 
 

@@ -161,7 +161,7 @@ def test_a_dry_run_lists_what_is_left_and_what_it_takes(tmp_path, monkeypatch, c
     assert tuple(skipping.SECONDS) == skipping.CASES
     listed = dry(str(out), "--repeats", "4")
     assert [line[0] for line in listed[:-1]] == list(skipping.CASES) and not out.exists()
-    assert listed[-2] == ["record", "5", "runs", "both", "ways", "39", "s"]  # 5 × 7.8 s
+    assert listed[-2] == ["record", "5", "runs", "both", "ways", "24", "s"]  # 5 × 4.8 s
     assert listed[-1][:4] == ["total:", str(len(skipping.CASES)), "of", str(len(skipping.CASES))]
     assert dry(str(out), "--size", "small", "--case", "rays")[0][-1] == "unknown"  # of grids that were never timed
 
