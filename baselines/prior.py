@@ -104,10 +104,15 @@ def tissue_prior(volume: Array, metal: Metal, water: float) -> Array:
     return out
 
 
+def choice_views(n: int) -> list[int]:
+    """Return which of `n` views decide: the middle ones of equal shares, the same where every view is given twice."""
+    shares = min(CHOICE_VIEWS, n)
+    return [(2 * k + 1) * n // (2 * shares) for k in range(shares)]
+
+
 def _misfit(trace: Trace, columns: Array) -> tuple[float, float]:
     """Return the standard deviation of P − q on the ring and the greatest q, in some views."""
-    n = trace.geometry.n_views
-    views = np.unique(np.linspace(0, n - 1, min(CHOICE_VIEWS, n)).round().astype(int)).tolist()
+    views = choice_views(trace.geometry.n_views)
     projections = forward_columns(columns, trace.geometry, views)
     off = [_beside(trace, view, q) for view, q in zip(views, projections, strict=True)]
     ring = np.concatenate(off)

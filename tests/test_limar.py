@@ -11,7 +11,7 @@ from baselines import limar, nmar
 from baselines.inpaint import Filled, fill, harmonic
 from baselines.metal import Metal, Trace, auto_mask, find_metal, reach, reinsert, water_value
 from baselines.morphology import dilate, spread
-from baselines.prior import tissue_prior
+from baselines.prior import choice_views, tissue_prior
 from benchmarks.methods import find
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -347,3 +347,11 @@ def test_reinsertion_refuses_what_it_does_not_know():
     metal = Metal(mask=np.ones((2, 2, 2), bool), source="oracle")
     with pytest.raises(InputError, match="insert must be one of"):
         reinsert(torch.zeros(2, 2, 2), np.zeros((2, 2, 2), np.float32), metal, "x")
+
+
+def test_the_views_that_decide_between_priors_are_the_same_where_each_is_given_twice():
+    for n in (1, 5, 31, 32, 33, 48, 60, 240):
+        views = choice_views(n)
+        assert len(set(views)) == min(n, 32) and 0 <= min(views) and max(views) < n
+        if n >= 32:
+            assert [view // 2 for view in choice_views(2 * n)] == views
