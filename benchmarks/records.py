@@ -263,8 +263,10 @@ def outdated(records: list[Record]) -> str:
 
 def remarks(records: list[Record]) -> list[str]:
     """Say, a sentence without its stop each, what tables of these records leave out and what they mix."""
-    shown = dict.fromkeys((f"{r.run.scene} (seed {r.run.seed})", r.data_code) for r in latest(records))
-    return [text for text in (outdated(records), mixture(shown)) if text]
+    shown = latest(records)
+    known = {r.run.scan: r.data_code for r in shown if r.data_code}  # records of before that do not note it
+    made = {f"{r.run.scene} (seed {r.run.seed})": known.get(r.run.scan, "") for r in shown}
+    return [text for text in (outdated(records), mixture(made.items())) if text]
 
 
 def last(records: list[Record]) -> dict[str, Record]:

@@ -352,6 +352,6 @@ def test_reinsertion_refuses_what_it_does_not_know():
 def test_the_views_that_decide_between_priors_are_the_same_where_each_is_given_twice():
     for n in (1, 5, 31, 32, 33, 48, 60, 240):
         views = choice_views(n)
-        assert len(set(views)) == min(n, 32) and 0 <= min(views) and max(views) < n
+        assert len(set(views)) == min(n, 32) and min(views) >= 0 and max(views) < n
         if n >= 32:
             assert [view // 2 for view in choice_views(2 * n)] == views

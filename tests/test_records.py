@@ -45,6 +45,7 @@ def test_records_of_before_there_were_details_are_read(tmp_path):
 def test_scans_of_different_code_are_named():
     one, two = (msgspec.structs.replace(record(seed=k, scan=f"s{k}"), data_code=f"v{k}") for k in (1, 2))
     assert records.remarks([one, one]) == []
+    assert records.remarks([one, msgspec.structs.replace(one, label="limar", data_code="")]) == []  # of the same scan
     assert records.remarks([one, two]) == [
         "the scenes were made by different code of the simulator, so their scores may not compare: "
         "lung (seed 1) by v1; lung (seed 2) by v2; make-dataset --force makes them again"
