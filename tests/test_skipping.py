@@ -178,7 +178,7 @@ def test_a_dry_run_lists_what_is_left_and_what_it_takes(tmp_path, monkeypatch, c
         lines.append(out / skipping.NAME, record, record)
     words = [str(out), "--case", "rays", "--case", "twin"]
     (twin, total) = dry(*words, "--repeats", "2")
-    assert twin == ["twin", "3", "runs", "both", "ways", "1.4", "s"] and total[1:6] == ["1", "of", "2", "cases,", "1.4"]
+    assert twin == ["twin", "3", "runs", "both", "ways", "7.8", "s"] and total[1:6] == ["1", "of", "2", "cases,", "7.8"]
     assert dry(*words, "--repeats", "3")[0] == ["rays", "4", "runs", "both", "ways", "48", "s"]
     assert dry(*words, "--repeats", "2", "--force")[0][:2] == ["rays", "3"]
 
