@@ -10,15 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from baselines.inpaint import Filled
-from baselines.limar import check_insert, finished, mended, uncorrected
-from baselines.metal import Trace, find_metal, reinsert
-from baselines.morphology import dilate
-from baselines.prior import NO_BODY, RING, check_prior, choose_prior
+from ctsim.baselines.inpaint import Filled
+from ctsim.baselines.limar import check_insert, finished, mended, uncorrected
+from ctsim.baselines.metal import Trace, find_metal, reinsert
+from ctsim.baselines.morphology import dilate
+from ctsim.baselines.prior import NO_BODY, RING, check_prior, choose_prior
+from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.log import line_integrals
+from ctsim.reconstruct.projector import forward_columns
 from ctsim.types import Scan, Status, Volume
-from reconstruct.fdk import reconstruct as fdk
-from reconstruct.log import line_integrals
-from reconstruct.projector import forward_columns
 
 TERMS = ("l", "l^2", "l^3", "l t", "l^2 t", "l t^2")  # l: mm of metal, t: mm of water that weigh as the tissue
 RIDGE = 2e-3  # on columns of norm 1
@@ -37,12 +37,12 @@ def bhc_poly(
 ) -> Volume:
     """Reconstruct `scan` less a polynomial in metal and tissue length that is fitted to what metal adds to it.
 
-    q are the projections of a tissue prior (`baselines.prior.tissue_prior`) that has water in place of the metal; how P
-    of tissue alone bends with q is fitted on a ring around the trace. What P exceeds that by in the trace is
+    q are the projections of a tissue prior (`ctsim.baselines.prior.tissue_prior`) that has water in place of the metal;
+    how P of tissue alone bends with q is fitted on a ring around the trace. What P exceeds that by in the trace is
     regressed on `TERMS`, leaving out clamped pixels, and the fit, where it is positive, is subtracted from P.
-    `prior` is that of `baselines.nmar.Settings`, `mask` and `insert` those of `baselines.limar.Bridging`. Without
-    metal, where the mask is not to be relied on, and where nothing can be fitted, the result is FDK's to the last
-    bit. Raises InputError as LIMAR does.
+    `prior` is that of `ctsim.baselines.nmar.Settings`, `mask` and `insert` those of
+    `ctsim.baselines.limar.Bridging`. Without metal, where the mask is not to be relied on, and where nothing can be
+    fitted, the result is FDK's to the last bit. Raises InputError as LIMAR does.
     """
     check_insert(insert)
     check_prior(prior)

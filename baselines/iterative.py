@@ -1,6 +1,6 @@
 """What the iterative methods share: the linear system of a scan, their course, and how they end.
 
-A x = p with A of `reconstruct.projector`, x the attenuation in 1/mm and p the measured line integrals; residuals
+A x = p with A of `ctsim.reconstruct.projector`, x the attenuation in 1/mm and p the measured line integrals; residuals
 are ‖A x − p‖_W / ‖p‖_W, so an empty volume has 1. Volumes are kept as [y, x, z] while iterating. Only voxels
 within the field of view that some ray meets are unknowns; all others are and stay zero.
 """
@@ -14,17 +14,17 @@ import torch
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from baselines.beyond import seen_beyond
-from baselines.metal import Trace, auto_mask
+from ctsim.baselines.beyond import seen_beyond
+from ctsim.baselines.metal import Trace, auto_mask
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.log import NO_SIGNAL, is_blind, line_integrals
+from ctsim.reconstruct.projector import Views, adjoint_columns, forward_columns
+from ctsim.reconstruct.redundancy import ray_weights
+from ctsim.reconstruct.watch import Stopwatch
+from ctsim.reconstruct.watch import watch as watch
 from ctsim.types import Scan, Status, Volume
-from reconstruct.fdk import reconstruct as fdk
-from reconstruct.log import NO_SIGNAL, is_blind, line_integrals
-from reconstruct.projector import Views, adjoint_columns, forward_columns
-from reconstruct.redundancy import ray_weights
-from reconstruct.watch import Stopwatch
-from reconstruct.watch import watch as watch
 
 Array = NDArray[np.float32]
 Weights = str | torch.Tensor
@@ -36,7 +36,7 @@ WORST = 1.5  # a relative residual that no fit of pure noise reaches: one view f
 class Iterations:
     """What all iterative methods are given; a method adds its own and may set other defaults.
 
-    `weights` of the rays is "none" (all 1), "trace" (0 in the trace of the metal that `baselines.metal.auto_mask`
+    `weights` of the rays is "none" (all 1), "trace" (0 in the trace of the metal that `ctsim.baselines.metal.auto_mask`
     finds in FDK's volume, else 1), "exp(-l)" (the share of photons that came through a line integral l, hence the
     inverse variance of l up to a factor), or a tensor [view, v, u] of one's own.
     """

@@ -17,19 +17,19 @@ import torch
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from baselines.metal import auto_mask, water_value
-from baselines.prior import BONE, LUNG
+from ctsim.baselines.metal import auto_mask, water_value
+from ctsim.baselines.prior import BONE, LUNG
 from ctsim.detector import Detector
 from ctsim.errors import InputError
 from ctsim.materials import attenuation, material
 from ctsim.quadrature import effective_weights, energy_rule, full_rule
+from ctsim.reconstruct.beam import Given, known_detector, known_tube
+from ctsim.reconstruct.fdk import fdk_stream
+from ctsim.reconstruct.log import count_floor, how_it_ended, is_blind, line_integrals
+from ctsim.reconstruct.projector import forward_columns
+from ctsim.reconstruct.redundancy import ray_weights
 from ctsim.spectrum import Spectrum, Tube, spectrum
 from ctsim.types import Scan, Volume
-from reconstruct.beam import Given, known_detector, known_tube
-from reconstruct.fdk import fdk_stream
-from reconstruct.log import count_floor, how_it_ended, is_blind, line_integrals
-from reconstruct.projector import forward_columns
-from reconstruct.redundancy import ray_weights
 
 P_TOP, NODES = 30.0, 2048  # of the table of water; beyond it goes on straight
 L0_VIEWS, SEEN = 8, 0.05  # views, and the least P, that the median path is taken from

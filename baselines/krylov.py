@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from baselines.iterative import Course, Iterations, System, finish, weighted_dot, weighted_norm
+from ctsim.baselines.iterative import Course, Iterations, System, finish, weighted_dot, weighted_norm
+from ctsim.reconstruct.settings import keywords
 from ctsim.types import Scan, Volume
-from reconstruct.settings import keywords
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

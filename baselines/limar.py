@@ -11,22 +11,22 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from baselines.inpaint import FILLS, Filled, fill
-from baselines.metal import INSERTS, Metal, Trace, find_metal, reinsert
+from ctsim.baselines.inpaint import FILLS, Filled, fill
+from ctsim.baselines.metal import INSERTS, Metal, Trace, find_metal, reinsert
 from ctsim.errors import InputError
+from ctsim.reconstruct.fdk import add_fdk
+from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.settings import keywords
 from ctsim.types import Scan, Status, Volume
-from reconstruct.fdk import add_fdk
-from reconstruct.fdk import reconstruct as fdk
-from reconstruct.settings import keywords
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bridging:
     """Where the metal is, how its trace is bridged, and how it comes back.
 
-    `mask` is "oracle", "auto" or a file (`baselines.metal.find_metal`); `interpolation` "rows" or "harmonic"
-    (`baselines.inpaint.fill`); `insert` "fdk", "mean" or "none" (`baselines.metal.reinsert`); `dilation` widens the
-    trace by so many pixels, None by what the mask's edge leaves out of it (`baselines.metal.Trace`).
+    `mask` is "oracle", "auto" or a file (`ctsim.baselines.metal.find_metal`); `interpolation` "rows" or "harmonic"
+    (`ctsim.baselines.inpaint.fill`); `insert` "fdk", "mean" or "none" (`ctsim.baselines.metal.reinsert`); `dilation`
+    widens the trace by so many pixels, None by what the mask's edge leaves out of it (`ctsim.baselines.metal.Trace`).
     """
 
     mask: str = "oracle"

@@ -9,13 +9,13 @@ import scipy.ndimage
 import torch
 from numpy.typing import NDArray
 
-from baselines.morphology import dilate, filled, pieces, spread
 from ctsim.arrayfile import read_array
+from ctsim.baselines.morphology import dilate, filled, pieces, spread
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry, crosswise
 from ctsim.project import Tracer
+from ctsim.reconstruct.log import LineIntegrals
 from ctsim.types import Phantom, Scan
-from reconstruct.log import LineIntegrals
 
 PEAK, HALF, SMALLEST = 0.25, 0.5, 8  # of the maximum; of the metal's value; voxels
 FACTORS = (8.0, 1.5)  # metal must exceed this many times water, and this many times the body's 99.9th percentile

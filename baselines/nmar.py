@@ -12,15 +12,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from baselines.inpaint import Filled, fill
-from baselines.limar import Bridging, finished, mended, uncorrected
-from baselines.metal import Trace, find_metal, reinsert
-from baselines.prior import NO_BODY, check_prior, choose_prior
+from ctsim.baselines.inpaint import Filled, fill
+from ctsim.baselines.limar import Bridging, finished, mended, uncorrected
+from ctsim.baselines.metal import Trace, find_metal, reinsert
+from ctsim.baselines.prior import NO_BODY, check_prior, choose_prior
 from ctsim.errors import InputError
+from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.projector import forward_columns
+from ctsim.reconstruct.settings import keywords
 from ctsim.types import Scan, Status, Volume
-from reconstruct.fdk import reconstruct as fdk
-from reconstruct.projector import forward_columns
-from reconstruct.settings import keywords
 
 NORMALISATIONS = ("offset", "additive", "ratio")
 
@@ -68,10 +68,10 @@ class Normalise:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings(Bridging):
-    """Those of `baselines.limar.Bridging`; `normalisation` and `floor` as in `Normalise`; and which prior.
+    """Those of `ctsim.baselines.limar.Bridging`; `normalisation` and `floor` as in `Normalise`; and which prior.
 
     `prior` is segmented from the "fdk" or the "limar" volume, or "auto": from the latter where its projections
-    fit the measured ones better by a twentieth around the trace (`baselines.prior.choose_prior`).
+    fit the measured ones better by a twentieth around the trace (`ctsim.baselines.prior.choose_prior`).
     """
 
     prior: str = "auto"

@@ -10,11 +10,11 @@ import scipy.ndimage
 import torch
 from numpy.typing import NDArray
 
-from baselines.limar import interpolated
-from baselines.metal import Metal, Trace, around, reach, water_value
-from baselines.morphology import dilate, opened, spread
+from ctsim.baselines.limar import interpolated
+from ctsim.baselines.metal import Metal, Trace, around, reach, water_value
+from ctsim.baselines.morphology import dilate, opened, spread
 from ctsim.errors import InputError
-from reconstruct.projector import forward_columns
+from ctsim.reconstruct.projector import forward_columns
 
 AIR, LUNG, BONE = 0.5, 0.15, 1.5  # bounds of the classes in multiples of water
 LUNG_SHARE = 0.03  # of the body; with less there is no lung class

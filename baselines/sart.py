@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit, prange
 
-from baselines.iterative import (
+from ctsim.baselines.iterative import (
     Array,
     Course,
     Iterations,
@@ -23,8 +23,8 @@ from baselines.iterative import (
     visiting_order,
     weighted_dot,
 )
+from ctsim.reconstruct.settings import keywords
 from ctsim.types import Scan, Volume
-from reconstruct.settings import keywords
 
 CACHE_BYTES = 1 << 30  # voxel sums of the subsets are kept up to this size, else made anew on each visit
 

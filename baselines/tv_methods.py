@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from baselines.iterative import (
+from ctsim.baselines.iterative import (
     Array,
     Course,
     Iterations,
@@ -18,12 +18,12 @@ from baselines.iterative import (
     weighted_dot,
     weighted_norm,
 )
-from baselines.metal import water_value
-from baselines.sart import Passes
+from ctsim.baselines.metal import water_value
+from ctsim.baselines.sart import Passes
 from ctsim.errors import InputError
+from ctsim.reconstruct.settings import keywords
+from ctsim.reconstruct.tv import Denoiser, axis_ratios, descend, total_variation
 from ctsim.types import Scan, Volume
-from reconstruct.settings import keywords
-from reconstruct.tv import Denoiser, axis_ratios, descend, total_variation
 
 # Sidky and Pan's values
 RELAXATION_FALLS = 0.995

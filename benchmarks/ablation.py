@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from benchmarks.paper_layout import load
-from benchmarks.paper_tables import ABLATION
+from ctsim.benchmarks.paper_layout import load
+from ctsim.benchmarks.paper_tables import ABLATION
 from ctsim.errors import InputError
 from ctsim.human import human_time
 
 if TYPE_CHECKING:
-    from benchmarks.methods import Method
-    from benchmarks.records import Record
-    from benchmarks.run import Options, Task
-    from benchmarks.workers import Pool
+    from ctsim.benchmarks.methods import Method
+    from ctsim.benchmarks.records import Record
+    from ctsim.benchmarks.run import Options, Task
+    from ctsim.benchmarks.workers import Pool
 
 NAME = "ablation.md"
 # CPU seconds of a step of each preset on this suite, which ends with 65 536 splats, and its share of the warm-up, which
@@ -65,7 +65,7 @@ class Variant:
 
 def main(arguments: list[str]) -> int:
     """Run the command; 0 if every run ended well, 1 if one failed."""
-    from benchmarks.limited import refuse_unless_positive
+    from ctsim.benchmarks.limited import refuse_unless_positive
 
     given = tyro.cli(Arguments, prog="run-benchmark ablation", args=arguments)
     refuse_unless_positive(given.seconds)
@@ -73,9 +73,9 @@ def main(arguments: list[str]) -> int:
     if given.dry_run:
         sys.stdout.write(estimate(listed, given.data, given.results))
         return 0
-    from benchmarks import make_dataset
-    from benchmarks.run import Options
-    from benchmarks.workers import open_pool
+    from ctsim.benchmarks import make_dataset
+    from ctsim.benchmarks.run import Options
+    from ctsim.benchmarks.workers import open_pool
 
     # what cannot run shows before scans are made
     options, pool = Options(seconds=given.seconds, anchor=False), open_pool(given.workers, None)
@@ -117,8 +117,8 @@ def _run(
     given: Arguments, listed: list[Variant], options: "Options", workers: AbstractContextManager["Pool | None"]
 ) -> int:
     """Run what has no record, then render tables from all records, also after Ctrl-C."""
-    from benchmarks import paper_tables, records, run, tables
-    from benchmarks.cli_run import work
+    from ctsim.benchmarks import paper_tables, records, run, tables
+    from ctsim.benchmarks.cli_run import work
 
     given.results.mkdir(parents=True, exist_ok=True)
     records.repair(given.results / records.NAME)
@@ -138,14 +138,14 @@ def _run(
 
 def methods_of(listed: list[Variant]) -> "dict[str, Method]":
     """Return the methods by their labels. Raises InputError for a method or a parameter that does not exist."""
-    from benchmarks.methods import find
+    from ctsim.benchmarks.methods import find
 
     return {variant.label: find(variant.method, variant.params) for variant in listed}
 
 
 def tasks(listed: list[Variant], data: Path) -> "list[Task]":
     """Return the runs as tasks, scene by scene; those of scenes that are not in `data` are left out."""
-    from benchmarks.run import tasks_on
+    from ctsim.benchmarks.run import tasks_on
     from ctsim.store import list_scans, open_scan
 
     methods = methods_of(listed)
@@ -161,8 +161,8 @@ def tasks(listed: list[Variant], data: Path) -> "list[Task]":
 
 def estimate(listed: list[Variant], data: Path, results: Path) -> str:
     """Return what --dry-run prints: the runs, the rows that show them, what is recorded, and what the rest costs."""
-    from benchmarks import records
-    from benchmarks.run import pending
+    from ctsim.benchmarks import records
+    from ctsim.benchmarks.run import pending
 
     found = [r for r in records.read_all(results)[0] if r.status == records.OK and r.cost is not None]
     there = tasks(listed, data)

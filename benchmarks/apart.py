@@ -21,7 +21,7 @@ from typing import IO, Any
 _BEGIN = """import pickle, sys
 file = open(sys.argv[1], "rb")
 sys.path[:] = pickle.load(file)
-from benchmarks import apart
+from ctsim.benchmarks import apart
 apart.be(file)"""
 _THREADS = {"numba": "NUMBA_NUM_THREADS", "torch": "OMP_NUM_THREADS"}
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.metrics import Mask
-from benchmarks.protocol import Score, Stored, Truth
+from ctsim.benchmarks.metrics import Mask
+from ctsim.benchmarks.protocol import Score, Stored, Truth
 from ctsim.errors import InputError
 
 NEAR = 5.0

@@ -9,13 +9,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import details, intermediates
-from benchmarks.host import measured
-from benchmarks.isolate import Outcome
-from benchmarks.methods import Method
-from benchmarks.own import changed, restored
-from benchmarks.protocol import Stored
-from benchmarks.records import Cost
+from ctsim.benchmarks import details, intermediates
+from ctsim.benchmarks.host import measured
+from ctsim.benchmarks.isolate import Outcome
+from ctsim.benchmarks.methods import Method
+from ctsim.benchmarks.own import changed, restored
+from ctsim.benchmarks.protocol import Stored
+from ctsim.benchmarks.records import Cost
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:

@@ -11,32 +11,30 @@ import sys
 from collections.abc import Callable
 
 OTHERS = {
-    "inspect": "inspector",
-    "pareto": "pareto",
-    "peers": "peers",
-    "reproduce": "reproduce",
-    "skipping": "skipping",
-    "report": "reports.report",
-    "ablation": "ablation",
-    "paper-tables": "paper_tables",
-    "stress": "stress",
+    "inspect": "ctsim.benchmarks.inspector",
+    "pareto": "ctsim.benchmarks.pareto",
+    "peers": "ctsim.benchmarks.peers",
+    "reproduce": "ctsim.benchmarks.reproduce",
+    "skipping": "ctsim.benchmarks.skipping",
+    "report": "ctsim.reports.report",
+    "ablation": "ctsim.benchmarks.ablation",
+    "paper-tables": "ctsim.benchmarks.paper_tables",
+    "stress": "ctsim.benchmarks.stress",
 }
 EXIT_USER, EXIT_INTERRUPTED = 2, 130
 
 
 def make_dataset() -> int:
     """Run `make-dataset`; return the exit code."""
-    return guarded("make-dataset", "benchmarks.make_dataset", sys.argv[1:])
+    return guarded("make-dataset", "ctsim.benchmarks.make_dataset", sys.argv[1:])
 
 
 def run_benchmark() -> int:
     """Run `run-benchmark` or one of its subcommands, the keys of `OTHERS`; return the exit code."""
     arguments = sys.argv[1:]
     if arguments and arguments[0] in OTHERS:
-        module = OTHERS[arguments[0]]  # one of another package is named, never imported by this one
-        module = module if "." in module else f"benchmarks.{module}"
-        return guarded(f"run-benchmark {arguments[0]}", module, arguments[1:])
-    return guarded("run-benchmark", "benchmarks.cli_run", arguments)
+        return guarded(f"run-benchmark {arguments[0]}", OTHERS[arguments[0]], arguments[1:])
+    return guarded("run-benchmark", "ctsim.benchmarks.cli_run", arguments)
 
 
 def guarded(name: str, module: str, arguments: list[str], *, resumes: bool = True) -> int:

@@ -13,12 +13,12 @@ from ctsim.errors import InputError
 from ctsim.human import human_choice
 
 if TYPE_CHECKING:
-    from benchmarks.methods import Method
-    from benchmarks.protocol import Stored
-    from benchmarks.records import Record
-    from benchmarks.run import Options
-    from benchmarks.schedule import Group
-    from benchmarks.workers import Pool
+    from ctsim.benchmarks.methods import Method
+    from ctsim.benchmarks.protocol import Stored
+    from ctsim.benchmarks.records import Record
+    from ctsim.benchmarks.run import Options
+    from ctsim.benchmarks.schedule import Group
+    from ctsim.benchmarks.workers import Pool
 
 log = logging.getLogger(__name__)
 FEW = 20  # scenes, all of which a message names
@@ -76,8 +76,8 @@ def main(arguments: list[str]) -> int:
     """Run the command; 0 if every run ended well or was skipped with a reason, 1 if one failed."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     given = tyro.cli(Arguments, prog="run-benchmark", args=arguments)
-    from benchmarks import records, tables
-    from benchmarks.limited import refuse_unless_positive
+    from ctsim.benchmarks import records, tables
+    from ctsim.benchmarks.limited import refuse_unless_positive
 
     refuse_unless_positive(given.seconds)
     if given.dry_run and (given.collect or given.table):
@@ -102,7 +102,7 @@ def main(arguments: list[str]) -> int:
 
 def _read(results: Path) -> "list[Record]":
     """Read the records of a folder, and say which line was cut short."""
-    from benchmarks import records
+    from ctsim.benchmarks import records
 
     found, torn = records.read_all(results)
     for rest in torn:
@@ -112,9 +112,9 @@ def _read(results: Path) -> "list[Record]":
 
 def _compute(given: Arguments) -> int:
     """Run what is missing, then render tables and panels from all records, also after Ctrl-C."""
-    from benchmarks import records, run, schedule
-    from benchmarks.devices import check_device
-    from benchmarks.workers import open_pool
+    from ctsim.benchmarks import records, run, schedule
+    from ctsim.benchmarks.devices import check_device
+    from ctsim.benchmarks.workers import open_pool
 
     if given.scheduler is None:  # else it is the workers that have the device
         check_device(given.device)
@@ -162,8 +162,8 @@ def work(groups: "list[Group]", results: Path, options: "Options", pool: "Pool |
     """
     from tqdm import tqdm
 
-    from benchmarks import records, schedule, tables
-    from reconstruct.watch import Progress, listen
+    from ctsim.benchmarks import records, schedule, tables
+    from ctsim.reconstruct.watch import Progress, listen
 
     failed, written, took, ended = [], 0.0, 0.0, ""
     n_runs = sum(len(group) for group in groups)
@@ -186,7 +186,7 @@ def work(groups: "list[Group]", results: Path, options: "Options", pool: "Pool |
 
 
 def _methods(given: Arguments) -> "list[Method]":
-    from benchmarks import methods
+    from ctsim.benchmarks import methods
 
     names = tuple(dict.fromkeys(given.method)) or ("fdk",)
     overrides = methods.parse_overrides(given.set, names)
@@ -232,7 +232,7 @@ def _warn_of_other_code(data: Path, names: frozenset[str]) -> None:
 
 
 def _report(found: "list[Record]", scans: "list[Stored]", results: Path) -> None:
-    from benchmarks import panels, tables
+    from ctsim.benchmarks import panels, tables
 
     tables.write(found, results)
     panels.write_panels(found, scans, results)

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from benchmarks import intermediates
+from ctsim.benchmarks import intermediates
 
 LONGEST = 10_000
 ELSEWHERE = ("view_updates", intermediates.KEY)

@@ -7,13 +7,13 @@ import time
 import msgspec
 import torch
 
-from benchmarks.methods import Method
+from ctsim.benchmarks.methods import Method
 from ctsim.geometry import Geometry
+from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.splat.course import PASSES, affordable
+from ctsim.reconstruct.splat.fast import Settings, finer
+from ctsim.reconstruct.splat.published_settings import PRESETS
 from ctsim.types import Scan
-from reconstruct.fdk import reconstruct as fdk
-from reconstruct.splat.course import PASSES, affordable
-from reconstruct.splat.fast import Settings, finer
-from reconstruct.splat.published_settings import PRESETS
 
 FDKS = {
     "fdk": 1.0,

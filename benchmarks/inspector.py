@@ -20,7 +20,7 @@ from ctsim.errors import InputError
 from ctsim.human import human_choice
 
 if TYPE_CHECKING:
-    from benchmarks.protocol import Stored, Truth
+    from ctsim.benchmarks.protocol import Stored, Truth
 
 Volume = NDArray[Any]
 Window = Literal["gauss", "gauss_zero", "r2", "uniform7"]
@@ -116,7 +116,7 @@ def score(
     What is held against 50 keV is `at_50kev` where there is one. Outside the region the volume counts as the reference
     in SSIM's window. None where a number does not exist: identical volumes have no PSNR, an empty region has neither.
     """
-    from benchmarks import metrics
+    from ctsim.benchmarks import metrics
 
     if how.reference == "50kev" and at_50kev is not None:
         values = at_50kev
@@ -147,7 +147,7 @@ def region_of(truth: "Truth", name: str) -> NDArray[np.bool_]:
 
 def range_of(values: Volume, truth: "Truth", how: Convention) -> float:
     """Return the data range by its rule; a rule that gives 0 or less is an InputError."""
-    from benchmarks.protocol import tissue_range
+    from ctsim.benchmarks.protocol import tissue_range
 
     reference = truth.references[how.reference]
     match how.data_range:
@@ -168,7 +168,7 @@ def range_of(values: Volume, truth: "Truth", how: Convention) -> float:
 
 def aligned(values: Volume, truth: "Truth", how: Convention) -> Volume:
     """Return the volume after alignment; gains and offsets are fitted as in `aligned`, on the body's tissue."""
-    from benchmarks import metrics
+    from ctsim.benchmarks import metrics
 
     if how.alignment == "minmax":
         return unit(values)
@@ -206,8 +206,8 @@ def similarity(
     """
     from skimage.metrics import structural_similarity
 
-    from benchmarks import metrics
-    from benchmarks.ssim import ssim_along_axes
+    from ctsim.benchmarks import metrics
+    from ctsim.benchmarks.ssim import ssim_along_axes
 
     if window == "gauss":
         return metrics.ssim3d(values, reference, data_range=data_range, region=region)
@@ -243,7 +243,7 @@ def _cell(value: float | None, base: float | None, digits: int) -> str:
 
 def markdown(values: Volume, stored: "Stored", label: str, at_50kev: Volume | None = None) -> str:
     """Return the table in Markdown with what it shows; volumes are [z, y, x] in 1/mm and finite."""
-    from benchmarks.protocol import TISSUE, truth_of
+    from ctsim.benchmarks.protocol import TISSUE, truth_of
 
     truth = truth_of(stored)
     for volume, which in ((values, "volume"), (at_50kev, "volume at 50 keV")):
@@ -295,8 +295,8 @@ def _scan(given: Arguments) -> "Stored":
 
 def _kept(given: Arguments, stored: "Stored") -> tuple[Volume, str, Volume | None]:
     """Read the volumes that a results folder keeps of a scan and method."""
-    from benchmarks import records
-    from benchmarks.volumes import identity_of, own_at_50kev, read_volume
+    from ctsim.benchmarks import records
+    from ctsim.benchmarks.volumes import identity_of, own_at_50kev, read_volume
 
     assert given.results is not None
     found, _ = records.read_all(given.results)
@@ -322,9 +322,9 @@ def _kept(given: Arguments, stored: "Stored") -> tuple[Volume, str, Volume | Non
 
 def _made(given: Arguments, stored: "Stored") -> tuple[Volume, str, Volume | None]:
     """Reconstruct the scan."""
-    from benchmarks import methods
-    from benchmarks.attempt import attempt, scan_for
-    from benchmarks.devices import check_device
+    from ctsim.benchmarks import methods
+    from ctsim.benchmarks.attempt import attempt, scan_for
+    from ctsim.benchmarks.devices import check_device
 
     if given.method is None:
         raise InputError("expected a results folder or --method NAME")

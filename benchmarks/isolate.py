@@ -14,12 +14,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import apart, intermediates
-from benchmarks.intermediates import Intermediates
-from benchmarks.records import Cost
+from ctsim.benchmarks import apart, intermediates
+from ctsim.benchmarks.intermediates import Intermediates
+from ctsim.benchmarks.records import Cost
 
 if TYPE_CHECKING:
-    from benchmarks.methods import Method
+    from ctsim.benchmarks.methods import Method
 
 _RESULT, _SHOWN = "outcome.json", "intermediates.npz"
 _VOLUMES = ("values", "at_50kev")
@@ -30,8 +30,8 @@ class Outcome:
     """How a run ended: its status and reason, the volume [z, y, x] float32 in 1/mm if any, and its cost.
 
     `at_50kev` is the volume at 50 keV of a method that knows energies.
-    `intermediates` are what the method worked with, for pictures (`benchmarks.intermediates`); `details` what it says
-    of its result, for the record (`benchmarks.details`).
+    `intermediates` are what the method worked with, for pictures (`ctsim.benchmarks.intermediates`); `details` what it
+    says of its result, for the record (`ctsim.benchmarks.details`).
     """
 
     status: str
@@ -54,7 +54,7 @@ class _Ended(msgspec.Struct, frozen=True, kw_only=True):
 
 def _work(store: str, folder: str, variant: str, method: "Method", device: str, out: str) -> None:
     """Be the process: open the scan, warm up, run, leave the outcome in `out`."""
-    from benchmarks.attempt import run_here, scan_for, warm_up
+    from ctsim.benchmarks.attempt import run_here, scan_for, warm_up
 
     stored = pkgutil.resolve_name(store)(folder)
     warm = warm_up(method, scan_for(method, stored, "metal"), device)

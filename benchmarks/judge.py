@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.artefact import NO_TWIN, Layout, artefact_score, layout_of
-from benchmarks.projection import HeldOut, held_out, projection_score, with_floor
-from benchmarks.protocol import Score, Stored, Truth, evaluate, no_metal_score, truth_of
+from ctsim.benchmarks.artefact import NO_TWIN, Layout, artefact_score, layout_of
+from ctsim.benchmarks.projection import HeldOut, held_out, projection_score, with_floor
+from ctsim.benchmarks.protocol import Score, Stored, Truth, evaluate, no_metal_score, truth_of
 from ctsim.notes import NOT_ON_GRID
 
 

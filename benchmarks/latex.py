@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Sequence
 
-from benchmarks.texts import escape, one_line
+from ctsim.benchmarks.texts import escape, one_line
 
 
 def comment(text: str) -> str:

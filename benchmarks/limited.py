@@ -11,8 +11,8 @@ import signal
 from collections.abc import Callable, Mapping
 from typing import Any, Self
 
-from benchmarks import workers
-from benchmarks.isolate import how_it_ended
+from ctsim.benchmarks import workers
+from ctsim.benchmarks.isolate import how_it_ended
 from ctsim.errors import InputError
 
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from benchmarks.make_scene import make_scene, memory, say
-from benchmarks.workers import TICK, Lost, Pool, open_pool
+from ctsim.benchmarks.make_scene import make_scene, memory, say
+from ctsim.benchmarks.workers import TICK, Lost, Pool, open_pool
 from ctsim.errors import InputError
 from ctsim.human import human_bytes, human_choice, human_time
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from importlib.resources.abc import Traversable
 
     from ctsim.manifest import Manifest
+    from ctsim.phantoms.scene import Scene
     from ctsim.plan import Plan
     from ctsim.types import Phantom, Scanner
-    from phantoms.scene import Scene
 
 OF_COMMANDS = ("pareto", "peers", "stress")  # what run-benchmark's commands measure: suites, but none of datasets
 _SPARE = 64 * 2**20  # bytes left free for the file system's own needs
@@ -82,7 +82,7 @@ def load(suite: str) -> "tuple[Scene, ...]":
     InputError
         When there is no such suite or file, or the file is wrong (naming file, key and what was expected).
     """
-    from phantoms.scene import load_suite
+    from ctsim.phantoms.scene import load_suite
 
     known = bundled()
     if suite in known:
@@ -95,7 +95,7 @@ def load(suite: str) -> "tuple[Scene, ...]":
 
 def bundled() -> "dict[str, Traversable]":
     """Return the bundled suites by name, those of `OF_COMMANDS` apart."""
-    folder = resources.files("benchmarks") / "suites"
+    folder = resources.files("ctsim.benchmarks") / "suites"
     files = {entry.name.removesuffix(".toml"): entry for entry in folder.iterdir() if entry.name.endswith(".toml")}
     return {name: entry for name, entry in files.items() if name not in OF_COMMANDS}
 
@@ -129,8 +129,8 @@ def _verify(data_dir: Path) -> int:
 
 
 def _plan(scene: "Scene") -> "tuple[Plan, Phantom, Scanner]":
+    from ctsim.phantoms.scene import build, stream_id
     from ctsim.plan import make_plan
-    from phantoms.scene import build, stream_id
 
     with memory(scene.name):
         phantom, scanner = build(scene), scene.resolve()
@@ -156,7 +156,7 @@ def _dry_run(scenes: "tuple[Scene, ...]", options: Options) -> int:
 def _finished(scenes: "tuple[Scene, ...]", out: Path, force: bool) -> "dict[str, Manifest]":
     """Return the manifests of the scenes that are there and stay, by name; reads only."""
     from ctsim.folder import finished
-    from phantoms.scene import scene_id
+    from ctsim.phantoms.scene import scene_id
 
     found = {} if force else {s.name: finished(out, s.name, scene_id(s)) for s in scenes}
     return {name: manifest for name, manifest in found.items() if manifest is not None}
@@ -235,7 +235,7 @@ def _make_all(scenes: "list[Scene]", out: Path, options: Options) -> None:
 def _make_here(scenes: "list[Scene]", plans: "dict[str, Plan]", out: Path, force: bool) -> None:
     """Make scenes one after another in this process; one that another process has finished meanwhile is there."""
     from ctsim.folder import is_complete
-    from phantoms.scene import build, scene_id
+    from ctsim.phantoms.scene import build, scene_id
 
     for number, scene in enumerate(scenes, 1):
         if not force and is_complete(out, scene.name, scene_id(scene)):
@@ -276,8 +276,8 @@ def do(job: Job) -> None:
     """
     from ctsim.folder import is_complete
     from ctsim.locks import PATIENCE, Busy
+    from ctsim.phantoms.scene import build, scene_id
     from ctsim.sources import source_hash
-    from phantoms.scene import build, scene_id
 
     name, waited = job.scene.name, 0.0
     if source_hash() != job.code:

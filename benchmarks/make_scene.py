@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:
+    from ctsim.phantoms.scene import Scene
     from ctsim.plan import Plan
     from ctsim.types import Phantom, Scanner
-    from phantoms.scene import Scene
 
 
 def make_scene(
@@ -32,9 +32,9 @@ def make_scene(
     InputError
         When another scene is in the way or the disk is full.
     """
+    from ctsim.phantoms.scene import scene_id, scene_to_toml
     from ctsim.simulate import scan_info, simulate_views, truth_volumes
     from ctsim.writer import SceneWriter, Stack
-    from phantoms.scene import scene_id, scene_to_toml
 
     phantom, scanner = parts
     geometry = scanner.geometry

@@ -25,24 +25,24 @@ from ctsim.errors import InputError
 if TYPE_CHECKING:
     from ctsim.types import Scan, Volume
 
-OURS = ("ctsim", "reconstruct", "baselines")
+OURS = ("ctsim",)
 COUNTS_ONLY, METAL_MASK, SPECTRUM = "counts only", "metal mask", "spectrum"
 
 TABLE: dict[str, tuple[str, str]] = {
-    "fdk": ("reconstruct.fdk:reconstruct", COUNTS_ONLY),
-    "limar": ("baselines.limar:reconstruct", METAL_MASK),
-    "nmar": ("baselines.nmar:reconstruct", METAL_MASK),
-    "bhc-poly": ("baselines.bhc:bhc_poly", METAL_MASK),
-    "water-precorrection": ("baselines.known_spectrum:water_precorrection", SPECTRUM),
-    "ibhc": ("baselines.known_spectrum:ibhc", SPECTRUM),
-    "sart": ("baselines.sart:sart", COUNTS_ONLY),
-    "os-sart": ("baselines.sart:os_sart", COUNTS_ONLY),
-    "sirt": ("baselines.sart:sirt", COUNTS_ONLY),
-    "cgls": ("baselines.krylov:cgls", COUNTS_ONLY),
-    "fista-tv": ("baselines.tv_methods:fista_tv", COUNTS_ONLY),
-    "asd-pocs": ("baselines.tv_methods:asd_pocs", COUNTS_ONLY),
-    "awpcsd": ("baselines.tv_methods:awpcsd", COUNTS_ONLY),
-    "splat": ("reconstruct.splat.method:reconstruct", COUNTS_ONLY),
+    "fdk": ("ctsim.reconstruct.fdk:reconstruct", COUNTS_ONLY),
+    "limar": ("ctsim.baselines.limar:reconstruct", METAL_MASK),
+    "nmar": ("ctsim.baselines.nmar:reconstruct", METAL_MASK),
+    "bhc-poly": ("ctsim.baselines.bhc:bhc_poly", METAL_MASK),
+    "water-precorrection": ("ctsim.baselines.known_spectrum:water_precorrection", SPECTRUM),
+    "ibhc": ("ctsim.baselines.known_spectrum:ibhc", SPECTRUM),
+    "sart": ("ctsim.baselines.sart:sart", COUNTS_ONLY),
+    "os-sart": ("ctsim.baselines.sart:os_sart", COUNTS_ONLY),
+    "sirt": ("ctsim.baselines.sart:sirt", COUNTS_ONLY),
+    "cgls": ("ctsim.baselines.krylov:cgls", COUNTS_ONLY),
+    "fista-tv": ("ctsim.baselines.tv_methods:fista_tv", COUNTS_ONLY),
+    "asd-pocs": ("ctsim.baselines.tv_methods:asd_pocs", COUNTS_ONLY),
+    "awpcsd": ("ctsim.baselines.tv_methods:awpcsd", COUNTS_ONLY),
+    "splat": ("ctsim.reconstruct.splat.method:reconstruct", COUNTS_ONLY),
 }
 """name -> ("module:function", what it needs beside the counts)."""
 

@@ -66,7 +66,7 @@ def ssim3d(values: Array, reference: Array, *, data_range: float, region: Mask |
     Outside the region the reconstruction is replaced by the reference before filtering, so that what
     is not judged cannot leak in through the window. Same numbers as scikit-image's slice-wise map.
     """
-    from benchmarks.ssim import ssim_along_axes
+    from ctsim.benchmarks.ssim import ssim_along_axes
 
     _check(values, reference, region, data_range)
     if region is None:
@@ -82,7 +82,7 @@ def ssim3d_r2(values: Array, reference: Array) -> float | None:
 
     Peak 1, zeros beyond the border of a slice, slices whose reference is nowhere positive left out.
     """
-    from benchmarks.ssim import ssim_along_axes
+    from ctsim.benchmarks.ssim import ssim_along_axes
 
     _check(values, reference, None, 1.0)
     sums = ssim_along_axes(values, reference, np.ones(values.shape, bool), 1.0, mode="zero")

@@ -1,7 +1,7 @@
 """One picture a scene: every method's volume in one window, its signed error on one scale, and what it worked with.
 
 Rows are the reference and the methods. Columns are a slice normal to z and one normal to y, their errors against the
-effective-spectrum reference, and, where a method attached them (`benchmarks.intermediates`), the projection that
+effective-spectrum reference, and, where a method attached them (`ctsim.benchmarks.intermediates`), the projection that
 it backprojected with the metal's trace, and its prior.
 """
 
@@ -19,13 +19,13 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 
-from benchmarks import intermediates
-from benchmarks.artefact import water_attenuation
-from benchmarks.intermediates import Intermediates
-from benchmarks.protocol import Stored, Truth, truth_of
-from benchmarks.records import OK, Record, latest
-from benchmarks.texts import pictured
-from benchmarks.volumes import identity_of, map_volume
+from ctsim.benchmarks import intermediates
+from ctsim.benchmarks.artefact import water_attenuation
+from ctsim.benchmarks.intermediates import Intermediates
+from ctsim.benchmarks.protocol import Stored, Truth, truth_of
+from ctsim.benchmarks.records import OK, Record, latest
+from ctsim.benchmarks.texts import pictured
+from ctsim.benchmarks.volumes import identity_of, map_volume
 from ctsim.durable import replacing, sync
 
 PLANES = ((0, "z"), (1, "y"))
@@ -176,8 +176,8 @@ def draw(stored: Stored, truth: Truth, rows: list[Row]) -> Figure:
 
 def _measured(stored: Stored, view: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return −ln(counts/open) of a view, and where the true metal's shadow lies (Joseph's rule), both [v, u]."""
-    from reconstruct.log import line_integrals
-    from reconstruct.projector import forward_columns
+    from ctsim.reconstruct.log import line_integrals
+    from ctsim.reconstruct.projector import forward_columns
 
     metal = np.ascontiguousarray((np.asarray(stored.metal) > 0).transpose(1, 2, 0), np.float32)
     return line_integrals(stored.scan, view)[0].numpy(), forward_columns(metal, stored.geometry, [view])[0] > 0

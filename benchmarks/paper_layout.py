@@ -12,11 +12,11 @@ from typing import Any, Literal
 
 import msgspec
 
-from benchmarks import latex
-from benchmarks.columns import COLUMNS, Column
-from benchmarks.methods import Method
-from benchmarks.paper_scenes import title
-from benchmarks.texts import escape, ranked
+from ctsim.benchmarks import latex
+from ctsim.benchmarks.columns import COLUMNS, Column
+from ctsim.benchmarks.methods import Method
+from ctsim.benchmarks.paper_scenes import title
+from ctsim.benchmarks.texts import escape, ranked
 from ctsim.errors import InputError
 
 Form = Literal["md", "tex"]
@@ -148,7 +148,7 @@ class Paper(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 def load() -> Paper:
     """Read the bundled file."""
-    text = (resources.files("benchmarks") / "data" / "paper_tables.toml").read_text(encoding="utf-8")
+    text = (resources.files("ctsim.benchmarks") / "data" / "paper_tables.toml").read_text(encoding="utf-8")
     return msgspec.toml.decode(text, type=Paper)
 
 

@@ -12,8 +12,8 @@ import msgspec
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:
-    from benchmarks.records import Record, Run
-    from phantoms.scene import Scene
+    from ctsim.benchmarks.records import Record, Run
+    from ctsim.phantoms.scene import Scene
 
 
 class Scenes:
@@ -21,7 +21,7 @@ class Scenes:
 
     def __init__(self, planned: "Iterable[tuple[str, str]]") -> None:
         """Read the suites of the planned scenes (suite, name)."""
-        from benchmarks.make_dataset import load
+        from ctsim.benchmarks.make_dataset import load
 
         wanted = set(planned)
         suites = {suite: load(suite) for suite in sorted({suite for suite, _ in wanted})}
@@ -49,7 +49,7 @@ class Scenes:
 
 
 def _identity(scene: "Scene", name: str, seed: int) -> str:
-    from phantoms.scene import scene_id
+    from ctsim.phantoms.scene import scene_id
 
     try:
         return scene_id(msgspec.structs.replace(scene, name=name, seed=seed))

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import msgspec
 import tyro
 
-from benchmarks.methods import TABLE
-from benchmarks.paper_layout import Cell, Form, Paper, Planned, Sheet, Table, duration, load, printed, render
-from benchmarks.paper_scenes import Scenes, strangers, title
+from ctsim.benchmarks.methods import TABLE
+from ctsim.benchmarks.paper_layout import Cell, Form, Paper, Planned, Sheet, Table, duration, load, printed, render
+from ctsim.benchmarks.paper_scenes import Scenes, strangers, title
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:
-    from benchmarks.records import Record
+    from ctsim.benchmarks.records import Record
 
 Protocol = Literal["paper", "tissue", "aligned", "aligned_50kev"]
 ABLATION = "ablation"
@@ -50,7 +50,7 @@ def main(arguments: list[str]) -> int:
 
 def read(folders: tuple[Path, ...]) -> "list[Record]":
     """Read the records of all folders, oldest first. Raises InputError where a folder or all are missing."""
-    from benchmarks import lines, records
+    from ctsim.benchmarks import lines, records
 
     if not folders:
         raise InputError("no folder is given, expected one or more with records of run-benchmark")
@@ -70,7 +70,7 @@ def text_of(found: "list[Record]", form: Form, protocol: Protocol, numbers: tupl
 
     Raises InputError for a table that the paper lacks.
     """
-    from benchmarks import records
+    from ctsim.benchmarks import records
 
     paper = load()
     measured = Measured.of(found, paper)
@@ -107,7 +107,7 @@ class Measured:
     @classmethod
     def of(cls, found: "list[Record]", paper: Paper) -> "Measured":
         """Keep what counts of records that are sorted by time."""
-        from benchmarks import records, tables
+        from ctsim.benchmarks import records, tables
 
         scenes = Scenes((p.suite, p.scene) for table in paper.table for row in table.plan() for p in row)
         own = [r for r in found if r.run.variant == "metal" and r.run.protocol == records.VERSION]
@@ -151,7 +151,7 @@ def fill(table: Table, measured: Measured, protocol: str) -> Sheet:
 
 def _cell(table: Table, k: int, planned: Planned, measured: Measured, protocol: str) -> Cell:
     """Return our cell of column `k`: mean ± standard deviation over seeds; of a failed run its status."""
-    from benchmarks.records import OK
+    from ctsim.benchmarks.records import OK
 
     metric = table.columns[k].metric
     runs = measured.runs.get((planned.place, planned.label), [])
@@ -170,7 +170,7 @@ def _cell(table: Table, k: int, planned: Planned, measured: Measured, protocol: 
 
 def caption(table: Table, used: "list[Record]", protocol: str) -> str:
     """State protocol, region, reference, range, seeds, inputs and metal insertion of our columns, and what compares."""
-    from benchmarks import tables
+    from ctsim.benchmarks import tables
 
     timed = all(column.metric == "wall" for column in table.columns)
     parts = [f"The paper's Table {table.number} and what was measured here."]
@@ -225,7 +225,7 @@ def _joined(texts: Iterable[str], by: str = ", ") -> str:
 
 def _remarks(used: "list[Record]", measured: Measured) -> list[str]:
     """Say which runs failed and why, and how many records older data have left behind."""
-    from benchmarks.records import OK
+    from ctsim.benchmarks.records import OK
 
     failed = [f"{r.run.scene}, {r.label}: {r.status} – {r.reason or 'no reason given'}" for r in used if r.status != OK]
     scenes = dict.fromkeys(r.run.scene for r in used)

@@ -16,18 +16,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from benchmarks import lines, pareto_suite
-from benchmarks.host import commit, host, use_threads
-from benchmarks.pareto_records import NAME, WHAT, Part, Timed, latest, read, runs
-from benchmarks.records import OK
+from ctsim.benchmarks import lines, pareto_suite
+from ctsim.benchmarks.host import commit, host, use_threads
+from ctsim.benchmarks.pareto_records import NAME, WHAT, Part, Timed, latest, read, runs
+from ctsim.benchmarks.records import OK
 from ctsim.durable import replacing, write_synced
 from ctsim.errors import InputError
 from ctsim.human import human_choice, human_time
 
 if TYPE_CHECKING:
-    from benchmarks.pareto_jobs import Job, Ran
-    from benchmarks.pareto_methods import Effort
-    from benchmarks.pareto_suite import Suite
+    from ctsim.benchmarks.pareto_jobs import Job, Ran
+    from ctsim.benchmarks.pareto_methods import Effort
+    from ctsim.benchmarks.pareto_suite import Suite
 
 RODS = "rods"
 
@@ -66,7 +66,7 @@ class Arguments:
 
 def main(argv: list[str]) -> int:
     """Run the command; 0 if every setting was measured or skipped with a reason, 1 if one failed."""
-    from benchmarks.limited import refuse_unless_positive
+    from ctsim.benchmarks.limited import refuse_unless_positive
 
     given = tyro.cli(Arguments, prog="run-benchmark pareto", args=argv)
     if given.repeats < 1 or given.threads < 1:
@@ -90,7 +90,7 @@ def main(argv: list[str]) -> int:
 
 def _scenes(given: Arguments, suite: "Suite") -> dict[Part, list[str]]:
     """Return the scenes of each part that is asked for."""
-    from benchmarks import make_dataset
+    from ctsim.benchmarks import make_dataset
 
     parts: tuple[Part, ...] = given.part or ("simulator", "methods")
     known: dict[Part, list[str]] = {"simulator": [RODS], "methods": []}
@@ -120,8 +120,8 @@ def _measure(given: Arguments, suite: "Suite", wanted: dict[Part, list[str]]) ->
     """Run what is missing, part by part and scene by scene; return how many settings failed."""
     from tqdm import tqdm
 
-    from benchmarks import pareto_jobs
-    from benchmarks.limited import Limited
+    from ctsim.benchmarks import pareto_jobs
+    from ctsim.benchmarks.limited import Limited
 
     commit()  # remembered: the code that is loaded, whatever is committed meanwhile
     path, failed = given.out / NAME, 0
@@ -171,8 +171,8 @@ def rounds(jobs: "list[Job]", repeats: int, done: Counter[str], run: "Callable[[
 
 def _choices(suite: "Suite") -> "list[Job]":
     """List the simulator's choices."""
-    from benchmarks import pareto_simulator
-    from benchmarks.pareto_jobs import jobs
+    from ctsim.benchmarks import pareto_simulator
+    from ctsim.benchmarks.pareto_jobs import jobs
 
     asked = suite.simulator
     return jobs(pareto_simulator.Bench, (asked.side, asked.views), pareto_simulator.choices(asked), machine())
@@ -180,8 +180,8 @@ def _choices(suite: "Suite") -> "list[Job]":
 
 def _methods(given: Arguments, suite: "Suite", scene: str) -> "list[Job]":
     """Make the scene's scan if it is missing, and list the runs of every method that is asked for."""
-    from benchmarks import make_dataset, pareto_methods
-    from benchmarks.pareto_jobs import jobs
+    from ctsim.benchmarks import make_dataset, pareto_methods
+    from ctsim.benchmarks.pareto_jobs import jobs
 
     data = given.out / "data"
     if make_dataset.main([suite.dataset.suite, str(data), "--only", scene]):
@@ -190,7 +190,7 @@ def _methods(given: Arguments, suite: "Suite", scene: str) -> "list[Job]":
 
 
 def _efforts(given: Arguments, suite: "Suite") -> "list[Effort]":
-    from benchmarks import pareto_methods
+    from ctsim.benchmarks import pareto_methods
 
     found: list[Effort] = []
     for name in given.method or tuple(listed.name for listed in suite.method):
@@ -223,9 +223,9 @@ def _dry_run(given: Arguments, suite: "Suite", wanted: dict[Part, list[str]]) ->
 
 def _planned(given: Arguments, suite: "Suite", part: Part, scene: str) -> list[tuple[str, str, float]]:
     """Return (curve, identity, seconds of a run) of a scene's settings; a scan that is not made has no identity."""
-    from benchmarks import estimates, make_dataset, pareto_methods, pareto_simulator
+    from ctsim.benchmarks import estimates, make_dataset, pareto_methods, pareto_simulator
     from ctsim.folder import is_complete
-    from phantoms.scene import scene_id
+    from ctsim.phantoms.scene import scene_id
 
     if part == "simulator":
         usual = pareto_simulator.Bench(suite.simulator.side, suite.simulator.views).estimate()
@@ -248,8 +248,8 @@ def _planned(given: Arguments, suite: "Suite", part: Part, scene: str) -> list[t
 
 def _report(out: Path) -> None:
     """Write table and figure from the records, print the table."""
-    from benchmarks import pareto_figure, pareto_table
-    from benchmarks.pareto_records import points
+    from ctsim.benchmarks import pareto_figure, pareto_table
+    from ctsim.benchmarks.pareto_records import points
 
     found = read(out / NAME)
     shown = latest(found)

@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator
 
-from benchmarks.pareto_front import front
-from benchmarks.pareto_records import Part, Point, at_knee
-from benchmarks.pareto_table import curves, groups
-from benchmarks.texts import pictured
+from ctsim.benchmarks.pareto_front import front
+from ctsim.benchmarks.pareto_records import Part, Point, at_knee
+from ctsim.benchmarks.pareto_table import curves, groups
+from ctsim.benchmarks.texts import pictured
 
 DPI, WIDE, HIGH = 150, 9.0, 4.6
 MARKERS, STYLES = ("o", "^", "s", "D"), ("-", "--", ":", "-.")  # by group

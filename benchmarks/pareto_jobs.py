@@ -1,4 +1,4 @@
-"""Timed runs of `run-benchmark pareto`, as the process takes them that does all (`benchmarks.limited`).
+"""Timed runs of `run-benchmark pareto`, as the process takes them that does all (`ctsim.benchmarks.limited`).
 
 What runs share stays in that process: compiled kernels, the opened scene, the reference. Where it was replaced, since a
 run was ended, that is made again before the next one's clock starts.
@@ -9,10 +9,10 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from benchmarks.host import use_threads
-from benchmarks.limited import Limited, Stopped
-from benchmarks.pareto_records import Mark, Setting
-from benchmarks.records import OK
+from ctsim.benchmarks.host import use_threads
+from ctsim.benchmarks.limited import Limited, Stopped
+from ctsim.benchmarks.pareto_records import Mark, Setting
+from ctsim.benchmarks.records import OK
 
 
 class Choice(Protocol):
@@ -84,7 +84,7 @@ def within(process: Limited, threads: int, job: Job) -> Ran:
 
 def do(threads: int, job: Job) -> Ran:
     """Be the process: run a job, after a warm-up if it is the first of its kind, and say whatever happens."""
-    from benchmarks.attempt import describe
+    from ctsim.benchmarks.attempt import describe
 
     use_threads(threads)
     marks, status, reason, first = (), OK, "", None

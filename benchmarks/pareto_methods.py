@@ -17,17 +17,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks import metrics
-from benchmarks.attempt import scan_for, warm_up
-from benchmarks.methods import Method, find
-from benchmarks.pareto_jobs import Ended
-from benchmarks.pareto_records import Mark, Setting
-from benchmarks.pareto_suite import Listed, Suite
-from benchmarks.protocol import VERSION, Truth, tissue_range, truth_of
+from ctsim.benchmarks import metrics
+from ctsim.benchmarks.attempt import scan_for, warm_up
+from ctsim.benchmarks.methods import Method, find
+from ctsim.benchmarks.pareto_jobs import Ended
+from ctsim.benchmarks.pareto_records import Mark, Setting
+from ctsim.benchmarks.pareto_suite import Listed, Suite
+from ctsim.benchmarks.protocol import VERSION, Truth, tissue_range, truth_of
 from ctsim.errors import InputError
+from ctsim.reconstruct.watch import watch
 from ctsim.store import StoredScan, open_scan
 from ctsim.types import Status
-from reconstruct.watch import watch
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

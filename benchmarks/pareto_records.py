@@ -14,10 +14,10 @@ from typing import Any, Literal
 
 import msgspec
 
-from benchmarks import lines
-from benchmarks.host import Host
-from benchmarks.pareto_front import Pair, knee
-from benchmarks.records import OK
+from ctsim.benchmarks import lines
+from ctsim.benchmarks.host import Host
+from ctsim.benchmarks.pareto_front import Pair, knee
+from ctsim.benchmarks.records import OK
 
 NAME, WHAT = "pareto.jsonl", "a record of run-benchmark pareto"
 VERSION = 2

@@ -15,12 +15,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.methods import code_version
-from benchmarks.pareto_records import Mark, Setting
-from benchmarks.pareto_suite import Choices, Level
-from benchmarks.peer_cases import SIZE, relative, voxelised
-from benchmarks.peer_poly import poly_scene
+from ctsim.benchmarks.methods import code_version
+from ctsim.benchmarks.pareto_records import Mark, Setting
+from ctsim.benchmarks.pareto_suite import Choices, Level
+from ctsim.benchmarks.peer_cases import SIZE, relative, voxelised
+from ctsim.benchmarks.peer_poly import poly_scene
 from ctsim.noise import Noise
+from ctsim.phantoms.scanners import preset
 from ctsim.plan import Plan, make_plan
 from ctsim.project import Response, Tracer, transmit
 from ctsim.quadrature import full_rule
@@ -29,7 +30,6 @@ from ctsim.settings import Simulation, Truth
 from ctsim.simulate import simulate_views
 from ctsim.spectrum import spectrum
 from ctsim.types import Phantom, Scanner
-from phantoms.scanners import preset
 
 SCENE = "rods"
 CHECKED = 2  # views that are held against the reference

@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from ctsim.errors import InputError
+from ctsim.phantoms.messages import explain
+from ctsim.phantoms.suites import parse_toml, read_toml
 from ctsim.settings import Simulation
-from phantoms.messages import explain
-from phantoms.suites import parse_toml, read_toml
 
 NAME = "pareto.toml"
 Count = Annotated[int, msgspec.Meta(ge=1)]
@@ -97,7 +97,7 @@ def load(path: Path | None) -> Suite:
 
     Raises InputError naming the file, the key and what was expected.
     """
-    bundled = parse_toml((resources.files("benchmarks") / "suites" / NAME).read_text(encoding="utf-8"), NAME)
+    bundled = parse_toml((resources.files("ctsim.benchmarks") / "suites" / NAME).read_text(encoding="utf-8"), NAME)
     if path is None:
         return msgspec.convert(bundled, Suite)
     tables = bundled | read_toml(path, f"like {NAME}")

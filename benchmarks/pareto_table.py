@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 
-from benchmarks.pareto_front import beaten_by, faster, front
-from benchmarks.pareto_records import (
+from ctsim.benchmarks.pareto_front import beaten_by, faster, front
+from ctsim.benchmarks.pareto_records import (
     ERROR,
     NEAR,
     Part,

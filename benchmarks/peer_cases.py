@@ -17,21 +17,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks import apart, peer_catalogue, peer_paper, peer_rtk, peer_xcist
-from benchmarks.peer_catalogue import Case
+from ctsim.benchmarks import apart, peer_catalogue, peer_paper, peer_rtk, peer_xcist
+from ctsim.benchmarks.peer_catalogue import Case
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
+from ctsim.phantoms.bodies import Validation
+from ctsim.phantoms.body_lung import Lung
+from ctsim.phantoms.recipes import build_recipe
+from ctsim.phantoms.scanners import preset
 from ctsim.plan import present_materials
 from ctsim.project import Tracer, path_lengths
+from ctsim.reconstruct.fdk import fdk as ours_fdk
 from ctsim.simulate import compact
 from ctsim.solids import Solid
 from ctsim.types import Phantom, Scanner
 from ctsim.voxelise import attenuation_volume, label_volume
-from phantoms.bodies import Validation
-from phantoms.body_lung import Lung
-from phantoms.recipes import build_recipe
-from phantoms.scanners import preset
-from reconstruct.fdk import fdk as ours_fdk
 
 OURS = "ctsim"
 MEASURED = RTK, XCIST = "itk-rtk", "xcist"  # the catalogue's peers that there is code for

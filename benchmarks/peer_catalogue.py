@@ -7,7 +7,7 @@ from typing import Annotated
 import msgspec
 
 from ctsim.errors import InputError
-from phantoms.suites import parse_toml
+from ctsim.phantoms.suites import parse_toml
 
 Name = Annotated[str, msgspec.Meta(min_length=1)]
 Seconds = Annotated[float, msgspec.Meta(ge=0)]
@@ -86,7 +86,7 @@ def parse(text: str, where: str) -> Catalogue:
 @functools.cache
 def load() -> Catalogue:
     """Read the bundled catalogue."""
-    file = resources.files("benchmarks") / "suites" / "peers.toml"
+    file = resources.files("ctsim.benchmarks") / "suites" / "peers.toml"
     return parse(file.read_text(encoding="utf-8"), str(file))
 
 

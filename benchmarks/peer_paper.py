@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks import host, make_dataset
+from ctsim.benchmarks import host, make_dataset
 
 
 def make(suite: str, out: str, scene: str) -> None:

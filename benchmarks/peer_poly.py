@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import apart, host, peer_catalogue, peer_rtk, peer_xcist
-from benchmarks.peer_cases import (
+from ctsim.benchmarks import apart, host, peer_catalogue, peer_rtk, peer_xcist
+from ctsim.benchmarks.peer_cases import (
     OURS,
     RTK,
     SIZE,
@@ -21,6 +21,7 @@ from benchmarks.peer_cases import (
     voxelised,
 )
 from ctsim.materials import attenuation
+from ctsim.phantoms.shapes import cylinder
 from ctsim.plan import make_plan
 from ctsim.project import Response, Tracer, transmit
 from ctsim.quadrature import EnergyRule, full_rule
@@ -28,7 +29,6 @@ from ctsim.settings import Simulation, Truth
 from ctsim.spectrum import spectrum
 from ctsim.types import Phantom, Scanner
 from ctsim.voxelise import fractions
-from phantoms.shapes import cylinder
 
 BINS = 80
 FINER = 16  # rays along each side of a pixel in the oracle

@@ -8,9 +8,9 @@ from typing import Any
 
 import msgspec
 
-from benchmarks import lines
-from benchmarks.host import Host, certain
-from benchmarks.peer_cases import FAILED, FULL, MEASURED, OURS, RTK, XCIST, Measurement
+from ctsim.benchmarks import lines
+from ctsim.benchmarks.host import Host, certain
+from ctsim.benchmarks.peer_cases import FAILED, FULL, MEASURED, OURS, RTK, XCIST, Measurement
 
 MEGA = 1e6
 ABSENT = "not installed"

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from benchmarks import peer_catalogue
+from ctsim.benchmarks import peer_catalogue
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:
-    from benchmarks.peer_cases import Measurement, Setup
-    from benchmarks.peer_tables import By
+    from ctsim.benchmarks.peer_cases import Measurement, Setup
+    from ctsim.benchmarks.peer_tables import By
 
 NAME = "peers.jsonl"
 
@@ -58,7 +58,7 @@ class Arguments:
 
 def main(argv: list[str]) -> int:
     """Run the command; 0 if every case was measured, 1 if one failed."""
-    from benchmarks.limited import refuse_unless_positive
+    from ctsim.benchmarks.limited import refuse_unless_positive
 
     given = tyro.cli(Arguments, prog="run-benchmark peers", args=argv)
     if given.repeats < 1 or given.threads < 1:
@@ -83,7 +83,7 @@ def _wanted(given: Arguments) -> list[str]:
 
 
 def _collect(given: Arguments) -> None:
-    from benchmarks import lines, peer_tables
+    from ctsim.benchmarks import lines, peer_tables
 
     kind, what = peer_tables.PeerRecord, peer_tables.WHAT
     lines.take_over(given.results / NAME, given.collect, kind, what, dry_run=given.dry_run)
@@ -91,7 +91,7 @@ def _collect(given: Arguments) -> None:
 
 def _report(given: Arguments, wanted: Sequence[str]) -> int:
     """Write and print the table of all records; return 1 if a wanted case has failed."""
-    from benchmarks import peer_cases, peer_tables
+    from ctsim.benchmarks import peer_cases, peer_tables
 
     path, side = given.results / NAME, _side(given)
     stored = peer_tables.latest(peer_tables.read(path), side)
@@ -104,17 +104,17 @@ def _report(given: Arguments, wanted: Sequence[str]) -> int:
 
 
 def _side(given: Arguments) -> int:
-    from benchmarks import peer_cases
+    from ctsim.benchmarks import peer_cases
 
     return peer_cases.SMALL if given.small else peer_cases.FULL
 
 
 def _left(given: Arguments, wanted: Sequence[str]) -> "tuple[list[str], By]":
     """Return the wanted cases that are not recorded, and who measures."""
-    from benchmarks import host
+    from ctsim.benchmarks import host
 
     host.use_threads(given.threads)
-    from benchmarks import peer_tables
+    from ctsim.benchmarks import peer_tables
 
     # of the code that is loaded, whatever is committed meanwhile
     by = host.host(), host.commit(), peer_catalogue.installed()
@@ -126,7 +126,7 @@ def _left(given: Arguments, wanted: Sequence[str]) -> "tuple[list[str], By]":
 def _planned(given: Arguments, wanted: Sequence[str]) -> str:
     """Return what --dry-run prints; seconds are from records of these grids, else from one run on full ones."""
     left, _ = _left(given, wanted)
-    from benchmarks import costs, peer_tables
+    from ctsim.benchmarks import costs, peer_tables
 
     cases = {case.name: case for case in peer_catalogue.load().case}
     once: dict[str, float] = {}
@@ -142,7 +142,7 @@ def _planned(given: Arguments, wanted: Sequence[str]) -> str:
 def _measure(given: Arguments, wanted: Sequence[str]) -> None:
     """Measure the wanted cases that are not recorded; a case is stored as soon as it is measured."""
     left, by = _left(given, wanted)
-    from benchmarks import lines, peer_cases, peer_tables
+    from ctsim.benchmarks import lines, peer_cases, peer_tables
 
     setup = peer_cases.Setup(n=_side(given), repeats=given.repeats, threads=by[0].threads, versions=by[2])
     began = datetime.now(UTC).isoformat(timespec="microseconds")
@@ -164,8 +164,8 @@ def _measuring(seconds: float | None) -> "Iterator[Callable[[str, Setup], list[M
     if seconds is None:
         yield measure
         return
-    from benchmarks.limited import Limited, Stopped
-    from benchmarks.peer_cases import Measurement
+    from ctsim.benchmarks.limited import Limited, Stopped
+    from ctsim.benchmarks.peer_cases import Measurement
 
     def within(case: str, setup: "Setup") -> list[Measurement]:
         try:
@@ -183,10 +183,10 @@ def _measuring(seconds: float | None) -> "Iterator[Callable[[str, Setup], list[M
 
 def measure(case: str, setup: "Setup") -> "list[Measurement]":
     """Measure a case in this process."""
-    from benchmarks import host
+    from ctsim.benchmarks import host
 
     host.use_threads(setup.threads)
-    from benchmarks import peer_cases, peer_poly
+    from ctsim.benchmarks import peer_cases, peer_poly
 
     cases: dict[str, Callable[[Setup], list[Measurement]]] = {
         "paths": peer_cases.paths,

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.protocol import AS_RETURNED, Score, Stored, Truth
+from ctsim.benchmarks.protocol import AS_RETURNED, Score, Stored, Truth
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 
@@ -62,7 +62,7 @@ def half_way(geometry: Geometry) -> Geometry | str:
 
 def held_out(stored: Stored) -> HeldOut | str:
     """Simulate the held-out views of a scan, or say why there are none."""
-    from phantoms.scene import load_suite
+    from ctsim.phantoms.scene import load_suite
 
     views = half_way(stored.geometry)
     if isinstance(views, str):
@@ -88,11 +88,11 @@ def _simulated(scene: Any, geometry: Geometry, stored: Stored) -> HeldOut:
     from scipy import ndimage
 
     from ctsim.materials import attenuation
+    from ctsim.phantoms.scene import build, stream_id
     from ctsim.plan import make_plan
     from ctsim.quadrature import effective_weights
     from ctsim.settings import Truth
     from ctsim.simulate import REFERENCE_KEV, simulate_views
-    from phantoms.scene import build, stream_id
 
     phantom = build(scene)
     scanner = msgspec.structs.replace(scene.resolve(), geometry=geometry)
@@ -144,7 +144,7 @@ def rmse_by_target(
 
 
 def _projected(values: NDArray[Any], held: HeldOut) -> NDArray[np.float32]:
-    from reconstruct.projector import forward_columns
+    from ctsim.reconstruct.projector import forward_columns
 
     return forward_columns(np.ascontiguousarray(values.transpose(1, 2, 0), np.float32), held.geometry)
 

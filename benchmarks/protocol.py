@@ -13,8 +13,8 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from benchmarks import metrics
-from benchmarks.metrics import Mask
+from ctsim.benchmarks import metrics
+from ctsim.benchmarks.metrics import Mask
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:

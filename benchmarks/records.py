@@ -15,11 +15,11 @@ from typing import Any
 
 import msgspec
 
-from benchmarks import lines
-from benchmarks.collector import uncollected
-from benchmarks.host import Host
-from benchmarks.methods import TABLE
-from benchmarks.protocol import VERSION, Score
+from ctsim.benchmarks import lines
+from ctsim.benchmarks.collector import uncollected
+from ctsim.benchmarks.host import Host
+from ctsim.benchmarks.methods import TABLE
+from ctsim.benchmarks.protocol import VERSION, Score
 from ctsim.durable import append_synced, write_synced
 from ctsim.errors import InputError
 from ctsim.folder import mixture
@@ -71,8 +71,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     `label` is the method with the parameters that differ from its defaults; `inputs` what the method
     needs beside the counts; `volume` the path of the kept volume relative to the results folder; `place`
     the numbers of the scan in its dataset and of the method in its command, by which tables are ordered;
-    `details` what the method says of its result (`benchmarks.details`); `data_code` hashes the code of the simulator
-    that made the scan (empty: not noted).
+    `details` what the method says of its result (`ctsim.benchmarks.details`); `data_code` hashes the code of the
+    simulator that made the scan (empty: not noted).
     """
 
     identity: str

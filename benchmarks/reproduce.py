@@ -15,8 +15,8 @@ import tyro
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:
-    from benchmarks.records import Record
-    from phantoms.scene import Scene
+    from ctsim.benchmarks.records import Record
+    from ctsim.phantoms.scene import Scene
 
 METHODS = ("fdk", "limar", "nmar", "os-sart")
 SCENE, SHARE = "lung-Fe", 0.6
@@ -58,7 +58,7 @@ class Claim:
 def main(arguments: list[str]) -> int:
     """Run the command; 0 if every claim holds, 1 if one does not or cannot be judged."""
     given = tyro.cli(Arguments, prog="run-benchmark reproduce", args=arguments)
-    from benchmarks import records, tables
+    from ctsim.benchmarks import records, tables
 
     if given.dry_run:
         return _dry_run(given)
@@ -77,7 +77,7 @@ def main(arguments: list[str]) -> int:
 
 def _compute(given: Arguments) -> int:
     """Make the scans that are missing, then run what has no record."""
-    from benchmarks import cli_run, make_dataset
+    from ctsim.benchmarks import cli_run, make_dataset
 
     code = make_dataset.main(_scans_of(given))
     return code or cli_run.main(_runs_of(given, [scene.name for scene in _scenes(given)]))
@@ -95,17 +95,17 @@ def _runs_of(given: Arguments, scenes: list[str]) -> list[str]:
 
 
 def _scenes(given: Arguments) -> "tuple[Scene, ...]":
-    from benchmarks import make_dataset
+    from ctsim.benchmarks import make_dataset
 
     return make_dataset.select(make_dataset.load(given.suite), (), given.seeds)
 
 
 def _dry_run(given: Arguments) -> int:
     """Print the plans of scans to make, the runs on those that are there, and what runs on the others will take."""
-    from benchmarks import cli_run, costs, make_dataset, records
-    from benchmarks.schedule import Costs
+    from ctsim.benchmarks import cli_run, costs, make_dataset, records
+    from ctsim.benchmarks.schedule import Costs
     from ctsim.folder import is_complete
-    from phantoms.scene import scene_id
+    from ctsim.phantoms.scene import scene_id
 
     if code := make_dataset.main([*_scans_of(given), "--dry-run"]):
         return code

@@ -1,8 +1,8 @@
 """Run methods over stored scans, score what they return, and record each run with what it took.
 
 A method that fails is a record with a status and a reason; the next run tries it again. What it writes into its scan
-or sets in its process no other run sees (`benchmarks.own`). With `isolate` a run has a process of its own: its peak
-memory is its own, a crash or a time limit ends only it.
+or sets in its process no other run sees (`ctsim.benchmarks.own`). With `isolate` a run has a process of its own: its
+peak memory is its own, a crash or a time limit ends only it.
 """
 
 import dataclasses
@@ -12,18 +12,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks import artefact, intermediates, records
-from benchmarks.attempt import SCORED, describe, run_here, scan_for, skip, warm_up
-from benchmarks.host import commit, host
-from benchmarks.isolate import Outcome, run_apart
-from benchmarks.judge import Judge, Twin
-from benchmarks.limited import refuse_unless_positive
-from benchmarks.methods import Method
-from benchmarks.protocol import Score, Stored
-from benchmarks.records import Record, Run
-from benchmarks.volumes import identity_of, keep, read_volume
+from ctsim.benchmarks import artefact, intermediates, records
+from ctsim.benchmarks.attempt import SCORED, describe, run_here, scan_for, skip, warm_up
+from ctsim.benchmarks.host import commit, host
+from ctsim.benchmarks.isolate import Outcome, run_apart
+from ctsim.benchmarks.judge import Judge, Twin
+from ctsim.benchmarks.limited import refuse_unless_positive
+from ctsim.benchmarks.methods import Method
+from ctsim.benchmarks.protocol import Score, Stored
+from ctsim.benchmarks.records import Record, Run
+from ctsim.benchmarks.volumes import identity_of, keep, read_volume
 from ctsim.errors import InputError
-from phantoms.suites import read_toml
+from ctsim.phantoms.suites import read_toml
 
 STORE = "ctsim.store:open_scan"
 LATE = 120.0  # seconds beyond its own

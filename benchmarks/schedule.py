@@ -12,13 +12,13 @@ from typing import Any
 
 import msgspec
 
-from benchmarks import methods, records
-from benchmarks.costs import listing
-from benchmarks.devices import check_device
-from benchmarks.isolate import Outcome
-from benchmarks.records import OK, Record
-from benchmarks.run import Options, Runner, Task, describe_run, run_all, tasks_on
-from benchmarks.workers import Lost, Pool
+from ctsim.benchmarks import methods, records
+from ctsim.benchmarks.costs import listing
+from ctsim.benchmarks.devices import check_device
+from ctsim.benchmarks.isolate import Outcome
+from ctsim.benchmarks.records import OK, Record
+from ctsim.benchmarks.run import Options, Runner, Task, describe_run, run_all, tasks_on
+from ctsim.benchmarks.workers import Lost, Pool
 from ctsim.errors import InputError
 
 Group = tuple[Task, ...]
@@ -84,7 +84,7 @@ def text(
 
 def estimated(task: Task) -> float | None:
     """Guess the seconds of a run from FDK's time on this machine, None for a method of the user's own."""
-    from benchmarks.estimates import fdk_seconds, in_fdks
+    from ctsim.benchmarks.estimates import fdk_seconds, in_fdks
 
     geometry = task.stored.geometry
     fdks = in_fdks(task.method, geometry)

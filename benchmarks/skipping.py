@@ -18,10 +18,10 @@ import tyro
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:
-    from benchmarks.host import Host
-    from benchmarks.limited import Limited
-    from benchmarks.skipping_cases import Setup
-    from benchmarks.skipping_tables import Measured
+    from ctsim.benchmarks.host import Host
+    from ctsim.benchmarks.limited import Limited
+    from ctsim.benchmarks.skipping_cases import Setup
+    from ctsim.benchmarks.skipping_tables import Measured
 
 Case = Literal[
     "materials", "bricks", "rays", "energies", "edges", "refining", "scatter", "twin",
@@ -66,7 +66,7 @@ class Arguments:
 
 def main(argv: list[str]) -> int:
     """Run the command; 0 if every difference is within what is stated, 1 if one is not or was not measured."""
-    from benchmarks.limited import refuse_unless_positive
+    from ctsim.benchmarks.limited import refuse_unless_positive
 
     given = tyro.cli(Arguments, prog="run-benchmark skipping", args=argv)
     if given.repeats < 1:
@@ -84,7 +84,7 @@ def main(argv: list[str]) -> int:
 
 
 def _collect(given: Arguments) -> None:
-    from benchmarks import lines, skipping_tables
+    from ctsim.benchmarks import lines, skipping_tables
 
     kind, what = skipping_tables.SkipRecord, skipping_tables.WHAT
     lines.take_over(given.results / NAME, given.collect, kind, what, dry_run=given.dry_run)
@@ -92,7 +92,7 @@ def _collect(given: Arguments) -> None:
 
 def _report(given: Arguments, wanted: tuple[Case, ...]) -> int:
     """Write and print the table of all records; return 1 if a wanted case has a difference beyond what is stated."""
-    from benchmarks import skipping_tables
+    from ctsim.benchmarks import skipping_tables
 
     path = given.results / NAME
     stored = skipping_tables.latest(skipping_tables.read(path), given.size, CASES)
@@ -107,7 +107,7 @@ def _report(given: Arguments, wanted: tuple[Case, ...]) -> int:
 def _left(given: Arguments, wanted: tuple[Case, ...]) -> "tuple[list[Case], tuple[Host, str]]":
     """Return the wanted cases that are not recorded, and where and by what code: (host, commit)."""
     importlib.import_module("numba")  # so that `host` counts the kernels' threads
-    from benchmarks import host, skipping_tables
+    from ctsim.benchmarks import host, skipping_tables
 
     at = host.host(), host.commit()  # of the code that is loaded, whatever is committed meanwhile
     path = given.results / NAME
@@ -117,7 +117,7 @@ def _left(given: Arguments, wanted: tuple[Case, ...]) -> "tuple[list[Case], tupl
 
 def _planned(given: Arguments, wanted: tuple[Case, ...]) -> str:
     """Return what --dry-run prints; seconds are from records of this size, else those measured once at core's."""
-    from benchmarks import costs, skipping_tables
+    from ctsim.benchmarks import costs, skipping_tables
 
     stored = skipping_tables.latest(skipping_tables.read(given.results / NAME), given.size, CASES)
     usual: dict[Case, float] = SECONDS if given.size == "core" else {}
@@ -130,8 +130,8 @@ def _planned(given: Arguments, wanted: tuple[Case, ...]) -> str:
 
 def _measure(given: Arguments, wanted: tuple[Case, ...]) -> None:
     """Measure the wanted cases that are not recorded; a case is stored as soon as it is measured."""
-    from benchmarks import lines, skipping_cases, skipping_tables
-    from benchmarks.limited import Limited
+    from ctsim.benchmarks import lines, skipping_cases, skipping_tables
+    from ctsim.benchmarks.limited import Limited
 
     left, (here, now) = _left(given, wanted)
     began = datetime.now(UTC).isoformat(timespec="microseconds")
@@ -154,8 +154,8 @@ def _measure(given: Arguments, wanted: tuple[Case, ...]) -> None:
 
 def _within(process: "Limited", case: Case, setup: "Setup") -> "list[Measured]":
     """Measure a case in the process; what does not end in time, or with which the process dies, has failed."""
-    from benchmarks import skipping_methods, skipping_tables
-    from benchmarks.limited import Stopped
+    from ctsim.benchmarks import skipping_methods, skipping_tables
+    from ctsim.benchmarks.limited import Stopped
 
     try:
         return process.run(skipping_methods.measured, case, setup)

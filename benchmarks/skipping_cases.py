@@ -17,12 +17,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.make_dataset import load, select
-from benchmarks.peer_cases import in_turns
-from benchmarks.skipping_limits import rounding
-from benchmarks.skipping_tables import CORE, Measured
+from ctsim.benchmarks.make_dataset import load, select
+from ctsim.benchmarks.peer_cases import in_turns
+from ctsim.benchmarks.skipping_limits import rounding
+from ctsim.benchmarks.skipping_tables import CORE, Measured
 from ctsim.bricks import Bricks, make_bricks
 from ctsim.geometry import Geometry
+from ctsim.phantoms.bodies import Validation
+from ctsim.phantoms.scene import Scene, build, stream_id
 from ctsim.plan import Plan, make_plan
 from ctsim.project import EDGE_THRESHOLD, Response, Tracer, transmit
 from ctsim.quadrature import full_rule
@@ -30,8 +32,6 @@ from ctsim.scatter import Scatter
 from ctsim.settings import Truth
 from ctsim.simulate import compact, simulate_views
 from ctsim.types import Phantom, Scanner
-from phantoms.bodies import Validation
-from phantoms.scene import Scene, build, stream_id
 
 ABSENT = ("Al", "Ti", "Cu", "Au")  # metals that a table may name and a thorax does not hold
 LINES = Truth(noise_free=True)

@@ -11,24 +11,24 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from baselines.inpaint import Filled, fill
-from baselines.limar import interpolated
-from baselines.metal import Trace, find_metal
-from baselines.nmar import Normalise, normalised
-from baselines.prior import Choice, choose_prior
-from benchmarks import cli_run, make_dataset, skipping_cases
-from benchmarks.attempt import scan_for
-from benchmarks.cli import EXIT_INTERRUPTED
-from benchmarks.methods import Method, find
-from benchmarks.skipping_cases import Pair, Pairs, Setup, largest
-from benchmarks.skipping_tables import Measured
-from benchmarks.volumes import read_volume
+from ctsim.baselines.inpaint import Filled, fill
+from ctsim.baselines.limar import interpolated
+from ctsim.baselines.metal import Trace, find_metal
+from ctsim.baselines.nmar import Normalise, normalised
+from ctsim.baselines.prior import Choice, choose_prior
+from ctsim.benchmarks import cli_run, make_dataset, skipping_cases
+from ctsim.benchmarks.attempt import scan_for
+from ctsim.benchmarks.cli import EXIT_INTERRUPTED
+from ctsim.benchmarks.methods import Method, find
+from ctsim.benchmarks.skipping_cases import Pair, Pairs, Setup, largest
+from ctsim.benchmarks.skipping_tables import Measured
+from ctsim.benchmarks.volumes import read_volume
+from ctsim.phantoms.scene import scene_to_toml
+from ctsim.reconstruct.fdk import fdk_stream
+from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.projector import forward_columns
 from ctsim.store import StoredScan, open_scan
 from ctsim.types import Scan
-from phantoms.scene import scene_to_toml
-from reconstruct.fdk import fdk_stream
-from reconstruct.fdk import reconstruct as fdk
-from reconstruct.projector import forward_columns
 
 HOW = "rows"
 Bridge = Callable[[NDArray[np.float32], slice, Filled], None]

@@ -6,9 +6,9 @@ from statistics import median
 
 import msgspec
 
-from benchmarks import lines
-from benchmarks.host import Host, certain
-from benchmarks.records import OK
+from ctsim.benchmarks import lines
+from ctsim.benchmarks.host import Host, certain
+from ctsim.benchmarks.records import OK
 
 CORE, WHAT = "core", "a record of run-benchmark skipping"
 

@@ -1,4 +1,4 @@
-"""What projecting splats costs, side by side in one process: `python -m benchmarks.splat_kernels OUT`.
+"""What projecting splats costs, side by side in one process: `python -m ctsim.benchmarks.splat_kernels OUT`.
 
 Writes OUT/splat_kernels.md. Contenders take turns, seconds are medians over the rounds; errors are against the exact
 form on the same splats. Two cases: a view of the published methods (50 000 splats of σ = 2.5 pixels, 512²), and a
@@ -14,16 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.cli import guarded
-from benchmarks.host import commit, host
+from ctsim.benchmarks.cli import guarded
+from ctsim.benchmarks.host import commit, host
 from ctsim.errors import InputError
-from phantoms.scanners import preset
-from reconstruct.splat.columns import LatticeProjector
-from reconstruct.splat.fast import finer
-from reconstruct.splat.kernels.lanes import WIDTH
-from reconstruct.splat.lattice import Lattice
-from reconstruct.splat.model import Splats
-from reconstruct.splat.project import Projector
+from ctsim.phantoms.scanners import preset
+from ctsim.reconstruct.splat.columns import LatticeProjector
+from ctsim.reconstruct.splat.fast import finer
+from ctsim.reconstruct.splat.kernels.lanes import WIDTH
+from ctsim.reconstruct.splat.lattice import Lattice
+from ctsim.reconstruct.splat.model import Splats
+from ctsim.reconstruct.splat.project import Projector
 
 ROUNDS = 7
 CORE = preset("skyscan1273", 240, (224, 224), (128, 128, 128), 60.0).geometry
@@ -131,4 +131,4 @@ def _digits(value: float) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded("splat_kernels", "benchmarks.splat_kernels", sys.argv[1:], resumes=False))
+    sys.exit(guarded("splat_kernels", "ctsim.benchmarks.splat_kernels", sys.argv[1:], resumes=False))

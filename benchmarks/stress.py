@@ -17,13 +17,13 @@ import tyro
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:
-    from benchmarks.stress_cases import Case
-    from benchmarks.stress_records import StressRecord
+    from ctsim.benchmarks.stress_cases import Case
+    from ctsim.benchmarks.stress_records import StressRecord
 
 # estimates of a row on one idle core, short and full, from runs beside other work
 SECONDS = {"simulator": (0.3, 0.6), "splat kernels": (0.1, 0.1)}
 SECONDS_OF_METHOD = (0.2, 0.5)
-CATALOGUE = "benchmarks.stress"
+CATALOGUE = "ctsim.benchmarks.stress"
 """The module whose `catalogue` the process that carries out the cases asks, with suite and methods."""
 
 
@@ -59,12 +59,12 @@ class Arguments:
 
 def main(argv: list[str]) -> int:
     """Run the command; 0 if every row is as expected, 1 if one is not."""
-    from benchmarks.limited import refuse_unless_positive
+    from ctsim.benchmarks.limited import refuse_unless_positive
 
     given = tyro.cli(Arguments, prog="run-benchmark stress", args=argv)
     refuse_unless_positive(given.seconds)
-    from benchmarks import lines, stress_records
-    from benchmarks.stress_cases import FULL, SHORT
+    from ctsim.benchmarks import lines, stress_records
+    from ctsim.benchmarks.stress_cases import FULL, SHORT
 
     side = SHORT if given.short else FULL
     cases = _chosen(catalogue(given.suite, given.method), given.case)
@@ -93,7 +93,7 @@ def catalogue(suite: Path | None = None, methods: tuple[str, ...] = ()) -> "list
 
     Raises InputError for a file that is wrong and a method that does not exist.
     """
-    from benchmarks import stress_chain, stress_methods, stress_simulator, stress_splats
+    from ctsim.benchmarks import stress_chain, stress_methods, stress_simulator, stress_splats
 
     own, of_methods = stress_simulator.cases() + stress_splats.cases(), stress_methods.cases(suite, methods)
     subjects = {c.subject for c in of_methods}
@@ -115,8 +115,8 @@ def _work(left: "list[Case]", side: int, given: Arguments) -> None:
     """Carry out the rows that are left; each is stored as it ends."""
     from tqdm import tqdm
 
-    from benchmarks import host, lines, stress_records
-    from benchmarks.stress_worker import Worker
+    from ctsim.benchmarks import host, lines, stress_records
+    from ctsim.benchmarks.stress_worker import Worker
 
     commit, machine = host.commit(), host.host()  # of the code that is loaded, whatever is committed meanwhile
     asked = (given.suite, given.method)
@@ -132,7 +132,7 @@ def _work(left: "list[Case]", side: int, given: Arguments) -> None:
 
 def _report(found: "list[StressRecord]", given: Arguments) -> int:
     """Write the table and say what is not as expected; return the exit code."""
-    from benchmarks import stress_records
+    from ctsim.benchmarks import stress_records
 
     path = given.results / stress_records.TABLE_NAME
     if not found:

@@ -3,18 +3,18 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.methods import code_version
-from benchmarks.stress_cases import Case, Findings
-from benchmarks.stress_methods import bound
-from benchmarks.stress_scans import USUAL, chords, exact_p, geometry, in_air, scan_from, simulated
-from benchmarks.stress_simulator import LIMIT, QUIET
+from ctsim.benchmarks.methods import code_version
+from ctsim.benchmarks.stress_cases import Case, Findings
+from ctsim.benchmarks.stress_methods import bound
+from ctsim.benchmarks.stress_scans import USUAL, chords, exact_p, geometry, in_air, scan_from, simulated
+from ctsim.benchmarks.stress_simulator import LIMIT, QUIET
 from ctsim.geometry import Geometry
 from ctsim.kernels.backproject_reference import backproject
+from ctsim.reconstruct.fdk import reconstruct
+from ctsim.reconstruct.filters import padded_length, ramp_kernel
+from ctsim.reconstruct.redundancy import ray_weights
 from ctsim.settings import Truth
 from ctsim.types import Scanner
-from reconstruct.fdk import reconstruct
-from reconstruct.filters import padded_length, ramp_kernel
-from reconstruct.redundancy import ray_weights
 
 
 def fdk_in_float64(p: NDArray[np.float64], of: Geometry) -> NDArray[np.float64]:
@@ -48,5 +48,5 @@ def whole_chain(side: int, found: Findings) -> None:
 def cases() -> list[Case]:
     """Return the case of the whole chain."""
     what, expected = "closed-form P and FDK in float64 beside the chain", f"as far apart as |ΔP| ≤ {LIMIT:g} allows"
-    code = code_version(__name__) + code_version("phantoms.shapes")
+    code = code_version(__name__) + code_version("ctsim.phantoms.shapes")
     return [Case(name="float64", subject="fdk", what=what, expected=expected, run=whole_chain, code=code)]

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import torch
 
-from benchmarks.stress_scans import Example, Positive, scaled_by
+from ctsim.benchmarks.stress_scans import Example, Positive, scaled_by
 
 
 class Change(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind"):

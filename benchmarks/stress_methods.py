@@ -19,15 +19,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.methods import SPECTRUM, TABLE, Method, code_version, find
-from benchmarks.stress_cases import Case, Findings
-from benchmarks.stress_scans import Example, on_threads, thread_counts
-from benchmarks.stress_suite import GROUPS, Scene, load
+from ctsim.benchmarks.methods import SPECTRUM, TABLE, Method, code_version, find
+from ctsim.benchmarks.stress_cases import Case, Findings
+from ctsim.benchmarks.stress_scans import Example, on_threads, thread_counts
+from ctsim.benchmarks.stress_suite import GROUPS, Scene, load
+from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.log import line_integrals
+from ctsim.reconstruct.redundancy import ray_weights
 from ctsim.spectrum import TABLE_KVP
 from ctsim.types import Scan, Status, Volume
-from reconstruct.fdk import reconstruct as fdk
-from reconstruct.log import line_integrals
-from reconstruct.redundancy import ray_weights
 
 NEAR = 0.7
 SAME = 1e-3  # of the greatest value: float32
@@ -139,7 +139,7 @@ def _expected(method: Method, scene: Scene) -> str:
 
 def cases(suite: Path | None = None, names: Sequence[str] = ()) -> list[Case]:
     """Return every scene of a suite by every method, scene by scene, so that methods share scans."""
-    own = code_version(__name__) + code_version("phantoms.shapes")
+    own = code_version(__name__) + code_version("ctsim.phantoms.shapes")
     methods, found = subjects(names), []
     for scene in load(suite):
         for method in methods:

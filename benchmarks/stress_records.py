@@ -6,10 +6,10 @@ from pathlib import Path
 
 import msgspec
 
-from benchmarks import lines
-from benchmarks.host import Host
-from benchmarks.stress_cases import Case, Outcome
-from benchmarks.texts import escape
+from ctsim.benchmarks import lines
+from ctsim.benchmarks.host import Host
+from ctsim.benchmarks.stress_cases import Case, Outcome
+from ctsim.benchmarks.texts import escape
 
 NAME, TABLE_NAME = "stress.jsonl", "stress.md"
 A_ROW = "a row of run-benchmark stress"

@@ -14,21 +14,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from baselines.morphology import dilate
-from benchmarks.peer_cases import upright_chord
-from benchmarks.stress_cases import FULL, SHORT
+from ctsim.baselines.morphology import dilate
+from ctsim.benchmarks.peer_cases import upright_chord
+from ctsim.benchmarks.stress_cases import FULL, SHORT
 from ctsim.errors import InputError
 from ctsim.geometry import Count, Geometry, Pair, Triple
 from ctsim.materials import attenuation
+from ctsim.phantoms.shapes import cylinder
 from ctsim.plan import make_plan
 from ctsim.quadrature import full_rule
+from ctsim.reconstruct.redundancy import ray_weights
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import flat_image, simulate_views, truth_volumes
 from ctsim.solids import Solid
 from ctsim.spectrum import spectrum
 from ctsim.types import Phantom, Scan, Scanner
-from phantoms.shapes import cylinder
-from reconstruct.redundancy import ray_weights
 
 SIZE = 60.0
 BODY, HEIGHT = 24.0, 52.0  # radius and height of the water

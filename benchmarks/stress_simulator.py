@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.methods import code_version
-from benchmarks.stress_cases import SIMULATOR, Case, Findings
-from benchmarks.stress_scans import (
+from ctsim.benchmarks.methods import code_version
+from ctsim.benchmarks.stress_cases import SIMULATOR, Case, Findings
+from ctsim.benchmarks.stress_scans import (
     BODY,
     HEIGHT,
     SIZE,
@@ -360,7 +360,7 @@ SPECIAL: dict[str, tuple[str, str, Callable[[int, Findings], None]]] = {
 
 def cases() -> list[Case]:
     """Return the simulator's cases."""
-    code = code_version(__name__) + code_version("phantoms.shapes")
+    code = code_version(__name__) + code_version("ctsim.phantoms.shapes")
     found = {}
     for name, (what, make) in SCENES.items():
         expected = CLOSED_FORM + (f"; mass on the grid within {MASS:g}" if name in WITH_MASS else "")

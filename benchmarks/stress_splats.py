@@ -9,16 +9,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.methods import code_version
-from benchmarks.stress_cases import SPLATS, Case, Findings
-from benchmarks.stress_scans import on_threads, thread_counts
+from ctsim.benchmarks.methods import code_version
+from ctsim.benchmarks.stress_cases import SPLATS, Case, Findings
+from ctsim.benchmarks.stress_scans import on_threads, thread_counts
 from ctsim.geometry import Geometry
-from reconstruct.splat.densify import Schedule, densify
-from reconstruct.splat.kernels import response_reference, splat_reference
-from reconstruct.splat.model import Splats
-from reconstruct.splat.project import Projector
-from reconstruct.splat.response import evaluate, make_response
-from reconstruct.splat.volume import voxelise
+from ctsim.reconstruct.splat.densify import Schedule, densify
+from ctsim.reconstruct.splat.kernels import response_reference, splat_reference
+from ctsim.reconstruct.splat.model import Splats
+from ctsim.reconstruct.splat.project import Projector
+from ctsim.reconstruct.splat.response import evaluate, make_response
+from ctsim.reconstruct.splat.volume import voxelise
 
 PROJECTED, VOXELISED, RESPONDED = 1e-5, 1e-5, 2e-6
 CUTOFF = 6.0  # beyond it lies 2e-8 of a peak, so that it does not matter which pixels a cutoff takes in

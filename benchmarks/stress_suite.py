@@ -11,10 +11,10 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from benchmarks.methods import TABLE
-from benchmarks.stress_cases import FULL
-from benchmarks.stress_changes import AnyChange, Filled, Unchanged
-from benchmarks.stress_scans import (
+from ctsim.benchmarks.methods import TABLE
+from ctsim.benchmarks.stress_cases import FULL
+from ctsim.benchmarks.stress_changes import AnyChange, Filled, Unchanged
+from ctsim.benchmarks.stress_scans import (
     BONE,
     HEIGHT,
     TITANIUM,
@@ -32,11 +32,11 @@ from ctsim.errors import InputError
 from ctsim.geometry import Pair
 from ctsim.materials import material
 from ctsim.noise import Noise
+from ctsim.phantoms.suites import read_toml, scenes_of
 from ctsim.scatter import Scatter
 from ctsim.solids import Solid
 from ctsim.spectrum import Tube
 from ctsim.types import Phantom, Scanner
-from phantoms.suites import read_toml, scenes_of
 
 RODS = {"water": WATER, "bone": BONE, "titanium": TITANIUM}
 TAKEN = ("threads", "float64")  # names of cases of methods that are no scenes
@@ -164,5 +164,5 @@ def load(path: Path | None = None) -> tuple[Scene, ...]:
     """Read a file of scenes, by default the bundled one; raises InputError with file, key and what was expected."""
     if path is not None:
         return scenes_of(read_toml(path), Scene, str(path))
-    with resources.as_file(resources.files("benchmarks") / "suites" / "stress.toml") as bundled:
+    with resources.as_file(resources.files("ctsim.benchmarks") / "suites" / "stress.toml") as bundled:
         return load(bundled)

@@ -9,8 +9,8 @@ import os
 from collections.abc import Hashable
 from typing import Self
 
-from benchmarks.limited import Limited, Stopped
-from benchmarks.stress_cases import Case, Outcome, carry_out
+from ctsim.benchmarks.limited import Limited, Stopped
+from ctsim.benchmarks.stress_cases import Case, Outcome, carry_out
 
 THREADS = "NUMBA_NUM_THREADS"
 

@@ -7,10 +7,10 @@ table has a million of them: they are plain tuples, which the collector of garba
 import math
 from typing import TYPE_CHECKING
 
-from benchmarks.columns import COLUMNS
-from benchmarks.compare import COMPARED, Row, derived
-from benchmarks.records import Record, latest
-from benchmarks.texts import harmless
+from ctsim.benchmarks.columns import COLUMNS
+from ctsim.benchmarks.compare import COMPARED, Row, derived
+from ctsim.benchmarks.records import Record, latest
+from ctsim.benchmarks.texts import harmless
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from benchmarks import latex
-from benchmarks.collector import uncollected
-from benchmarks.columns import COLUMNS, Column
-from benchmarks.compare import NMAR, harm, row_of
-from benchmarks.protocol import AS_RETURNED
-from benchmarks.records import OK, Record, latest, outdated, remarks
-from benchmarks.summary import Number, Numbers, csv_text, numbers, summary
-from benchmarks.texts import escape, ranked
+from ctsim.benchmarks import latex
+from ctsim.benchmarks.collector import uncollected
+from ctsim.benchmarks.columns import COLUMNS, Column
+from ctsim.benchmarks.compare import NMAR, harm, row_of
+from ctsim.benchmarks.protocol import AS_RETURNED
+from ctsim.benchmarks.records import OK, Record, latest, outdated, remarks
+from ctsim.benchmarks.summary import Number, Numbers, csv_text, numbers, summary
+from ctsim.benchmarks.texts import escape, ranked
 from ctsim.durable import write_synced
 from ctsim.errors import InputError
 

@@ -1,6 +1,6 @@
 """How well NMAR chooses its prior, and what the trace's margin is worth.
 
-    python -m benchmarks.tune_nmar DATA OUT [SCENE …]
+    python -m ctsim.benchmarks.tune_nmar DATA OUT [SCENE …]
 
 DATA is a dataset of scenes that stand in no table (`make-dataset tune DATA`), each with its metal-free twin. For
 every scene and dilation a line of OUT/nmar.csv holds the error of LIMAR and of NMAR with either prior (RMS difference
@@ -19,16 +19,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from baselines import nmar
-from baselines.limar import interpolated
-from baselines.metal import Metal, Trace, find_metal
-from baselines.prior import Choice, better, choose_prior
-from benchmarks.artefact import water_attenuation
-from benchmarks.cli import guarded
-from benchmarks.protocol import truth_of
+from ctsim.baselines import nmar
+from ctsim.baselines.limar import interpolated
+from ctsim.baselines.metal import Metal, Trace, find_metal
+from ctsim.baselines.prior import Choice, better, choose_prior
+from ctsim.benchmarks.artefact import water_attenuation
+from ctsim.benchmarks.cli import guarded
+from ctsim.benchmarks.protocol import truth_of
 from ctsim.errors import InputError
+from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.store import StoredScan, list_scans, open_scan
-from reconstruct.fdk import reconstruct as fdk
 
 DILATIONS = (0, None, 1)
 PRIORS = ("fdk", "limar")
@@ -119,4 +119,4 @@ def _held(trace: Trace) -> torch.Tensor:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded("tune_nmar", "benchmarks.tune_nmar", sys.argv[1:], resumes=False))
+    sys.exit(guarded("tune_nmar", "ctsim.benchmarks.tune_nmar", sys.argv[1:], resumes=False))

@@ -1,6 +1,6 @@
 """What the settings of methods are worth, one changed at a time from the defaults.
 
-    python -m benchmarks.tune_settings DATA OUT [METHOD …]
+    python -m ctsim.benchmarks.tune_settings DATA OUT [METHOD …]
 
 DATA is a dataset of scenes that stand in no table (`make-dataset tune DATA`). A line of OUT/settings.csv holds a
 method, its settings, the iterations done, and by scene PSNR3D in dB under the protocols `tissue` and `aligned`
@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks import metrics
-from benchmarks.cli import guarded
-from benchmarks.methods import Method, find
-from benchmarks.protocol import Truth, tissue_range, truth_of
+from ctsim.benchmarks import metrics
+from ctsim.benchmarks.cli import guarded
+from ctsim.benchmarks.methods import Method, find
+from ctsim.benchmarks.protocol import Truth, tissue_range, truth_of
 from ctsim.errors import InputError
+from ctsim.reconstruct.watch import watch
 from ctsim.store import StoredScan, list_scans, open_scan
-from reconstruct.watch import watch
 
 STOPS: dict[str, tuple[int, ...]] = {
     "fista-tv": (25, 50, 100),
@@ -99,4 +99,4 @@ def psnrs(values: np.ndarray, truth: Truth) -> list[float]:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded("tune_settings", "benchmarks.tune_settings", sys.argv[1:], resumes=False))
+    sys.exit(guarded("tune_settings", "ctsim.benchmarks.tune_settings", sys.argv[1:], resumes=False))

@@ -9,9 +9,9 @@ import numpy as np
 
 from ctsim.errors import InputError
 from ctsim.geometry import Triple
+from ctsim.phantoms.shapes import cylinder
 from ctsim.solids import Solid
 from ctsim.types import Phantom
-from phantoms.shapes import cylinder
 
 REACH = 0.92
 """Every object stays within this share of its cube: radius and half height are REACH·size/2."""

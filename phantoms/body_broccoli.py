@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.geometry import Triple
+from ctsim.phantoms.bodies import Recipe, Shape, assemble
+from ctsim.phantoms.fields import Canvas, Field, Mask, Noise, frame_along
+from ctsim.phantoms.inserts import count, diameter, inserts
 from ctsim.solids import Solid
 from ctsim.types import Phantom
-from phantoms.bodies import Recipe, Shape, assemble
-from phantoms.fields import Canvas, Field, Mask, Noise, frame_along
-from phantoms.inserts import count, diameter, inserts
 
 MATERIALS = ("air", "water", "cellulose")
 AIR, WATER, FIBRE = range(3)

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ctsim.geometry import Triple
+from ctsim.phantoms.bodies import Recipe, Shape, assemble
+from ctsim.phantoms.fields import Canvas, Field, Inside, Mask, Noise, supply_tree
+from ctsim.phantoms.inserts import count, diameter, inserts
 from ctsim.solids import Solid
 from ctsim.types import Phantom
-from phantoms.bodies import Recipe, Shape, assemble
-from phantoms.fields import Canvas, Field, Inside, Mask, Noise, supply_tree
-from phantoms.inserts import count, diameter, inserts
 
 MATERIALS = ("air", "soft_tissue", "adipose", "lung", "cortical_bone")
 AIR, SOFT, FAT, LUNG, BONE = range(5)

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctsim.geometry import Triple
+from ctsim.phantoms.bodies import REACH, Recipe, Shape, assemble
+from ctsim.phantoms.fields import Canvas, Field, Mask, Noise, frame_along
+from ctsim.phantoms.inserts import count, diameter, inserts
 from ctsim.solids import Solid
 from ctsim.types import Phantom
-from phantoms.bodies import REACH, Recipe, Shape, assemble
-from phantoms.fields import Canvas, Field, Mask, Noise, frame_along
-from phantoms.inserts import count, diameter, inserts
 
 
 class Walnut(Recipe, frozen=True, kw_only=True, tag="walnut"):

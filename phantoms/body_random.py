@@ -3,11 +3,11 @@
 import numpy as np
 
 from ctsim.geometry import Triple
+from ctsim.phantoms.bodies import Recipe, Shape, assemble
+from ctsim.phantoms.fields import Canvas, Noise
+from ctsim.phantoms.inserts import Inserts, count, diameter, inserts
 from ctsim.solids import Solid
 from ctsim.types import Phantom
-from phantoms.bodies import Recipe, Shape, assemble
-from phantoms.fields import Canvas, Noise
-from phantoms.inserts import Inserts, count, diameter, inserts
 
 MATERIALS = ("air", "soft_tissue", "adipose", "lung", "cortical_bone", "water")
 

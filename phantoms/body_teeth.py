@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ctsim.geometry import Triple
+from ctsim.phantoms.bodies import Recipe, Shape, assemble
+from ctsim.phantoms.fields import Canvas, Field, Mask, Noise
+from ctsim.phantoms.inserts import count, diameter, inserts
 from ctsim.solids import Solid
 from ctsim.types import Phantom
-from phantoms.bodies import Recipe, Shape, assemble
-from phantoms.fields import Canvas, Field, Mask, Noise
-from phantoms.inserts import count, diameter, inserts
 
 MATERIALS = ("air", "soft_tissue", "cortical_bone", "dentin", "enamel")
 AIR, SOFT, BONE, DENTIN, ENAMEL = range(5)

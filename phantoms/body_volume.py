@@ -13,10 +13,10 @@ from ctsim.arrayfile import MOST, read_array
 from ctsim.errors import InputError
 from ctsim.geometry import Triple
 from ctsim.materials import attenuation
+from ctsim.phantoms.bodies import REACH, Millimetres, Recipe, Shape, assemble, half_box
+from ctsim.phantoms.inserts import count, diameter, inserts
 from ctsim.solids import Solid
 from ctsim.types import Phantom
-from phantoms.bodies import REACH, Millimetres, Recipe, Shape, assemble, half_box
-from phantoms.inserts import count, diameter, inserts
 
 TISSUES = ("air", "lung", "adipose", "soft_tissue", "cortical_bone")
 FROM_HU = (-900.0, -250.0, -20.0, 200.0)

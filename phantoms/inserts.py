@@ -1,4 +1,4 @@
-"""Metal inserts in a recipe's relative coordinates; `phantoms.shapes` makes the solids."""
+"""Metal inserts in a recipe's relative coordinates; `ctsim.phantoms.shapes` makes the solids."""
 
 import math
 from dataclasses import dataclass
@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctsim.geometry import Triple
+from ctsim.phantoms import shapes
+from ctsim.phantoms.bodies import Recipe
 from ctsim.solids import Solid, Vector
-from phantoms import shapes
-from phantoms.bodies import Recipe
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,14 +12,14 @@ import numpy as np
 
 from ctsim.errors import InputError
 from ctsim.geometry import Triple
+from ctsim.phantoms.bodies import MetalRods, Recipe, Shape, Validation, metal_rods, validation
+from ctsim.phantoms.body_broccoli import Broccoli, broccoli
+from ctsim.phantoms.body_lung import Lung, lung
+from ctsim.phantoms.body_organic import BellPepper, Chicken, Walnut, bell_pepper, chicken, walnut
+from ctsim.phantoms.body_random import Random, random
+from ctsim.phantoms.body_teeth import Teeth, teeth
+from ctsim.phantoms.body_volume import CtVolume, ct_volume
 from ctsim.types import Phantom
-from phantoms.bodies import MetalRods, Recipe, Shape, Validation, metal_rods, validation
-from phantoms.body_broccoli import Broccoli, broccoli
-from phantoms.body_lung import Lung, lung
-from phantoms.body_organic import BellPepper, Chicken, Walnut, bell_pepper, chicken, walnut
-from phantoms.body_random import Random, random
-from phantoms.body_teeth import Teeth, teeth
-from phantoms.body_volume import CtVolume, ct_volume
 
 AnyRecipe = Validation | MetalRods | Lung | Teeth | Broccoli | Walnut | Chicken | BellPepper | Random | CtVolume
 

@@ -13,10 +13,10 @@ from ctsim.detector import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Count, Geometry, Pair, Triple
 from ctsim.noise import Noise
+from ctsim.phantoms.bodies import REACH
 from ctsim.scatter import Scatter
 from ctsim.spectrum import Filter, Tube
 from ctsim.types import Scanner
-from phantoms.bodies import REACH
 
 MARGIN = 1.06  # air beside the object's shadow, so that filters and flat-field checks see open pixels
 

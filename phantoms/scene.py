@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry, crosswise
 from ctsim.manifest import is_reserved
+from ctsim.phantoms.recipes import AnyRecipe, build_recipe
+from ctsim.phantoms.scanners import REACH, ScannerSettings
+from ctsim.phantoms.suites import NULL, decode, parse_toml, read_toml, scenes_of
 from ctsim.settings import Simulation, Truth
 from ctsim.types import Phantom, Scanner
-from phantoms.recipes import AnyRecipe, build_recipe
-from phantoms.scanners import REACH, ScannerSettings
-from phantoms.suites import NULL, decode, parse_toml, read_toml, scenes_of
 
 
 class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

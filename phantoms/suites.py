@@ -11,7 +11,7 @@ from typing import Any, Protocol, TypeVar, cast
 import msgspec
 
 from ctsim.errors import InputError
-from phantoms.messages import explain
+from ctsim.phantoms.messages import explain
 
 S = TypeVar("S", bound=msgspec.Struct)
 DEEPEST = 32  # tables and lists within each other; no scene has more than eight

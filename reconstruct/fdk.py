@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.kernels.backproject_cpu import backproject
+from ctsim.reconstruct.filters import filter_rows, padded_length, ramp_response
+from ctsim.reconstruct.log import LineIntegrals, how_it_ended, is_blind
+from ctsim.reconstruct.redundancy import RayWeights, ray_weights
 from ctsim.types import Scan, Volume
-from reconstruct.filters import filter_rows, padded_length, ramp_response
-from reconstruct.log import LineIntegrals, how_it_ended, is_blind
-from reconstruct.redundancy import RayWeights, ray_weights
 
 CHUNK_BYTES = 1 << 25
 
@@ -25,7 +25,7 @@ CHUNK_BYTES = 1 << 25
 def reconstruct(scan: Scan, *, device: str = "cpu", window: str = "ram-lak", cutoff: float = 1.0) -> Volume:
     """Reconstruct `scan` by FDK without any correction.
 
-    `window` and `cutoff` are those of `reconstruct.filters.window_gain`. Details hold the clamped pixels,
+    `window` and `cutoff` are those of `ctsim.reconstruct.filters.window_gain`. Details hold the clamped pixels,
     the number of views backprojected (`view_updates`) and how redundant rays were weighted. Where no pixel has
     signal the volume is empty and the status an error. Raises InputError for another device than the CPU, for a
     geometry given by poses, and for an unknown window.

@@ -1,7 +1,7 @@
 """Draw the two pictures of the documentation: the frame of `docs/conventions.md` and the README's artefact.
 
-`python -m reports.drawings geometry docs/geometry.svg`
-`python -m reports.drawings artefact DATA/SCENE docs/images/artefact.png RESULTS/volumes/SCENE__fdk.tif …`
+`python -m ctsim.reports.drawings geometry docs/geometry.svg`
+`python -m ctsim.reports.drawings artefact DATA/SCENE docs/images/artefact.png RESULTS/volumes/SCENE__fdk.tif …`
 """
 
 import sys
@@ -92,8 +92,8 @@ def artefact(scene: Path, volumes: list[Path], path: Path) -> None:
     """Draw one slice of a scene through most metal: the reference and reconstructions named SCENE__METHOD.tif."""
     import tifffile
 
-    from benchmarks.panels import cut
-    from benchmarks.protocol import truth_of
+    from ctsim.benchmarks.panels import cut
+    from ctsim.benchmarks.protocol import truth_of
     from ctsim.store import open_scan
 
     truth = truth_of(open_scan(scene))

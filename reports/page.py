@@ -1,7 +1,7 @@
 """One HTML file that needs nothing else: tables that sort, figures, and a slice slider for each scene.
 
-Its parts are written by `benchmarks.tables` and `reports.figures`; here they are put in their places. A policy in
-the file itself forbids it to load anything.
+Its parts are written by `ctsim.benchmarks.tables` and `ctsim.reports.figures`; here they are put in their places. A
+policy in the file itself forbids it to load anything.
 """
 
 import html
@@ -16,10 +16,10 @@ import matplotlib
 import matplotlib.colors
 import numpy as np
 
-from benchmarks.records import OK, Record
-from benchmarks.tables import render
-from reports import figures, markdown, slices
-from reports.kept import Case, Kept
+from ctsim.benchmarks.records import OK, Record
+from ctsim.benchmarks.tables import render
+from ctsim.reports import figures, markdown, slices
+from ctsim.reports.kept import Case, Kept
 
 PRIMARY = "tissue"
 TITLES = {
@@ -75,7 +75,7 @@ def page(content: Content, done: Callable[[], Any] = lambda: None) -> str:
 
 
 def _asset(name: str) -> str:
-    return resources.files("reports").joinpath(name).read_text(encoding="utf-8")
+    return resources.files("ctsim.reports").joinpath(name).read_text(encoding="utf-8")
 
 
 def _table(name: str, text: str) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from matplotlib.figure import Figure
 
 if TYPE_CHECKING:
-    from reports.kept import Case
+    from ctsim.reports.kept import Case
 
 
 def text(markdown: str) -> None:
@@ -30,7 +30,7 @@ def figure(drawing: Figure, name: str) -> None:
     if _in_jupyter():
         from IPython.display import Image, display  # pyright: ignore[reportMissingImports]
 
-        from reports.view import png
+        from ctsim.reports.view import png
 
         display(Image(data=png(drawing)))
         return
@@ -42,8 +42,8 @@ def figure(drawing: Figure, name: str) -> None:
 
 def slices(case: "Case", name: str) -> None:
     """Show a case's viewer; a script draws what it shows first."""
-    from reports.view import figure as drawn
-    from reports.view import first_state, viewer
+    from ctsim.reports.view import figure as drawn
+    from ctsim.reports.view import first_state, viewer
 
     if _in_jupyter():
         from IPython.display import display  # pyright: ignore[reportMissingImports]

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.metrics import erode
-from reports.kept import Case
+from ctsim.benchmarks.metrics import erode
+from ctsim.reports.kept import Case
 
 OUTLINE = 200  # points across an image: an outline is one of them wide, however few the voxels are
 RING, UNJUDGED = (255, 176, 0), (140, 140, 140)  # as in the panels

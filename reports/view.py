@@ -12,9 +12,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from benchmarks.texts import pictured
+from ctsim.benchmarks.texts import pictured
 from ctsim.errors import InputError
-from reports.kept import Case
+from ctsim.reports.kept import Case
 
 if TYPE_CHECKING:
     import ipywidgets  # pyright: ignore[reportMissingImports]

@@ -24,7 +24,7 @@ n_views = 12
 @pytest.fixture(scope="session")
 def smallest(tmp_path_factory) -> Path:
     """A dataset of one scene, rods in water, as make-dataset writes it; not to be changed."""
-    from benchmarks.make_dataset import main
+    from ctsim.benchmarks.make_dataset import main
 
     folder = tmp_path_factory.mktemp("smallest")
     (folder / "scene.toml").write_text(SMALLEST, encoding="utf-8")

@@ -76,16 +76,24 @@ def serve() -> None:
     import tqdm
 
     tqdm.tqdm.monitor_interval = 0  # a fork would lose its thread
-    import benchmarks.cli_run
-    import benchmarks.make_dataset
-    import benchmarks.panels
-    import benchmarks.schedule
+    import ctsim.benchmarks.cli_run
+    import ctsim.benchmarks.make_dataset
+    import ctsim.benchmarks.panels
+    import ctsim.benchmarks.schedule
+    import ctsim.phantoms.scene
     import ctsim.writer
-    import phantoms.scene
 
     note_every_view(ctsim.writer.SceneWriter)
-    assert all((benchmarks.cli_run, benchmarks.make_dataset, benchmarks.panels, benchmarks.schedule, phantoms.scene))
-    benchmarks.panels.DPI = 20  # a picture is to be there; most of the time it would be drawn
+    assert all(
+        (
+            ctsim.benchmarks.cli_run,
+            ctsim.benchmarks.make_dataset,
+            ctsim.benchmarks.panels,
+            ctsim.benchmarks.schedule,
+            ctsim.phantoms.scene,
+        )
+    )
+    ctsim.benchmarks.panels.DPI = 20  # a picture is to be there; most of the time it would be drawn
     for line in sys.stdin:
         sys.stdout.write(json.dumps(attempt(**json.loads(line))) + "\n")
         sys.stdout.flush()
@@ -117,7 +125,7 @@ def die_after(writer: type, view: int, mark: Path) -> None:
 
 def patient(scan: Any, *, device: str) -> Any:
     """Reconstruct by FDK, but the first process that is asked waits for its end: RUN with .waits is a file then."""
-    from reconstruct.fdk import reconstruct
+    from ctsim.reconstruct.fdk import reconstruct
 
     with contextlib.suppress(FileExistsError):
         Path(os.environ[RUN] + ".waits").touch(exist_ok=False)
@@ -201,7 +209,7 @@ def be(
     os.environ[RUN] = command[2]
     try:
         if disk:
-            from benchmarks import make_dataset
+            from ctsim.benchmarks import make_dataset
 
             if holds is None:
                 make_dataset._SPARE = -(2**40)  # else a disk that is too small would be refused before the first byte
@@ -228,7 +236,7 @@ def be(
 
 def call(command: list[str]) -> int:
     """Call a command as its console script does."""
-    from benchmarks import cli
+    from ctsim.benchmarks import cli
 
     sys.argv = command
     code = {"make-dataset": cli.make_dataset, "run-benchmark": cli.run_benchmark}[command[0]]()

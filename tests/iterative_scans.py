@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 
-from baselines.krylov import cgls
-from baselines.sart import os_sart, sart, sirt
-from baselines.tv_methods import asd_pocs, awpcsd, fista_tv
+from ctsim.baselines.krylov import cgls
+from ctsim.baselines.sart import os_sart, sart, sirt
+from ctsim.baselines.tv_methods import asd_pocs, awpcsd, fista_tv
 from ctsim.geometry import Geometry
+from ctsim.reconstruct.projector import forward
 from ctsim.types import Scan
-from reconstruct.projector import forward
 
 MU, RADIUS, CENTRE = 0.02, 10.0, np.array([1.0, -2.0, 0.5])  # 1/mm, mm, x y z
 GEOMETRY = Geometry(

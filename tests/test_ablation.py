@@ -6,13 +6,13 @@ import msgspec
 import pytest
 from conftest import SMALLEST
 
-from benchmarks import ablation, cli, make_dataset, methods, records, workers
-from benchmarks.make_dataset import load as load_suite
+from ctsim.benchmarks import ablation, cli, make_dataset, methods, records, workers
+from ctsim.benchmarks.make_dataset import load as load_suite
 from ctsim.store import list_scans, open_scan
 
 STUB = """
 from ctsim.errors import InputError
-from reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.fdk import reconstruct as fdk
 
 
 def reconstruct(scan, *, device, preset="fast", steps=None, response=None, basis=None, nodes=None, e_max=None):

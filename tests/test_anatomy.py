@@ -12,13 +12,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from ctsim.phantoms.bodies import Recipe
+from ctsim.phantoms.body_lung import Lung
+from ctsim.phantoms.body_random import Random
+from ctsim.phantoms.body_teeth import Teeth
+from ctsim.phantoms.recipes import build_recipe
 from ctsim.solids import CAPSULE, ELLIPSOID, Solid
 from ctsim.types import Phantom
-from phantoms.bodies import Recipe
-from phantoms.body_lung import Lung
-from phantoms.body_random import Random
-from phantoms.body_teeth import Teeth
-from phantoms.recipes import build_recipe
 
 SEEDS = (1, 2, 3)
 Mask = NDArray[np.bool_]

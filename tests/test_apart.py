@@ -15,7 +15,7 @@ import pytest
 import torch
 from test_workers import until
 
-from benchmarks import apart, host
+from ctsim.benchmarks import apart, host
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def test_what_overstays_is_killed_with_what_it_has_started(tmp_path):
 
 def test_it_ends_with_a_process_that_is_killed(tmp_path):
     pids = tmp_path / "pids"
-    code = f"import apart_jobs; from benchmarks import apart; apart.call(apart_jobs.sleep_in_two, {str(pids)!r})"
+    code = f"import apart_jobs; from ctsim.benchmarks import apart; apart.call(apart_jobs.sleep_in_two, {str(pids)!r})"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     with subprocess.Popen([sys.executable, "-P", "-c", code], env=environment) as it:
         until(pids.exists)

@@ -8,23 +8,23 @@ import numpy as np
 import pytest
 import torch
 
-from baselines import bhc, known_spectrum
-from baselines.known_spectrum import Beam, precorrect
-from baselines.metal import Metal, Trace
-from benchmarks import intermediates
+from ctsim.baselines import bhc, known_spectrum
+from ctsim.baselines.known_spectrum import Beam, precorrect
+from ctsim.baselines.metal import Metal, Trace
+from ctsim.benchmarks import intermediates
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.noise import Noise
 from ctsim.plan import make_plan
 from ctsim.quadrature import full_rule
+from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.log import line_integrals
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import flat_image, simulate_views
 from ctsim.solids import FRUSTUM, Primitive, Solid
 from ctsim.types import Phantom, Scan, Scanner, Status
 from ctsim.voxelise import metal_mask
-from reconstruct.fdk import reconstruct as fdk
-from reconstruct.log import line_integrals
 
 METHODS = {
     "bhc-poly": bhc.bhc_poly,
@@ -183,7 +183,7 @@ def test_the_excess_is_that_of_the_three_materials():
 
 @pytest.mark.parametrize("mask", ["oracle", "auto"])
 def test_without_metal_the_polynomial_leaves_fdk_to_the_last_bit(water, mask, monkeypatch):
-    monkeypatch.setattr("baselines.metal.Tracer.background", None)
+    monkeypatch.setattr("ctsim.baselines.metal.Tracer.background", None)
     volume = bhc.bhc_poly(water, mask=mask)
     assert torch.equal(volume.values, fdk(water).values) and not volume.details["corrected"]
 

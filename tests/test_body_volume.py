@@ -13,11 +13,11 @@ from scipy import ndimage
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
+from ctsim.phantoms.body_volume import TISSUES, CtVolume
+from ctsim.phantoms.recipes import build_recipe
+from ctsim.phantoms.scene import parse_suite, scene_id, scene_to_toml, stream_id
 from ctsim.store import list_scans, open_scan
 from ctsim.voxelise import attenuation_volume
-from phantoms.body_volume import TISSUES, CtVolume
-from phantoms.recipes import build_recipe
-from phantoms.scene import parse_suite, scene_id, scene_to_toml, stream_id
 
 SPACING = (2.0, 1.5, 1.0)
 
@@ -123,7 +123,7 @@ scanner = {{ n_voxel = [16, 16, 16], n_detector = [24, 24], n_views = 4 }}
 
 
 def test_a_scan_of_it_is_made_and_reopened(head, tmp_path):
-    from benchmarks.make_dataset import main as make_dataset
+    from ctsim.benchmarks.make_dataset import main as make_dataset
 
     (tmp_path / "scene.toml").write_text(
         f'''

@@ -10,10 +10,10 @@ import pytest
 from test_splat_published import sphere
 
 from ctsim.errors import InputError
-from reconstruct.splat.checkpoint import Checkpoint
-from reconstruct.splat.fast import Settings, reconstruct
-from reconstruct.splat.published import fit_published
-from reconstruct.splat.published_settings import Settings as Published
+from ctsim.reconstruct.splat.checkpoint import Checkpoint
+from ctsim.reconstruct.splat.fast import Settings, reconstruct
+from ctsim.reconstruct.splat.published import fit_published
+from ctsim.reconstruct.splat.published_settings import Settings as Published
 
 STATE = {"u": np.linspace(0, 1, 50, dtype=np.float32), "numbers": np.arange(3), "empty": np.zeros(0)}
 

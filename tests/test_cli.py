@@ -10,15 +10,15 @@ import pytest
 from conftest import SMALLEST
 from test_paper_tables import record
 
-from benchmarks import cli, make_dataset, records
-from benchmarks.devices import check_device
+from ctsim.benchmarks import cli, make_dataset, records
+from ctsim.benchmarks.devices import check_device
 from ctsim.errors import InputError
 from ctsim.store import list_scans, open_scan
 
 WAITING = """
 import time
 from pathlib import Path
-from reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.fdk import reconstruct as fdk
 
 def reconstruct(scan, *, device):
     if not Path("go").exists():
@@ -30,7 +30,7 @@ def reconstruct(scan, *, device):
 
 def stopped(command, arguments, folder, begun):
     """Start a command in `folder`, send it SIGTERM once `begun()` is true, and return its exit code and last words."""
-    code = f"import sys; from benchmarks.cli import {command}; sys.argv[0] = '{command}'; sys.exit({command}())"
+    code = f"import sys; from ctsim.benchmarks.cli import {command}; sys.argv[0] = '{command}'; sys.exit({command}())"
     with subprocess.Popen(
         [sys.executable, "-c", code, *map(str, arguments)], cwd=folder, stderr=subprocess.PIPE, text=True
     ) as child:
@@ -97,8 +97,8 @@ def test_what_cannot_go_on_does_not_say_that_it_will(monkeypatch, capsys):
     def stopped(_arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("benchmarks.tune_nmar.main", stopped)
-    assert cli.guarded("tune_nmar", "benchmarks.tune_nmar", [], resumes=False) == 130
+    monkeypatch.setattr("ctsim.benchmarks.tune_nmar.main", stopped)
+    assert cli.guarded("tune_nmar", "ctsim.benchmarks.tune_nmar", [], resumes=False) == 130
     assert "begins anew" in capsys.readouterr().err
 
 

@@ -3,8 +3,8 @@ import gc
 import pytest
 from test_paper_tables import record
 
-from benchmarks import records, tables
-from benchmarks.collector import uncollected
+from ctsim.benchmarks import records, tables
+from ctsim.benchmarks.collector import uncollected
 
 
 @pytest.mark.parametrize("on", [True, False])

@@ -8,12 +8,12 @@ import pytest
 from test_paper_tables import record
 from test_pareto_points import setting, timed
 
-from benchmarks import lines, peer_cases, peer_tables, records, skipping_tables, stress_records, tables
-from benchmarks.host import host
-from benchmarks.methods import parse_overrides
-from benchmarks.pareto_records import latest, points
-from benchmarks.pareto_records import read as read_pareto
 from ctsim import locks, manifest
+from ctsim.benchmarks import lines, peer_cases, peer_tables, records, skipping_tables, stress_records, tables
+from ctsim.benchmarks.host import host
+from ctsim.benchmarks.methods import parse_overrides
+from ctsim.benchmarks.pareto_records import latest, points
+from ctsim.benchmarks.pareto_records import read as read_pareto
 from ctsim.errors import InputError
 from ctsim.folder import read_progress
 from ctsim.scaninfo import read_info

@@ -34,7 +34,7 @@ def test_an_example_works(kind, text, smallest, tmp_path, monkeypatch):
     if kind == "python":
         exec(compile(text, "example", "exec"), {"__name__": "example"})
     else:
-        from phantoms.scene import build, parse_suite
+        from ctsim.phantoms.scene import build, parse_suite
 
         assert all(build(scene).labels.any() for scene in parse_suite(text))
 
@@ -57,15 +57,15 @@ def commands(text: str) -> list[str]:
 
 def arguments_of(name: str, words: list[str]) -> tuple[type, list[str]] | None:
     """Return the form and the words of a command of ours, None for another, and where it is but named."""
-    from benchmarks.cli import OTHERS
-    from benchmarks.cli_run import Arguments
-    from benchmarks.make_dataset import Options
+    from ctsim.benchmarks.cli import OTHERS
+    from ctsim.benchmarks.cli_run import Arguments
+    from ctsim.benchmarks.make_dataset import Options
 
     if name.rpartition("/")[2] not in ("make-dataset", "run-benchmark"):
         return None
     form = Options if name.endswith("make-dataset") else Arguments
     if form is Arguments and words and (module := OTHERS.get(words[0])):
-        form, words = importlib.import_module(module if "." in module else f"benchmarks.{module}").Arguments, words[1:]
+        form, words = importlib.import_module(module).Arguments, words[1:]
     return (form, words) if any(not word.startswith("-") for word in words) else None
 
 
@@ -91,8 +91,8 @@ def test_commands_are_found_wherever_they_stand():
 
 
 def test_the_readme_names_every_recipe_and_suite():
-    from benchmarks.make_dataset import bundled
-    from phantoms.recipes import NAMES
+    from ctsim.benchmarks.make_dataset import bundled
+    from ctsim.phantoms.recipes import NAMES
 
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     suites = bundled()

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import intermediates, volumes
-from benchmarks.volumes import read_volume, write_volume
 from ctsim import durable, process
+from ctsim.benchmarks import intermediates, volumes
+from ctsim.benchmarks.volumes import read_volume, write_volume
 from ctsim.durable import replacing, write_synced
-from reconstruct.splat.checkpoint import Checkpoint
+from ctsim.reconstruct.splat.checkpoint import Checkpoint
 
 ROUNDS = 40
 

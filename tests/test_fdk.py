@@ -6,11 +6,11 @@ import torch
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.kernels.backproject_cpu import backproject
+from ctsim.reconstruct.fdk import add_fdk, fdk, reconstruct
+from ctsim.reconstruct.filters import WINDOWS
+from ctsim.reconstruct.log import count_floor, line_integrals
+from ctsim.reconstruct.redundancy import parker_share, ray_weights
 from ctsim.types import Scan, Status
-from reconstruct.fdk import add_fdk, fdk, reconstruct
-from reconstruct.filters import WINDOWS
-from reconstruct.log import count_floor, line_integrals
-from reconstruct.redundancy import parker_share, ray_weights
 
 MU = 0.02
 GEOMETRY = Geometry(
@@ -252,7 +252,7 @@ def test_view_updates_count_the_backprojected_views(monkeypatch):
         calls.append(len(angles))
         backproject(filtered, angles, orbit, grid, volume)
 
-    monkeypatch.setattr("reconstruct.fdk.backproject", counted)
+    monkeypatch.setattr("ctsim.reconstruct.fdk.backproject", counted)
     geometry = with_(arc_deg=220.0)
     volume = reconstruct(make_scan(geometry, torch.full(geometry.shape, 5e3)))
     assert len(calls) > 1 and volume.details["view_updates"] == sum(calls) == 180

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ctsim.errors import InputError
-from reconstruct.filters import WINDOWS, filter_rows, padded_length, ramp_kernel, ramp_response, window_gain
+from ctsim.reconstruct.filters import WINDOWS, filter_rows, padded_length, ramp_kernel, ramp_response, window_gain
 
 
 def test_kernel_has_the_band_limited_values():

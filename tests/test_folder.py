@@ -10,16 +10,16 @@ import pytest
 from small_scan import STACKS, content, one_view, write
 from test_writer import interrupt
 
-import benchmarks.make_dataset as command
-from benchmarks.make_dataset import load, main
+import ctsim.benchmarks.make_dataset as command
 from ctsim import folder, locks, manifest, simulate, sources
+from ctsim.benchmarks.make_dataset import load, main
 from ctsim.errors import InputError
 from ctsim.folder import is_complete, remarks, unfinished
 from ctsim.manifest import INDEX, MANIFEST, PROGRESS, IndexLine, read_index, read_manifest
+from ctsim.phantoms import scene as scenes
+from ctsim.phantoms.scene import scene_id
 from ctsim.store import open_scan, verify
 from ctsim.writer import SceneWriter
-from phantoms import scene as scenes
-from phantoms.scene import scene_id
 
 SUITE = """
 [defaults.scanner]
@@ -164,7 +164,7 @@ def test_a_scan_of_the_former_format_is_read_and_named(made, suite, capsys):
 
 
 def test_a_table_of_scans_of_different_code_is_remarked_upon(made, suite, other_code, tmp_path, caplog):
-    from benchmarks.cli_run import main as run
+    from ctsim.benchmarks.cli_run import main as run
 
     assert run([str(made), str(tmp_path / "results"), "--dry-run"]) == 0 and not caplog.messages
     first = sources.source_hash()

@@ -7,11 +7,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from setuptools import find_packages
 
 ROOT = Path(__file__).parents[1]
 DRAWS = {"matplotlib", "pandas", "tyro", "tqdm"}
 SLOW = {"torch", "numba", "scipy", "xraylib", "skimage"}
-BELOW_BENCHMARKS = ("ctsim", "phantoms", "reconstruct", "baselines")
+PARTS = ("phantoms", "reconstruct", "baselines", "benchmarks", "reports")
 
 
 def run(code: str) -> str:
@@ -28,15 +29,28 @@ def loaded(code: str) -> set[str]:
     return set(printed.splitlines()[-1].split())
 
 
-def modules(package: str) -> list[str]:
-    return [m.name for m in pkgutil.walk_packages([str(ROOT / package)], f"{package}.")]
+def modules(*left_out: str) -> list[str]:
+    """All modules of ctsim but for those of some parts."""
+    found = [m.name for m in pkgutil.walk_packages([str(ROOT / "ctsim")], "ctsim.")]
+    return [name for name in found if name.split(".")[1] not in left_out]
 
 
 def test_the_layers_hold():
     run("from importlinter.cli import lint_imports; assert lint_imports(cache_dir=None) == 0")
 
 
-@pytest.mark.parametrize("package", ["ctsim", "phantoms", "reconstruct", "baselines", "benchmarks", "reports"])
+def test_an_installed_ctsim_claims_one_name_on_the_import_path():
+    found = find_packages(str(ROOT), include=["ctsim*"])
+    folders = {".".join(p.parent.relative_to(ROOT).parts) for part in ("ctsim", *PARTS) for p in inits(ROOT / part)}
+    assert {*found} == {name if name.startswith("ctsim") else f"ctsim.{name}" for name in folders}
+    assert (importlib.metadata.distribution("ctsim").read_text("top_level.txt") or "").split() == ["ctsim"]
+
+
+def inits(folder: Path) -> list[Path]:
+    return list(folder.rglob("__init__.py"))
+
+
+@pytest.mark.parametrize("package", ["ctsim", *(f"ctsim.{part}" for part in PARTS)])
 def test_importing_a_package_loads_nothing_heavy(package):
     assert not loaded(f"import {package}") & (DRAWS | SLOW)
 
@@ -47,11 +61,13 @@ def test_what_lists_and_checks_datasets_loads_nothing_slow(module):
 
 
 def test_making_data_does_without_torch():
-    assert "torch" not in loaded("import phantoms.scene, ctsim.simulate, ctsim.writer, benchmarks.make_dataset")
+    assert "torch" not in loaded(
+        "import ctsim.phantoms.scene, ctsim.simulate, ctsim.writer, ctsim.benchmarks.make_dataset"
+    )
 
 
 def test_nothing_below_benchmarks_draws_or_talks():
-    names = [m for p in BELOW_BENCHMARKS for m in modules(p) if m != "ctsim.data.make_spectrum_table"]
+    names = [m for m in modules("benchmarks", "reports") if m != "ctsim.data.make_spectrum_table"]
     assert len(names) > 30
     brought = loaded("import torch")  # torch itself loads tqdm
     assert not (loaded("import " + ", ".join(names)) - brought) & DRAWS
@@ -70,6 +86,6 @@ def test_help_loads_nothing_slow(command):
 
 
 def test_importing_everything_neither_prints_nor_warns():
-    names = [m for p in (*BELOW_BENCHMARKS, "benchmarks") for m in modules(p)]
-    left_out = {"ctsim.data.make_spectrum_table", "benchmarks.peer_rtk"}  # they need what only an extra installs
+    names = modules("reports")
+    left_out = {"ctsim.data.make_spectrum_table", "ctsim.benchmarks.peer_rtk"}  # they need what only an extra installs
     assert run("import " + ", ".join(n for n in names if n not in left_out)) == ""

@@ -7,11 +7,11 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio
 from test_metrics import truth
 
-from benchmarks import cli, inspector, records
-from benchmarks.inspector import BASE, SINGLE, WHOLE, Convention, score
-from benchmarks.protocol import AT_50KEV, evaluate
-from benchmarks.volumes import at_50kev_of, write_volume
-from reconstruct.fdk import reconstruct as fdk
+from ctsim.benchmarks import cli, inspector, records
+from ctsim.benchmarks.inspector import BASE, SINGLE, WHOLE, Convention, score
+from ctsim.benchmarks.protocol import AT_50KEV, evaluate
+from ctsim.benchmarks.volumes import at_50kev_of, write_volume
+from ctsim.reconstruct.fdk import reconstruct as fdk
 
 
 @pytest.fixture(scope="module")

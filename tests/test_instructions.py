@@ -69,9 +69,9 @@ def measure() -> dict[str, np.ndarray]:
 
 def simulated() -> dict[str, np.ndarray]:
     """Simulate a small scan."""
+    from ctsim.phantoms.scene import build, parse_suite, stream_id
     from ctsim.plan import make_plan
     from ctsim.simulate import simulate_views
-    from phantoms.scene import build, parse_suite, stream_id
 
     (scene,) = parse_suite(SUITE)
     plan = make_plan(build(scene), scene.resolve(), scene.simulation, scene.truth, stream_id(scene))

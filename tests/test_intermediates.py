@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from benchmarks import attempt, intermediates, methods
+from ctsim.benchmarks import attempt, intermediates, methods
+from ctsim.reconstruct.log import line_integrals
 from ctsim.store import list_scans, open_scan
-from reconstruct.log import line_integrals
 
 
 @pytest.mark.parametrize("name", ["limar", "nmar"])

@@ -23,13 +23,13 @@ from iterative_scans import (
 )
 from scipy.sparse.linalg import lsqr
 
-from baselines.iterative import System, visiting_order, watch
-from baselines.krylov import cgls
-from baselines.sart import os_sart, sart, sirt
-from baselines.tv_methods import asd_pocs, awpcsd, fista_tv
+from ctsim.baselines.iterative import System, visiting_order, watch
+from ctsim.baselines.krylov import cgls
+from ctsim.baselines.sart import os_sart, sart, sirt
+from ctsim.baselines.tv_methods import asd_pocs, awpcsd, fista_tv
 from ctsim.errors import InputError
+from ctsim.reconstruct.projector import forward
 from ctsim.types import Scan, Status
-from reconstruct.projector import forward
 
 
 @functools.cache

@@ -7,23 +7,23 @@ import numpy as np
 import pytest
 import torch
 
-from baselines import limar, nmar
-from baselines.inpaint import Filled, fill, harmonic
-from baselines.metal import Metal, Trace, auto_mask, find_metal, reach, reinsert, water_value
-from baselines.morphology import dilate, spread
-from baselines.prior import choice_views, tissue_prior
-from benchmarks.methods import find
+from ctsim.baselines import limar, nmar
+from ctsim.baselines.inpaint import Filled, fill, harmonic
+from ctsim.baselines.metal import Metal, Trace, auto_mask, find_metal, reach, reinsert, water_value
+from ctsim.baselines.morphology import dilate, spread
+from ctsim.baselines.prior import choice_views, tissue_prior
+from ctsim.benchmarks.methods import find
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.noise import Noise
 from ctsim.plan import make_plan
 from ctsim.project import Tracer, path_lengths
+from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import flat_image, simulate_views
 from ctsim.solids import FRUSTUM, Primitive, Solid
 from ctsim.types import Phantom, Scan, Scanner, Status
 from ctsim.voxelise import metal_mask
-from reconstruct.fdk import reconstruct as fdk
 
 METHODS = {"limar": limar.reconstruct, "nmar": nmar.reconstruct}
 GEOMETRY = Geometry(
@@ -90,9 +90,9 @@ def test_on_iron_nmar_is_better_than_limar_and_limar_than_nothing(iron):
 def test_without_metal_the_result_is_fdk_to_the_last_bit_and_nothing_is_projected(iron, name, mask, monkeypatch):
     _, bare = iron
     first = fdk(bare)
-    monkeypatch.setattr("baselines.metal.Tracer.background", None)
-    monkeypatch.setattr("baselines.nmar.forward_columns", None)
-    monkeypatch.setattr("baselines.prior.forward_columns", None)
+    monkeypatch.setattr("ctsim.baselines.metal.Tracer.background", None)
+    monkeypatch.setattr("ctsim.baselines.nmar.forward_columns", None)
+    monkeypatch.setattr("ctsim.baselines.prior.forward_columns", None)
     volume = METHODS[name](bare, mask=mask)
     assert torch.equal(volume.values, first.values) and not volume.details["corrected"]
     # bone is the densest there is: the automatic mask finds it, and says that it is not to be relied on

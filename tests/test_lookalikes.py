@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from ctsim.phantoms.bodies import Recipe
+from ctsim.phantoms.recipes import BUILDERS, build_recipe
+from ctsim.phantoms.scene import load_suite
 from ctsim.solids import Primitive, Solid
 from ctsim.types import Phantom
-from phantoms.bodies import Recipe
-from phantoms.recipes import BUILDERS, build_recipe
-from phantoms.scene import load_suite
 
 SUITES = Path(__file__).parent.parent / "benchmarks" / "suites"
 KINDS = {str(kind.__struct_config__.tag): kind for kind in BUILDERS}

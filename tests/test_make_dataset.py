@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import tifffile
 
-import benchmarks.make_dataset as command
-from benchmarks.make_dataset import OF_COMMANDS, bundled, load, main, select
+import ctsim.benchmarks.make_dataset as command
 from ctsim import simulate
+from ctsim.benchmarks.make_dataset import OF_COMMANDS, bundled, load, main, select
 from ctsim.errors import InputError
 from ctsim.human import human_bytes, human_time
+from ctsim.phantoms.scene import load_suite, parse_suite, scene_id
 from ctsim.store import list_scans, open_scan
-from phantoms.scene import load_suite, parse_suite, scene_id
 
 SUITE = """
 [defaults]
@@ -219,8 +219,8 @@ def test_a_wrong_name_among_thousands_is_answered_with_the_nearest_and_their_num
 @pytest.mark.parametrize(
     ("where", "flags"),
     [
-        ("phantoms.scene.build", []),
-        ("phantoms.scene.build", ["--dry-run"]),
+        ("ctsim.phantoms.scene.build", []),
+        ("ctsim.phantoms.scene.build", ["--dry-run"]),
         ("ctsim.plan.make_plan", []),
         ("ctsim.simulate.simulate_views", []),
         ("ctsim.simulate.truth_volumes", []),

@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from benchmarks import cli_run, methods, records, run
+from ctsim.benchmarks import cli_run, methods, records, run
 from ctsim.errors import InputError
 from ctsim.manifest import INDEX, MANIFEST
 from ctsim.store import list_scans, open_scan
@@ -45,7 +45,7 @@ def many(smallest, tmp_path_factory) -> Path:
 def limited(*arguments: object) -> subprocess.CompletedProcess[str]:
     """Call run-benchmark in a process that may open no more than LIMIT files."""
     return subprocess.run(
-        [sys.executable, "-c", "import sys; from benchmarks.cli import run_benchmark; sys.exit(run_benchmark())"]
+        [sys.executable, "-c", "import sys; from ctsim.benchmarks.cli import run_benchmark; sys.exit(run_benchmark())"]
         + [str(a) for a in arguments],
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (LIMIT, LIMIT)),
         capture_output=True,

@@ -7,11 +7,11 @@ edge thresholds of its own: it shares no image with the scan that holds metal.
 import numpy as np
 import pytest
 
+from ctsim.phantoms.recipes import NAMES
+from ctsim.phantoms.scene import Scene, build, parse_suite
 from ctsim.plan import make_plan
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import simulate_views
-from phantoms.recipes import NAMES
-from phantoms.scene import Scene, build, parse_suite
 
 METALS = {"metal_rods": "Al6061", "teeth": "Ti", "broccoli": "Al", "bell_pepper": "Al"}
 SIZES = {"walnut": "size = 40.0", "metal_rods": "size = 60.0"}

@@ -6,22 +6,22 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks import records
-from benchmarks.attempt import scan_for
-from benchmarks.cli_run import main as run_benchmark
-from benchmarks.judge import Judge, Twin
-from benchmarks.make_dataset import main as make_dataset
-from benchmarks.methods import find
+from ctsim.benchmarks import records
+from ctsim.benchmarks.attempt import scan_for
+from ctsim.benchmarks.cli_run import main as run_benchmark
+from ctsim.benchmarks.judge import Judge, Twin
+from ctsim.benchmarks.make_dataset import main as make_dataset
+from ctsim.benchmarks.methods import find
 from ctsim.detector import Detector
 from ctsim.geometry import Geometry
 from ctsim.notes import metal_notes
+from ctsim.phantoms.shapes import cylinder, sphere
 from ctsim.project import Response
 from ctsim.quadrature import full_rule
 from ctsim.solids import Solid
 from ctsim.spectrum import Tube, spectrum
 from ctsim.store import open_scan
 from ctsim.types import Phantom
-from phantoms.shapes import cylinder, sphere
 
 GRID, VIEW = "no metal on the reconstruction grid", "no metal in any view"
 GEOMETRY = Geometry(

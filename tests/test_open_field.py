@@ -5,13 +5,13 @@ import warnings
 import numpy as np
 import pytest
 
-from benchmarks.make_dataset import main as make_dataset
-from benchmarks.protocol import metal_score, tissue_score, truth_of
+from ctsim.benchmarks.make_dataset import main as make_dataset
+from ctsim.benchmarks.protocol import metal_score, tissue_score, truth_of
 from ctsim.errors import InputError
+from ctsim.reconstruct.log import line_integrals
+from ctsim.reconstruct.scatter import open_excess
+from ctsim.reconstruct.splat.method import reconstruct
 from ctsim.store import list_scans, open_scan
-from reconstruct.log import line_integrals
-from reconstruct.scatter import open_excess
-from reconstruct.splat.method import reconstruct
 
 SCENE = """
 name = "scattering"

@@ -5,14 +5,14 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
-from benchmarks import cli, paper_layout, paper_tables, records
-from benchmarks.host import Host
-from benchmarks.make_dataset import load as load_suite
-from benchmarks.protocol import Score
-from benchmarks.records import Cost, Record, Run
-from benchmarks.run import repetition
+from ctsim.benchmarks import cli, paper_layout, paper_tables, records
+from ctsim.benchmarks.host import Host
+from ctsim.benchmarks.make_dataset import load as load_suite
+from ctsim.benchmarks.protocol import Score
+from ctsim.benchmarks.records import Cost, Record, Run
+from ctsim.benchmarks.run import repetition
 from ctsim.errors import InputError
-from phantoms.scene import scene_id
+from ctsim.phantoms.scene import scene_id
 
 PAPER = paper_layout.load()
 TABLES = {table.number: table for table in PAPER.table}
@@ -217,8 +217,8 @@ def test_the_commands_are_understood_and_make_the_label_of_the_cell():
 
     import tyro
 
-    from benchmarks.cli_run import Arguments
-    from benchmarks.methods import Method, parse_overrides
+    from ctsim.benchmarks.cli_run import Arguments
+    from ctsim.benchmarks.methods import Method, parse_overrides
 
     for table in PAPER.table:
         for row in table.rows:

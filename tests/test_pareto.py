@@ -18,7 +18,7 @@ import torch
 import tyro
 from conftest import SMALLEST
 
-from benchmarks import (
+from ctsim.benchmarks import (
     cli,
     pareto,
     pareto_jobs,
@@ -26,10 +26,10 @@ from benchmarks import (
     pareto_simulator,
     pareto_suite,
 )
-from benchmarks.limited import Limited
-from benchmarks.methods import TABLE
-from benchmarks.pareto_records import read
-from benchmarks.peer_cases import relative
+from ctsim.benchmarks.limited import Limited
+from ctsim.benchmarks.methods import TABLE
+from ctsim.benchmarks.pareto_records import read
+from ctsim.benchmarks.peer_cases import relative
 from ctsim.settings import Simulation
 from ctsim.types import Volume
 
@@ -183,7 +183,7 @@ def test_a_file_that_is_wrong_is_said_in_one_sentence(text, says, tmp_path, monk
 
 def slow(scan, *, device, iterations=2):
     """Take 5 s to begin, 1 s an iteration and 2 s to end, on the test's clock."""
-    from reconstruct.watch import Stopwatch
+    from ctsim.reconstruct.watch import Stopwatch
 
     CLOCK[0] += 5
     watch = Stopwatch()

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks import lines, pareto, pareto_figure, pareto_table
-from benchmarks.host import host
-from benchmarks.pareto_front import beaten_by, faster, front, knee
-from benchmarks.pareto_records import (
+from ctsim.benchmarks import lines, pareto, pareto_figure, pareto_table
+from ctsim.benchmarks.host import host
+from ctsim.benchmarks.pareto_front import beaten_by, faster, front, knee
+from ctsim.benchmarks.pareto_records import (
     VERSION,
     Mark,
     Setting,

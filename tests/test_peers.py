@@ -6,16 +6,27 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks import cli, host, lines, peer_cases, peer_catalogue, peer_poly, peer_rtk, peer_tables, peer_xcist, peers
-from benchmarks.peer_cases import OURS, RTK, XCIST, Measurement
+from ctsim.benchmarks import (
+    cli,
+    host,
+    lines,
+    peer_cases,
+    peer_catalogue,
+    peer_poly,
+    peer_rtk,
+    peer_tables,
+    peer_xcist,
+    peers,
+)
+from ctsim.benchmarks.peer_cases import OURS, RTK, XCIST, Measurement
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.phantoms.shapes import cylinder
 from ctsim.project import Tracer, path_lengths
 from ctsim.quadrature import full_rule
 from ctsim.spectrum import spectrum
 from ctsim.types import Phantom
 from ctsim.voxelise import fractions
-from phantoms.shapes import cylinder
 
 # not a cube, nor square, nor centred, so that no two axes can be exchanged or turned round unseen
 GEOMETRY = Geometry(
@@ -404,7 +415,7 @@ def test_repeats_must_be_positive(tmp_path):
 
 def test_help_imports_nothing_heavy():
     code = (
-        "import sys\nfrom benchmarks.peers import main\n"
+        "import sys\nfrom ctsim.benchmarks.peers import main\n"
         "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
         "assert not {'numba', 'torch', 'itk', 'gecatsim', 'scipy', 'pandas'} & set(sys.modules), sorted(sys.modules)\n"
     )

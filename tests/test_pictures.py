@@ -15,12 +15,12 @@ from test_paper_tables import record
 from test_pareto_points import setting, timed
 from test_run import GEOMETRY, Double, double, once
 
-from benchmarks import panels, pareto_figure
-from benchmarks.panels import Row, draw
-from benchmarks.pareto_records import points
-from benchmarks.protocol import truth_of
-from benchmarks.volumes import write_volume
-from reports import figures, view
+from ctsim.benchmarks import panels, pareto_figure
+from ctsim.benchmarks.panels import Row, draw
+from ctsim.benchmarks.pareto_records import points
+from ctsim.benchmarks.protocol import truth_of
+from ctsim.benchmarks.volumes import write_volume
+from ctsim.reports import figures, view
 
 # what matplotlib cannot parse as mathematics, what it would draw as such, and an escape of its own
 TEXTS = ("my_m[path=$HOME/x_{$]", "a$b$c", r"\$1, $2 \$")

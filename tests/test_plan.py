@@ -4,13 +4,13 @@ import tracemalloc
 
 import numpy as np
 
+from ctsim.phantoms.bodies import Validation
+from ctsim.phantoms.recipes import build_recipe
+from ctsim.phantoms.scanners import preset
 from ctsim.plan import make_plan
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import simulate_views, truth_volumes
 from ctsim.types import Scanner
-from phantoms.bodies import Validation
-from phantoms.recipes import build_recipe
-from phantoms.scanners import preset
 
 
 def scene(n: int, metal: str = "Fe"):

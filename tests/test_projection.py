@@ -7,13 +7,13 @@ import pytest
 import torch
 from conftest import SMALLEST
 
-from benchmarks import make_dataset, projection
-from benchmarks.judge import Judge, Twin
-from benchmarks.projection import REGIONS, HeldOut, half_way, held_out, projection_score, with_floor
-from benchmarks.protocol import truth_of
+from ctsim.benchmarks import make_dataset, projection
+from ctsim.benchmarks.judge import Judge, Twin
+from ctsim.benchmarks.projection import REGIONS, HeldOut, half_way, held_out, projection_score, with_floor
+from ctsim.benchmarks.protocol import truth_of
 from ctsim.geometry import Geometry
+from ctsim.reconstruct.projector import forward
 from ctsim.store import list_scans, open_scan
-from reconstruct.projector import forward
 
 GEOMETRY = Geometry(
     dso=100.0, dsd=150.0, n_voxel=(5, 7, 11), d_voxel=(1.0, 1.0, 1.0), n_detector=(8, 12), d_detector=(1.5, 1.5),

@@ -6,11 +6,11 @@ import pytest
 
 from ctsim.errors import InputError
 from ctsim.materials import material
+from ctsim.phantoms.body_volume import CtVolume
+from ctsim.phantoms.fields import Noise, supply_tree
+from ctsim.phantoms.recipes import BUILDERS, NAMES, build_recipe
+from ctsim.phantoms.scanners import REACH
 from ctsim.solids import BOX, CAPSULE, ELLIPSOID, FRUSTUM, Primitive
-from phantoms.body_volume import CtVolume
-from phantoms.fields import Noise, supply_tree
-from phantoms.recipes import BUILDERS, NAMES, build_recipe
-from phantoms.scanners import REACH
 
 DRAWN = {name: kind for name, kind in zip(NAMES, BUILDERS, strict=True) if kind is not CtVolume}  # no file needed
 KINDS = pytest.mark.parametrize("kind", DRAWN.values(), ids=DRAWN)

@@ -5,10 +5,10 @@ import sys
 import msgspec
 import pytest
 
-from benchmarks import cli, methods, records, tables
-from benchmarks.host import host, measured
-from benchmarks.protocol import Score
-from benchmarks.records import Record, Run
+from ctsim.benchmarks import cli, methods, records, tables
+from ctsim.benchmarks.host import host, measured
+from ctsim.benchmarks.protocol import Score
+from ctsim.benchmarks.records import Record, Run
 from ctsim.errors import InputError
 
 

@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks import cli, cli_run, host, lines, make_dataset, stress_records, tables
-from benchmarks.volumes import at_50kev_of, write_volume
+from ctsim.benchmarks import cli, cli_run, host, lines, make_dataset, stress_records, tables
+from ctsim.benchmarks.volumes import at_50kev_of, write_volume
 from ctsim.errors import InputError
-from reports import figures, kept, markdown, report, slices, view
+from ctsim.reports import figures, kept, markdown, report, slices, view
 
 ROOT = Path(__file__).parents[1]
 METHODS = ("fdk", "limar", "nmar")
@@ -331,8 +331,7 @@ def test_a_dataset_of_other_scans_is_refused(case, results, monkeypatch):
 
 def test_every_subcommand_names_a_module_that_is_there():
     for name, module in cli.OTHERS.items():
-        where = module if "." in module else f"benchmarks.{module}"
-        assert importlib.util.find_spec(where) is not None, name
+        assert importlib.util.find_spec(module) is not None, name
 
 
 def test_the_readmes_command_is_understood():

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import artefact, attempt, cli, cli_run, intermediates, methods, records, run
-from benchmarks.panels import Row, cut, draw, write_panels
-from benchmarks.protocol import truth_of
-from benchmarks.tables import caption
-from benchmarks.volumes import at_50kev_of, identity_of, read_volume, write_volume
+from ctsim.benchmarks import artefact, attempt, cli, cli_run, intermediates, methods, records, run
+from ctsim.benchmarks.panels import Row, cut, draw, write_panels
+from ctsim.benchmarks.protocol import truth_of
+from ctsim.benchmarks.tables import caption
+from ctsim.benchmarks.volumes import at_50kev_of, identity_of, read_volume, write_volume
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.scaninfo import ScanInfo
@@ -433,7 +433,7 @@ def test_a_disk_that_cannot_be_written_is_one_sentence(tmp_path, monkeypatch, ca
 
 def test_help_loads_nothing_heavy():
     script = (
-        "import sys\nfrom benchmarks.cli import run_benchmark\nsys.argv = ['run-benchmark', '--help']\n"
+        "import sys\nfrom ctsim.benchmarks.cli import run_benchmark\nsys.argv = ['run-benchmark', '--help']\n"
         "try:\n    run_benchmark()\nexcept SystemExit:\n    pass\n"
         "heavy = {'torch', 'numba', 'pandas', 'matplotlib', 'scipy', 'skimage'} & set(sys.modules)\n"
         "sys.exit(f'loaded {heavy}' if heavy else 0)\n"

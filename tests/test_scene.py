@@ -13,13 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctsim.errors import InputError
+from ctsim.phantoms.recipes import NAMES
+from ctsim.phantoms.scanners import MACHINES, ScannerSettings, preset
+from ctsim.phantoms.scene import Scene, build, load_suite, parse_suite, scene_id, scene_to_toml, stream_id
 from ctsim.plan import make_plan
 from ctsim.settings import Truth
 from ctsim.simulate import simulate_views
 from ctsim.writer import SceneWriter
-from phantoms.recipes import NAMES
-from phantoms.scanners import MACHINES, ScannerSettings, preset
-from phantoms.scene import Scene, build, load_suite, parse_suite, scene_id, scene_to_toml, stream_id
 
 SUITES = Path(__file__).parent.parent / "benchmarks" / "suites"
 

@@ -8,14 +8,14 @@ import pytest
 from test_run import double
 from test_tables import record
 
-from benchmarks import cli_run, estimates, records, run, schedule, tables
-from benchmarks.estimates import FDKS, fdk_seconds, in_fdks
-from benchmarks.methods import TABLE, Method, find
-from benchmarks.schedule import Costs, ordered
-from benchmarks.workers import Lost
+from ctsim.benchmarks import cli_run, estimates, records, run, schedule, tables
+from ctsim.benchmarks.estimates import FDKS, fdk_seconds, in_fdks
+from ctsim.benchmarks.methods import TABLE, Method, find
+from ctsim.benchmarks.schedule import Costs, ordered
+from ctsim.benchmarks.workers import Lost
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from reconstruct.splat.course import PASSES
+from ctsim.reconstruct.splat.course import PASSES
 
 OPTIONS = run.Options(keep_volumes=False)
 CIRCLE = Geometry(

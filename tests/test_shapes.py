@@ -7,8 +7,8 @@ import pytest
 
 from ctsim.errors import InputError
 from ctsim.kernels import solids_cpu
+from ctsim.phantoms import shapes
 from ctsim.solids import Solid, pack
-from phantoms import shapes
 
 TILT = (0.3, -0.5, 0.7)
 

@@ -7,18 +7,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from baselines.metal import reach
+from ctsim.baselines.metal import reach
 from ctsim.geometry import Geometry
 from ctsim.kernels import raytrace_reference
 from ctsim.noise import Noise
+from ctsim.phantoms.bodies import REACH
+from ctsim.phantoms.scene import _shadow
 from ctsim.plan import make_plan
 from ctsim.project import Response, Tracer, path_lengths, transmit
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import simulate_views
 from ctsim.solids import CAPSULE, ELLIPSOID, Primitive, Solid
 from ctsim.types import Phantom, Scanner
-from phantoms.bodies import REACH
-from phantoms.scene import _shadow
 
 ORBIT = Geometry(
     dso=200.0, dsd=400.0, n_voxel=(8, 8, 8), d_voxel=(3.0, 3.0, 3.0), n_detector=(23, 31), d_detector=(2.4, 2.0),

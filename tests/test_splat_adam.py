@@ -10,12 +10,12 @@ from test_splat_project import SMALL, splats, with_
 
 from ctsim import rng
 from ctsim.errors import InputError
-from reconstruct.splat import adam, densify, loss
-from reconstruct.splat.kernels.lanes import WIDTH
-from reconstruct.splat.kernels.splat_reference import covariances
-from reconstruct.splat.model import Splats
-from reconstruct.splat.project import Gradient, Projector
-from reconstruct.splat.volume import voxelise
+from ctsim.reconstruct.splat import adam, densify, loss
+from ctsim.reconstruct.splat.kernels.lanes import WIDTH
+from ctsim.reconstruct.splat.kernels.splat_reference import covariances
+from ctsim.reconstruct.splat.model import Splats
+from ctsim.reconstruct.splat.project import Gradient, Projector
+from ctsim.reconstruct.splat.volume import voxelise
 
 RNG = np.random.default_rng(4)
 ACTIVATION = adam.activation(SMALL)

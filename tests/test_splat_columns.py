@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from ctsim.geometry import Geometry
-from reconstruct.splat.columns import LatticeProjector
-from reconstruct.splat.kernels import separable_cpu as kernels
-from reconstruct.splat.kernels import splat_reference as reference
-from reconstruct.splat.kernels.lanes import WIDTH, decay, load, spread, store
-from reconstruct.splat.lattice import Lattice
-from reconstruct.splat.project import CUTOFF, Projector
+from ctsim.reconstruct.splat.columns import LatticeProjector
+from ctsim.reconstruct.splat.kernels import separable_cpu as kernels
+from ctsim.reconstruct.splat.kernels import splat_reference as reference
+from ctsim.reconstruct.splat.kernels.lanes import WIDTH, decay, load, spread, store
+from ctsim.reconstruct.splat.lattice import Lattice
+from ctsim.reconstruct.splat.project import CUTOFF, Projector
 
 GEOMETRY = Geometry(
     dso=200.0,

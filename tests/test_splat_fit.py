@@ -9,26 +9,26 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.attempt import warm_up
-from benchmarks.make_dataset import main as make_dataset
-from benchmarks.methods import find
-from benchmarks.metrics import psnr3d
-from benchmarks.protocol import tissue_score, truth_of
+from ctsim.benchmarks.attempt import warm_up
+from ctsim.benchmarks.make_dataset import main as make_dataset
+from ctsim.benchmarks.methods import find
+from ctsim.benchmarks.metrics import psnr3d
+from ctsim.benchmarks.protocol import tissue_score, truth_of
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
+from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.splat.checkpoint import Checkpoint
+from ctsim.reconstruct.splat.course import passes_over
+from ctsim.reconstruct.splat.curve import MATERIALS, MaterialCurve
+from ctsim.reconstruct.splat.lattice import Lattice
+from ctsim.reconstruct.splat.level import Data, carve, coarser, refined, weighted
+from ctsim.reconstruct.splat.method import reconstruct
+from ctsim.reconstruct.splat.ordered import Fit, bit_reversed, step_length
+from ctsim.reconstruct.splat.response import evaluate, make_response
+from ctsim.reconstruct.watch import listen
 from ctsim.store import list_scans, open_scan
 from ctsim.types import Status
-from reconstruct.fdk import reconstruct as fdk
-from reconstruct.splat.checkpoint import Checkpoint
-from reconstruct.splat.course import passes_over
-from reconstruct.splat.curve import MATERIALS, MaterialCurve
-from reconstruct.splat.lattice import Lattice
-from reconstruct.splat.level import Data, carve, coarser, refined, weighted
-from reconstruct.splat.method import reconstruct
-from reconstruct.splat.ordered import Fit, bit_reversed, step_length
-from reconstruct.splat.response import evaluate, make_response
-from reconstruct.watch import listen
 
 GEOMETRY = Geometry(
     dso=200.0,
@@ -120,7 +120,7 @@ def test_carving_keeps_every_voxel_of_the_object_and_few_more():
     )
     z, y, x = geometry.voxel_centres()
     ball = (x - 3) ** 2 + (y[:, None] + 2) ** 2 + (z[:, None, None] - 1) ** 2 < 36
-    from reconstruct.projector import forward
+    from ctsim.reconstruct.projector import forward
 
     p = forward(torch.from_numpy(ball.astype(np.float32) * 0.02), geometry).numpy()
     kept = carve(data_of(geometry, p), 0.01)
@@ -334,7 +334,7 @@ class Interrupted(Exception):
 
 
 def test_an_interrupted_fit_goes_on_to_the_same_bits(small, tmp_path, monkeypatch):
-    monkeypatch.setattr("reconstruct.splat.checkpoint.EVERY", 0.0)
+    monkeypatch.setattr("ctsim.reconstruct.splat.checkpoint.EVERY", 0.0)
     shares: list[float] = []
 
     def interrupt(progress):

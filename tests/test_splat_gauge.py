@@ -8,9 +8,9 @@ from scipy.optimize import least_squares
 from ctsim.detector import Detector
 from ctsim.detector import response as deposit
 from ctsim.materials import attenuation
+from ctsim.reconstruct.splat.published_settings import Settings
 from ctsim.spectrum import Filter, Tube
 from ctsim.spectrum import spectrum as tube_spectrum
-from reconstruct.splat.published_settings import Settings
 
 CENTRE = 50.0  # keV, of 10 … 90
 LONGEST = {"water": 60.0, "cortical_bone": 60.0, "Fe": 20.0}  # mm

@@ -8,11 +8,11 @@ import pytest
 from test_splat_project import GEOMETRIES, SMALL, one, splats, with_
 
 from ctsim.errors import InputError
-from reconstruct.splat.kernels import gradient_reference as reference
-from reconstruct.splat.kernels.lanes import WIDTH
-from reconstruct.splat.kernels.splat_reference import forward_views
-from reconstruct.splat.model import Splats
-from reconstruct.splat.project import Projector
+from ctsim.reconstruct.splat.kernels import gradient_reference as reference
+from ctsim.reconstruct.splat.kernels.lanes import WIDTH
+from ctsim.reconstruct.splat.kernels.splat_reference import forward_views
+from ctsim.reconstruct.splat.model import Splats
+from ctsim.reconstruct.splat.project import Projector
 
 PARTS = ["densities", "positions", "scales", "rotations"]
 CUTOFF = 8.0  # exp(−32): the gradient knows no cutoff

@@ -2,8 +2,8 @@
 
 import pytest
 
-from benchmarks import splat_kernels
-from phantoms.scanners import preset
+from ctsim.benchmarks import splat_kernels
+from ctsim.phantoms.scanners import preset
 
 
 def test_every_contender_has_a_row_and_is_near_the_exact_form(tmp_path, monkeypatch, capsys):

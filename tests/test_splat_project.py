@@ -9,11 +9,11 @@ import pytest
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from reconstruct.splat import project
-from reconstruct.splat.kernels import splat_reference as reference
-from reconstruct.splat.kernels.lanes import WIDTH
-from reconstruct.splat.model import Splats
-from reconstruct.splat.project import Projector
+from ctsim.reconstruct.splat import project
+from ctsim.reconstruct.splat.kernels import splat_reference as reference
+from ctsim.reconstruct.splat.kernels.lanes import WIDTH
+from ctsim.reconstruct.splat.model import Splats
+from ctsim.reconstruct.splat.project import Projector
 
 SMALL = Geometry(
     dso=100.0,

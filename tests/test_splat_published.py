@@ -12,16 +12,16 @@ import torch
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.reconstruct.beam import detected
+from ctsim.reconstruct.splat import adam, densify
+from ctsim.reconstruct.splat.learner import LEAST_VALUE, Learner, seed_splats
+from ctsim.reconstruct.splat.objective import Objective
+from ctsim.reconstruct.splat.published import fit_published, read_out, reconstruct
+from ctsim.reconstruct.splat.published_settings import PRESETS, Settings, changed
+from ctsim.reconstruct.splat.response import evaluate
+from ctsim.reconstruct.splat.volume import voxelise
+from ctsim.reconstruct.watch import Progress, listen, watch
 from ctsim.types import Scan, Status
-from reconstruct.beam import detected
-from reconstruct.splat import adam, densify
-from reconstruct.splat.learner import LEAST_VALUE, Learner, seed_splats
-from reconstruct.splat.objective import Objective
-from reconstruct.splat.published import fit_published, read_out, reconstruct
-from reconstruct.splat.published_settings import PRESETS, Settings, changed
-from reconstruct.splat.response import evaluate
-from reconstruct.splat.volume import voxelise
-from reconstruct.watch import Progress, listen, watch
 
 GEOMETRY = Geometry(
     dso=200.0,
@@ -185,7 +185,7 @@ class Interrupted(Exception):
 
 @pytest.mark.parametrize("held_out", [0, 3])
 def test_an_interrupted_fit_goes_on_to_the_same_bits(held_out, tmp_path, monkeypatch):
-    monkeypatch.setattr("reconstruct.splat.checkpoint.EVERY", 0.0)
+    monkeypatch.setattr("ctsim.reconstruct.splat.checkpoint.EVERY", 0.0)
     often = densify.Schedule(first=5, every=7, last=20_000, most=600)
     whole = dataclasses.replace(PAPER, steps=40, schedule=often, schedule_steps=40, held_out=held_out)
     kept = dataclasses.replace(whole, checkpoints=str(tmp_path))

@@ -13,9 +13,8 @@ from ctsim.detector import Detector
 from ctsim.errors import InputError
 from ctsim.materials import attenuation
 from ctsim.quadrature import full_rule
-from ctsim.spectrum import Filter, Tube, spectrum
-from reconstruct.splat.kernels import response_reference as reference
-from reconstruct.splat.response import (
+from ctsim.reconstruct.splat.kernels import response_reference as reference
+from ctsim.reconstruct.splat.response import (
     SCINTILLATOR,
     Basis,
     Name,
@@ -26,6 +25,7 @@ from reconstruct.splat.response import (
     theta_gradient,
     theta_sums,
 )
+from ctsim.spectrum import Filter, Tube, spectrum
 
 E_MAX = 90.0
 NAMES = get_args(Name)

@@ -8,12 +8,12 @@ import torch
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from reconstruct.projector import forward
-from reconstruct.splat.kernels import splat_reference as reference
-from reconstruct.splat.kernels.lanes import WIDTH
-from reconstruct.splat.model import Splats
-from reconstruct.splat.project import Projector
-from reconstruct.splat.volume import voxelise, voxelise_adjoint
+from ctsim.reconstruct.projector import forward
+from ctsim.reconstruct.splat.kernels import splat_reference as reference
+from ctsim.reconstruct.splat.kernels.lanes import WIDTH
+from ctsim.reconstruct.splat.model import Splats
+from ctsim.reconstruct.splat.project import Projector
+from ctsim.reconstruct.splat.volume import voxelise, voxelise_adjoint
 
 SMALL = Geometry(
     dso=100.0,

@@ -12,8 +12,8 @@ import tifffile
 import torch
 from small_scan import GEOMETRY, STACKS, one_view, volume, write
 
-from benchmarks import cli
 from ctsim import store
+from ctsim.benchmarks import cli
 from ctsim.errors import InputError
 from ctsim.manifest import INDEX, MANIFEST, IndexLine, read_index
 from ctsim.store import list_scans, open_scan, verify
@@ -155,7 +155,7 @@ def test_a_manifest_that_names_another_folder_is_refused(tmp_path, name, capsys)
         open_scan(folder)
     assert ["names the scene" in p for p in verify(tmp_path / "data")] == [True]
     results = tmp_path / "x" / "y" / "results"
-    command = ("run-benchmark", "benchmarks.cli_run", [str(tmp_path / "data"), str(results), "--scene", name])
+    command = ("run-benchmark", "ctsim.benchmarks.cli_run", [str(tmp_path / "data"), str(results), "--scene", name])
     assert cli.guarded(*command) == 2
     assert "names the scene" in capsys.readouterr().err and {p.name for p in tmp_path.iterdir()} == {"data"}
 

@@ -7,29 +7,29 @@ import numpy as np
 import pytest
 from stress_ends import ENDS, catalogue
 
-from baselines.known_spectrum import Beam
-from benchmarks import stress, stress_chain, stress_methods, stress_records, stress_simulator, stress_splats
-from benchmarks.methods import TABLE, find
-from benchmarks.stress_cases import Findings, carry_out
-from benchmarks.stress_scans import BONE, USUAL, WATER, example, geometry, in_air, rod
-from benchmarks.stress_suite import load
-from benchmarks.stress_worker import Worker
 from ctsim import plan
+from ctsim.baselines.known_spectrum import Beam
+from ctsim.benchmarks import stress, stress_chain, stress_methods, stress_records, stress_simulator, stress_splats
+from ctsim.benchmarks.methods import TABLE, find
+from ctsim.benchmarks.stress_cases import Findings, carry_out
+from ctsim.benchmarks.stress_scans import BONE, USUAL, WATER, example, geometry, in_air, rod
+from ctsim.benchmarks.stress_suite import load
+from ctsim.benchmarks.stress_worker import Worker
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.noise import Noise
 from ctsim.quadrature import gauss_rule
+from ctsim.reconstruct import log
+from ctsim.reconstruct.log import line_integrals
+from ctsim.reconstruct.splat import course, level, ordered
+from ctsim.reconstruct.splat.kernels.lanes import WIDTH
+from ctsim.reconstruct.splat.learner import seed_splats
+from ctsim.reconstruct.splat.loss import l1_ssim
+from ctsim.reconstruct.splat.objective import Objective
+from ctsim.reconstruct.splat.project import Projector
+from ctsim.reconstruct.splat.published_settings import Settings
 from ctsim.spectrum import Tube
 from ctsim.types import Scanner
-from reconstruct import log
-from reconstruct.log import line_integrals
-from reconstruct.splat import course, level, ordered
-from reconstruct.splat.kernels.lanes import WIDTH
-from reconstruct.splat.learner import seed_splats
-from reconstruct.splat.loss import l1_ssim
-from reconstruct.splat.objective import Objective
-from reconstruct.splat.project import Projector
-from reconstruct.splat.published_settings import Settings
 
 SMALLEST = 12
 SUBJECTS = [method.label for method in stress_methods.subjects()]
@@ -126,7 +126,7 @@ class Here:
 
 @pytest.fixture
 def command(monkeypatch, tmp_path):
-    monkeypatch.setattr("benchmarks.stress_worker.Worker", Here)
+    monkeypatch.setattr("ctsim.benchmarks.stress_worker.Worker", Here)
     monkeypatch.setattr(stress, "catalogue", lambda *_: catalogue()[:3])
     Here.ran = 0
     return lambda *words: stress.main([str(tmp_path / "out"), "--short", *words])
@@ -180,7 +180,9 @@ def error(given):
 
 def everywhere(monkeypatch, name, value):
     """Replace a function of the splat package in every module of it that has it."""
-    for module in [m for key, m in sys.modules.items() if key.startswith("reconstruct.splat") and hasattr(m, name)]:
+    for module in [
+        m for key, m in sys.modules.items() if key.startswith("ctsim.reconstruct.splat") and hasattr(m, name)
+    ]:
         monkeypatch.setattr(module, name, value)
 
 

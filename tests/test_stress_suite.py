@@ -9,11 +9,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks import stress, stress_methods, stress_records
-from benchmarks.stress_cases import Findings, carry_out
-from benchmarks.stress_changes import Filled, Magnified, Rounded, Turned, Twice
-from benchmarks.stress_scans import BODY, USUAL, Circle, OfSide, geometry
-from benchmarks.stress_suite import Scene, load
+from ctsim.benchmarks import stress, stress_methods, stress_records
+from ctsim.benchmarks.stress_cases import Findings, carry_out
+from ctsim.benchmarks.stress_changes import Filled, Magnified, Rounded, Turned, Twice
+from ctsim.benchmarks.stress_scans import BODY, USUAL, Circle, OfSide, geometry
+from ctsim.benchmarks.stress_suite import Scene, load
 from ctsim.errors import InputError
 
 SIDE = 8

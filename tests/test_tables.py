@@ -10,10 +10,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks import latex, records, tables
-from benchmarks.protocol import Score
-from benchmarks.records import Cost, Record, Run
-from benchmarks.texts import escape, ranked
+from ctsim.benchmarks import latex, records, tables
+from ctsim.benchmarks.protocol import Score
+from ctsim.benchmarks.records import Cost, Record, Run
+from ctsim.benchmarks.texts import escape, ranked
 from ctsim.errors import InputError
 
 

@@ -5,11 +5,11 @@ import pytest
 import torch
 from iterative_scans import GEOMETRY, MU, RADIUS, TINY, distance, matrix, one_thread, scan_of, sphere, tiny  # noqa: F401
 
-from baselines.iterative import System, watch
-from baselines.sart import sart
-from baselines.tv_methods import asd_pocs, awpcsd, fista_tv
-from reconstruct.projector import forward
-from reconstruct.tv import Denoiser, axis_ratios, descend, total_variation
+from ctsim.baselines.iterative import System, watch
+from ctsim.baselines.sart import sart
+from ctsim.baselines.tv_methods import asd_pocs, awpcsd, fista_tv
+from ctsim.reconstruct.projector import forward
+from ctsim.reconstruct.tv import Denoiser, axis_ratios, descend, total_variation
 
 
 def test_fista_keeps_its_promise():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from reconstruct import watch as module
-from reconstruct.watch import Progress, Stopwatch, listen, watch
+from ctsim.reconstruct import watch as module
+from ctsim.reconstruct.watch import Progress, Stopwatch, listen, watch
 
 
 class Clock:

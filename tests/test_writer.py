@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from small_scan import STACKS, content, one_view, write
 
-from benchmarks.make_dataset import main
 from ctsim import durable, folder
+from ctsim.benchmarks.make_dataset import main
 from ctsim.errors import InputError
 from ctsim.manifest import INDEX, mend_index, read_index, read_manifest
 from ctsim.store import list_scans, open_scan, verify
@@ -228,7 +228,7 @@ scanner = {{ n_voxel = {n_voxel}, n_detector = {n_detector}, n_views = 40 }}
 """
 LIMITED = """
 import resource, sys
-from benchmarks.cli import make_dataset
+from ctsim.benchmarks.cli import make_dataset
 resource.setrlimit(resource.RLIMIT_FSIZE, (10**6, 10**6))
 sys.exit(make_dataset())
 """

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from reconstruct.splat.model import Splats
-from reconstruct.splat.project import Gradient
+from ctsim.reconstruct.splat.model import Splats
+from ctsim.reconstruct.splat.project import Gradient
 
 Array = NDArray[np.float32]
 Parameters = Mapping[str, Array]

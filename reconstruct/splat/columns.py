@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.geometry import Geometry
-from reconstruct.splat.kernels import separable_cpu as kernels
-from reconstruct.splat.kernels.lanes import WIDTH
-from reconstruct.splat.kernels.splat_cpu import DEPTH, DUAL_U, DUAL_V
-from reconstruct.splat.lattice import Lattice
-from reconstruct.splat.project import Projector
+from ctsim.reconstruct.splat.kernels import separable_cpu as kernels
+from ctsim.reconstruct.splat.kernels.lanes import WIDTH
+from ctsim.reconstruct.splat.kernels.splat_cpu import DEPTH, DUAL_U, DUAL_V
+from ctsim.reconstruct.splat.lattice import Lattice
+from ctsim.reconstruct.splat.project import Projector
 
 LEVEL = 1e-9  # share of a vector that may point along z, or across
 Image = NDArray[np.float32]

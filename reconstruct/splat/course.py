@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.geometry import Geometry
-from reconstruct.splat.curve import MaterialCurve
-from reconstruct.splat.lattice import Lattice
-from reconstruct.splat.level import Data, carve, coarser, refined
-from reconstruct.splat.ordered import Fit
-from reconstruct.splat.response import Response
+from ctsim.reconstruct.splat.curve import MaterialCurve
+from ctsim.reconstruct.splat.lattice import Lattice
+from ctsim.reconstruct.splat.level import Data, carve, coarser, refined
+from ctsim.reconstruct.splat.ordered import Fit
+from ctsim.reconstruct.splat.response import Response
 
 EMPTY = 0.05  # times water: a voxel of the coarser volume below that holds no splat
 SMALLEST = 24  # voxels along an axis below which there is no coarser level

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from ctsim.materials import attenuation
-from reconstruct.splat.kernels import curve_cpu
-from reconstruct.splat.response import Response, tangent
+from ctsim.reconstruct.splat.kernels import curve_cpu
+from ctsim.reconstruct.splat.response import Response, tangent
 
 MATERIALS = ("water", "cortical_bone", "Al", "Ti", "Fe")
 DEEPEST = 8.0  # of P, to which a material's own hardening is fitted

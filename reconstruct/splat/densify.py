@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from ctsim import rng
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from reconstruct.splat.adam import Array, Moments, unit_length
-from reconstruct.splat.kernels.rotations_cpu import write_rotations
-from reconstruct.splat.model import Splats
+from ctsim.reconstruct.splat.adam import Array, Moments, unit_length
+from ctsim.reconstruct.splat.kernels.rotations_cpu import write_rotations
+from ctsim.reconstruct.splat.model import Splats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -20,19 +20,19 @@ from numpy.typing import NDArray
 from ctsim.detector import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.reconstruct.beam import Given, detected, refuse_beam
+from ctsim.reconstruct.log import how_it_ended, line_integrals
+from ctsim.reconstruct.scatter import open_excess
+from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
+from ctsim.reconstruct.splat.course import PASSES, Course, levels_of, passes_over
+from ctsim.reconstruct.splat.curve import STRONGEST, MaterialCurve
+from ctsim.reconstruct.splat.level import Data, weighted
+from ctsim.reconstruct.splat.ordered import Fit
+from ctsim.reconstruct.splat.response import Response, basis_functions, evaluate, make_response, tangent
+from ctsim.reconstruct.splat.volume import voxelise
+from ctsim.reconstruct.watch import Stopwatch
 from ctsim.spectrum import Tube
 from ctsim.types import Scan, Status, Volume
-from reconstruct.beam import Given, detected, refuse_beam
-from reconstruct.log import how_it_ended, line_integrals
-from reconstruct.scatter import open_excess
-from reconstruct.splat.checkpoint import Checkpoint, identity_of
-from reconstruct.splat.course import PASSES, Course, levels_of, passes_over
-from reconstruct.splat.curve import STRONGEST, MaterialCurve
-from reconstruct.splat.level import Data, weighted
-from reconstruct.splat.ordered import Fit
-from reconstruct.splat.response import Response, basis_functions, evaluate, make_response, tangent
-from reconstruct.splat.volume import voxelise
-from reconstruct.watch import Stopwatch
 
 OPEN = 5.0  # standard deviations of an open pixel below which a ray met nothing
 LEAST_OPEN = 0.01

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from ctsim.geometry import Geometry
-from reconstruct.splat.kernels import step_cpu
-from reconstruct.splat.model import Splats
-from reconstruct.tv import Denoiser, axis_ratios
+from ctsim.reconstruct.splat.kernels import step_cpu
+from ctsim.reconstruct.splat.model import Splats
+from ctsim.reconstruct.tv import Denoiser, axis_ratios
 
 SIGMA = 0.45
 """σ of a splat in voxels: wider ones, not negative, cannot make the edges of a volume of this grid."""

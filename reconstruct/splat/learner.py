@@ -16,13 +16,13 @@ from scipy.spatial import KDTree
 
 from ctsim import rng
 from ctsim.geometry import Geometry
-from reconstruct.fdk import fdk
-from reconstruct.splat import adam, densify
-from reconstruct.splat.adam import Array, Moments
-from reconstruct.splat.model import Splats
-from reconstruct.splat.objective import Objective, stream
-from reconstruct.splat.published_settings import ALONE, RATES, START, Settings
-from reconstruct.splat.response import Response
+from ctsim.reconstruct.fdk import fdk
+from ctsim.reconstruct.splat import adam, densify
+from ctsim.reconstruct.splat.adam import Array, Moments
+from ctsim.reconstruct.splat.model import Splats
+from ctsim.reconstruct.splat.objective import Objective, stream
+from ctsim.reconstruct.splat.published_settings import ALONE, RATES, START, Settings
+from ctsim.reconstruct.splat.response import Response
 
 LEAST_VALUE = 0.005  # 1/mm, of a voxel that may be a seed
 NEIGHBOURS = 3  # whose distance is a splat's first scale

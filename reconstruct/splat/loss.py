@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from ctsim import rng
 from ctsim.geometry import Geometry
-from reconstruct.splat.kernels import ssim_cpu as kernels
+from ctsim.reconstruct.splat.kernels import ssim_cpu as kernels
 
 Image = NDArray[np.floating]
 SSIM_SHARE = 0.25

@@ -9,9 +9,9 @@ from typing import Any, Literal
 import torch
 
 from ctsim.errors import InputError
+from ctsim.reconstruct.settings import keywords
+from ctsim.reconstruct.splat import fast, published
 from ctsim.types import Scan, Volume
-from reconstruct.settings import keywords
-from reconstruct.splat import fast, published
 
 PRESETS = ("fast", "paper", "r2")
 
@@ -20,7 +20,7 @@ PRESETS = ("fast", "paper", "r2")
 class Options:
     """What any preset may be told; None leaves what the preset says.
 
-    Those down to `detector` are of `reconstruct.splat.fast.Settings`, those from `basis` on of
+    Those down to `detector` are of `ctsim.reconstruct.splat.fast.Settings`, those from `basis` on of
     `published_settings.Settings`; `seconds`, `checkpoints`, `response`, `readout`, `tube` and `detector` are of both.
     """
 

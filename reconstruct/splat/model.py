@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.errors import InputError
-from reconstruct.splat.kernels.rotations_cpu import write_rotations
+from ctsim.reconstruct.splat.kernels.rotations_cpu import write_rotations
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,17 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.reconstruct.log import line_integrals
+from ctsim.reconstruct.splat import adam
+from ctsim.reconstruct.splat import response as responses
+from ctsim.reconstruct.splat.adam import Activation, Array
+from ctsim.reconstruct.splat.loss import brick, l1_ssim, total_variation
+from ctsim.reconstruct.splat.model import Splats
+from ctsim.reconstruct.splat.project import Projector
+from ctsim.reconstruct.splat.published_settings import Settings
+from ctsim.reconstruct.splat.response import Response
+from ctsim.reconstruct.splat.volume import voxelise, voxelise_adjoint
 from ctsim.types import Scan
-from reconstruct.log import line_integrals
-from reconstruct.splat import adam
-from reconstruct.splat import response as responses
-from reconstruct.splat.adam import Activation, Array
-from reconstruct.splat.loss import brick, l1_ssim, total_variation
-from reconstruct.splat.model import Splats
-from reconstruct.splat.project import Projector
-from reconstruct.splat.published_settings import Settings
-from reconstruct.splat.response import Response
-from reconstruct.splat.volume import voxelise, voxelise_adjoint
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

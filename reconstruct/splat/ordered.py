@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruct.splat.columns import LatticeProjector
-from reconstruct.splat.curve import METAL, MaterialCurve
-from reconstruct.splat.kernels import step_cpu
-from reconstruct.splat.lattice import Lattice
-from reconstruct.splat.level import Data
-from reconstruct.splat.response import Response, evaluate
-from reconstruct.splat.volume import voxelise
+from ctsim.reconstruct.splat.columns import LatticeProjector
+from ctsim.reconstruct.splat.curve import METAL, MaterialCurve
+from ctsim.reconstruct.splat.kernels import step_cpu
+from ctsim.reconstruct.splat.lattice import Lattice
+from ctsim.reconstruct.splat.level import Data
+from ctsim.reconstruct.splat.response import Response, evaluate
+from ctsim.reconstruct.splat.volume import voxelise
 
 SUBSET, LEAST_SUBSETS = 10, 8
 """Views in a subset, fewer where there would be too few subsets."""

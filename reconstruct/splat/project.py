@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from reconstruct.projector import Views, view_indices
-from reconstruct.splat.kernels import gradient_cpu
-from reconstruct.splat.kernels import splat_cpu as kernels
-from reconstruct.splat.kernels.lanes import WIDTH
-from reconstruct.splat.model import Splats
+from ctsim.reconstruct.projector import Views, view_indices
+from ctsim.reconstruct.splat.kernels import gradient_cpu
+from ctsim.reconstruct.splat.kernels import splat_cpu as kernels
+from ctsim.reconstruct.splat.kernels.lanes import WIDTH
+from ctsim.reconstruct.splat.model import Splats
 
 CUTOFF = 3.5
 """Mahalanobis radius beyond which a splat is zero."""

@@ -14,17 +14,17 @@ import torch
 from numpy.typing import NDArray
 
 from ctsim.errors import InputError
+from ctsim.reconstruct.log import NO_SIGNAL, is_blind
+from ctsim.reconstruct.splat.adam import Array
+from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
+from ctsim.reconstruct.splat.learner import LEAST_VALUE, Learner, seed_splats, splats_of
+from ctsim.reconstruct.splat.model import Splats
+from ctsim.reconstruct.splat.objective import Objective
+from ctsim.reconstruct.splat.published_settings import Changes, Settings, changed
+from ctsim.reconstruct.splat.response import Response, basis_functions, tangent
+from ctsim.reconstruct.splat.volume import voxelise
+from ctsim.reconstruct.watch import Stopwatch
 from ctsim.types import Scan, Status, Volume
-from reconstruct.log import NO_SIGNAL, is_blind
-from reconstruct.splat.adam import Array
-from reconstruct.splat.checkpoint import Checkpoint, identity_of
-from reconstruct.splat.learner import LEAST_VALUE, Learner, seed_splats, splats_of
-from reconstruct.splat.model import Splats
-from reconstruct.splat.objective import Objective
-from reconstruct.splat.published_settings import Changes, Settings, changed
-from reconstruct.splat.response import Response, basis_functions, tangent
-from reconstruct.splat.volume import voxelise
-from reconstruct.watch import Stopwatch
 
 VIEWS = 12  # that the hardening of the read-out is measured in
 BETTER = 1e-3  # share by which held-out views must be met better to count

@@ -14,11 +14,11 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypedDict, get_args
 
 from ctsim.errors import InputError
-from reconstruct.beam import Given, detected, refuse_beam
-from reconstruct.splat import response as responses
-from reconstruct.splat.densify import Schedule
-from reconstruct.splat.loss import TV_SHARE
-from reconstruct.splat.response import Response, make_response
+from ctsim.reconstruct.beam import Given, detected, refuse_beam
+from ctsim.reconstruct.splat import response as responses
+from ctsim.reconstruct.splat.densify import Schedule
+from ctsim.reconstruct.splat.loss import TV_SHARE
+from ctsim.reconstruct.splat.response import Response, make_response
 
 Preset = Literal["paper", "r2"]
 Basis = Literal["paper", "klein-nishina", "constant", "photoelectric"]

@@ -24,9 +24,9 @@ from ctsim.detector import response as deposit
 from ctsim.errors import InputError
 from ctsim.materials import attenuation
 from ctsim.quadrature import P_MAX, gauss_rule
+from ctsim.reconstruct.splat.kernels import response_cpu, response_reference
 from ctsim.spectrum import Filter, Spectrum, Tube
 from ctsim.spectrum import spectrum as tube_spectrum
-from reconstruct.splat.kernels import response_cpu, response_reference
 
 Name = Literal["paper", "hinge", "tube", "known", "mono", "sinh", "gmm", "free"]
 Basis = Literal["paper", "klein-nishina"]

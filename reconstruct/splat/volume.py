@@ -5,10 +5,10 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from reconstruct.splat.kernels import voxelise_cpu as kernels
-from reconstruct.splat.kernels.lanes import WIDTH
-from reconstruct.splat.model import Splats
-from reconstruct.splat.project import CUTOFF
+from ctsim.reconstruct.splat.kernels import voxelise_cpu as kernels
+from ctsim.reconstruct.splat.kernels.lanes import WIDTH
+from ctsim.reconstruct.splat.model import Splats
+from ctsim.reconstruct.splat.project import CUTOFF
 
 
 def voxelise(

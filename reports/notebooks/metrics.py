@@ -25,9 +25,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks import inspector
-from reports import kept, show
-from reports.figures import COLOURS, INK
+from ctsim.benchmarks import inspector
+from ctsim.reports import kept, show
+from ctsim.reports.figures import COLOURS, INK
 
 DATA, RESULTS = (Path(os.environ.get(f"CTSIM_{name.upper()}", name)) for name in ("data", "results"))
 case = kept.open_case(DATA, RESULTS)

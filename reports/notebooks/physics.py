@@ -26,17 +26,17 @@ from matplotlib.figure import Figure
 
 from ctsim.materials import attenuation
 from ctsim.noise import detect
+from ctsim.phantoms.scene import build, load_suite, stream_id
 from ctsim.plan import make_plan
 from ctsim.project import Response, Tracer, path_lengths, transmit
 from ctsim.quadrature import effective_weights, full_rule
+from ctsim.reconstruct.fdk import reconstruct
+from ctsim.reconstruct.log import line_integrals
+from ctsim.reports import show
+from ctsim.reports.figures import COLOURS
 from ctsim.rng import stream_key
 from ctsim.simulate import compact
 from ctsim.store import list_scans, open_scan
-from phantoms.scene import build, load_suite, stream_id
-from reconstruct.fdk import reconstruct
-from reconstruct.log import line_integrals
-from reports import show
-from reports.figures import COLOURS
 
 DATA = Path(os.environ.get("CTSIM_DATA", "data"))
 stored = open_scan(list_scans(DATA)[0])

@@ -20,10 +20,10 @@
 import os
 from pathlib import Path
 
-from benchmarks.records import read_all
-from benchmarks.tables import render
+from ctsim.benchmarks.records import read_all
+from ctsim.benchmarks.tables import render
 from ctsim.errors import InputError
-from reports import figures, kept, show
+from ctsim.reports import figures, kept, show
 
 DATA, RESULTS = (Path(os.environ.get(f"CTSIM_{name.upper()}", name)) for name in ("data", "results"))
 records, _ = read_all(RESULTS)

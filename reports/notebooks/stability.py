@@ -26,19 +26,19 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from benchmarks import stress_records
-from benchmarks.texts import pictured
+from ctsim.benchmarks import stress_records
+from ctsim.benchmarks.texts import pictured
 from ctsim.detector import Detector
 from ctsim.geometry import Geometry
 from ctsim.kernels import joseph_reference
 from ctsim.materials import attenuation
 from ctsim.quadrature import energy_rule
+from ctsim.reconstruct.fdk import reconstruct
+from ctsim.reconstruct.projector import adjoint, forward
+from ctsim.reports import show
+from ctsim.reports.figures import COLOURS
 from ctsim.spectrum import Tube, spectrum
 from ctsim.store import list_scans, open_scan
-from reconstruct.fdk import reconstruct
-from reconstruct.projector import adjoint, forward
-from reports import show
-from reports.figures import COLOURS
 
 DATA, RESULTS = (Path(os.environ.get(f"CTSIM_{name.upper()}", name)) for name in ("data", "results"))
 

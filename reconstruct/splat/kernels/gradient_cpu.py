@@ -15,8 +15,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from reconstruct.splat.kernels.lanes import WIDTH, add, fma, load, mul, ramp, spread, total
-from reconstruct.splat.kernels.splat_cpu import (
+from ctsim.reconstruct.splat.kernels.lanes import WIDTH, add, fma, load, mul, ramp, spread, total
+from ctsim.reconstruct.splat.kernels.splat_cpu import (
     C_UU,
     C_UV,
     C_VV,

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruct.splat.kernels.lanes import WIDTH
-from reconstruct.splat.kernels.splat_reference import rotation_matrices, shadow, spreads, weights
+from ctsim.reconstruct.splat.kernels.lanes import WIDTH
+from ctsim.reconstruct.splat.kernels.splat_reference import rotation_matrices, shadow, spreads, weights
 
 Array = NDArray[np.floating]
 

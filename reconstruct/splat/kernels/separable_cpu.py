@@ -20,7 +20,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from reconstruct.splat.kernels.lanes import (
+from ctsim.reconstruct.splat.kernels.lanes import (
     WIDTH,
     add,
     decay,
@@ -39,7 +39,7 @@ from reconstruct.splat.kernels.lanes import (
     sub,
     upper,
 )
-from reconstruct.splat.kernels.splat_cpu import (
+from ctsim.reconstruct.splat.kernels.splat_cpu import (
     BOX,
     CUTOFF,
     DEPTH,

@@ -23,7 +23,20 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from reconstruct.splat.kernels.lanes import WIDTH, below, div, exp, fma, load, mul, ramp, spread, sqrt, store, total
+from ctsim.reconstruct.splat.kernels.lanes import (
+    WIDTH,
+    below,
+    div,
+    exp,
+    fma,
+    load,
+    mul,
+    ramp,
+    spread,
+    sqrt,
+    store,
+    total,
+)
 
 CHUNKS = 16  # of splats at least, one a task
 ROWS = 32  # rows by multiplication before the exponentials are taken anew

@@ -15,8 +15,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from reconstruct.splat.kernels.lanes import WIDTH, exp, fma, load, mul, ramp, spread, store, total
-from reconstruct.splat.kernels.splat_cpu import CHUNKS, LARGEST
+from ctsim.reconstruct.splat.kernels.lanes import WIDTH, exp, fma, load, mul, ramp, spread, store, total
+from ctsim.reconstruct.splat.kernels.splat_cpu import CHUNKS, LARGEST
 
 SLABS = 16  # at most so many slabs of slices; a task adds splats to a slab in their order
 HALF = np.float32(-0.5)
