@@ -337,7 +337,7 @@ def test_workers_that_cannot_be_had_are_one_sentence(serial, tmp_path, monkeypat
         ("make_dataset", [suite, tmp_path / "data", "--only", "bare"]),
         ("cli_run", [serial / "data", tmp_path / "results"]),
     ):
-        assert cli.guarded("command", f"benchmarks.{module}", [*map(str, arguments), *flags]) == 2
+        assert cli.guarded("command", f"ctsim.benchmarks.{module}", [*map(str, arguments), *flags]) == 2
         error = capsys.readouterr().err
         assert said in error and error.count("\n") == 1
     assert not (tmp_path / "data").exists() and not (tmp_path / "results").exists()
