@@ -11,15 +11,15 @@ import sys
 from collections.abc import Callable
 
 OTHERS = {
-    "inspect": "ctsim.benchmarks.inspector",
-    "pareto": "ctsim.benchmarks.pareto",
-    "peers": "ctsim.benchmarks.peers",
-    "reproduce": "ctsim.benchmarks.reproduce",
-    "skipping": "ctsim.benchmarks.skipping",
+    "inspect": "ctsim.benchmarks.studies.inspect",
+    "pareto": "ctsim.benchmarks.studies.pareto.study",
+    "peers": "ctsim.benchmarks.studies.peers.study",
+    "reproduce": "ctsim.benchmarks.studies.claims",
+    "skipping": "ctsim.benchmarks.studies.skipping.study",
     "report": "ctsim.reports.report",
-    "ablation": "ctsim.benchmarks.ablation",
-    "paper-tables": "ctsim.benchmarks.paper_tables",
-    "stress": "ctsim.benchmarks.stress",
+    "ablation": "ctsim.benchmarks.studies.ablation",
+    "paper-tables": "ctsim.benchmarks.studies.paper.tables",
+    "stress": "ctsim.benchmarks.studies.stress.study",
 }
 EXIT_USER, EXIT_INTERRUPTED = 2, 130
 
@@ -34,7 +34,7 @@ def run_benchmark() -> int:
     arguments = sys.argv[1:]
     if arguments and arguments[0] in OTHERS:
         return guarded(f"run-benchmark {arguments[0]}", OTHERS[arguments[0]], arguments[1:])
-    return guarded("run-benchmark", "ctsim.benchmarks.cli_run", arguments)
+    return guarded("run-benchmark", "ctsim.benchmarks.studies.methods.study", arguments)
 
 
 def guarded(name: str, module: str, arguments: list[str], *, resumes: bool = True) -> int:

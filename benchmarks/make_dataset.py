@@ -1,30 +1,28 @@
 """make-dataset: from scene recipes to scans on disk, resumable at any moment."""
 
 import dataclasses
+import functools
 import shutil
 import sys
 import time
 import tomllib
-from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from ctsim.benchmarks.make_scene import make_scene, memory, say
-from ctsim.benchmarks.workers import TICK, Lost, Pool, open_pool
+from ctsim.benchmarks.engine.workers import TICK, Lost, Pool, open_pool
+from ctsim.benchmarks.suites import load, select
 from ctsim.errors import InputError
-from ctsim.human import human_bytes, human_choice, human_time
+from ctsim.human import human_bytes, human_time
 
 if TYPE_CHECKING:
-    from importlib.resources.abc import Traversable
+    from collections.abc import Iterable
 
     from ctsim.manifest import Manifest
     from ctsim.phantoms.scene import Scene
     from ctsim.plan import Plan
-    from ctsim.types import Phantom, Scanner
 
-OF_COMMANDS = ("pareto", "peers", "stress")  # what run-benchmark's commands measure: suites, but none of datasets
 _SPARE = 64 * 2**20  # bytes left free for the file system's own needs
 
 
@@ -74,48 +72,6 @@ def main(argv: list[str]) -> int:
         return 130
 
 
-def load(suite: str) -> "tuple[Scene, ...]":
-    """Return the scenes of a bundled suite by its name, or of a TOML file by its path.
-
-    Raises
-    ------
-    InputError
-        When there is no such suite or file, or the file is wrong (naming file, key and what was expected).
-    """
-    from ctsim.phantoms.scene import load_suite
-
-    known = bundled()
-    if suite in known:
-        with resources.as_file(known[suite]) as path:
-            return load_suite(path)
-    if not Path(suite).is_file():
-        raise InputError(f"{suite}: neither a TOML file nor a bundled suite ({', '.join(sorted(known))})")
-    return load_suite(Path(suite))
-
-
-def bundled() -> "dict[str, Traversable]":
-    """Return the bundled suites by name, those of `OF_COMMANDS` apart."""
-    folder = resources.files("ctsim.benchmarks") / "suites"
-    files = {entry.name.removesuffix(".toml"): entry for entry in folder.iterdir() if entry.name.endswith(".toml")}
-    return {name: entry for name, entry in files.items() if name not in OF_COMMANDS}
-
-
-def select(scenes: "tuple[Scene, ...]", only: tuple[str, ...], seeds: tuple[int, ...]) -> "tuple[Scene, ...]":
-    """Return the named scenes (all when none is named), once for each seed when seeds are given."""
-    import msgspec
-
-    names = [scene.name for scene in scenes]
-    for name in only:
-        if name not in names:
-            raise InputError(f"--only {name}: no such scene, expected one of {human_choice(names, name)}")
-    chosen = tuple(scene for scene in scenes if not only or scene.name in only)
-    if not seeds:
-        return chosen
-    return tuple(
-        msgspec.structs.replace(scene, name=f"{scene.name}-s{seed}", seed=seed) for scene in chosen for seed in seeds
-    )
-
-
 def _verify(data_dir: Path) -> int:
     from ctsim.folder import remarks
     from ctsim.manifest import read_index, verify
@@ -128,23 +84,16 @@ def _verify(data_dir: Path) -> int:
     return 2 if problems else 0
 
 
-def _plan(scene: "Scene") -> "tuple[Plan, Phantom, Scanner]":
-    from ctsim.phantoms.scene import build, stream_id
-    from ctsim.plan import make_plan
-
-    with memory(scene.name):
-        phantom, scanner = build(scene), scene.resolve()
-        return make_plan(phantom, scanner, scene.simulation, scene.truth, stream_id(scene)), phantom, scanner
-
-
 def _dry_run(scenes: "tuple[Scene, ...]", options: Options) -> int:
+    from ctsim.phantoms.dataset import plan_scene
+
     there = {} if options.out is None else _finished(scenes, options.out, options.force)
     seconds, size = 0.0, 0
     for scene in scenes:
         if scene.name in there:
             sys.stdout.write(f"{_complete(there[scene.name])}\n")
             continue
-        plan, *_ = _plan(scene)
+        plan = plan_scene(scene)
         sys.stdout.write(f"{scene.name}\n{plan.text()}\n")
         seconds, size = seconds + plan.seconds, size + plan.disk_bytes
     sys.stdout.write(f"total: {human_time(seconds)}, {human_bytes(size)} on disk\n")
@@ -216,10 +165,11 @@ def _make(scenes: "tuple[Scene, ...]", out: Path, options: Options) -> int:
 
 def _make_all(scenes: "list[Scene]", out: Path, options: Options) -> None:
     """Plan the scenes, then make them here or on workers."""
+    from ctsim.phantoms.dataset import plan_scene
     from ctsim.sources import source_hash
 
     with open_pool(options.workers, options.scheduler) as pool:
-        plans = {scene.name: _plan(scene)[0] for scene in scenes}  # all phantoms could be more than memory holds
+        plans = {scene.name: plan_scene(scene) for scene in scenes}  # all phantoms could be more than memory holds
         for name, plan in plans.items():
             for note in plan.notes:
                 say(f"{name}: {note}")
@@ -235,15 +185,29 @@ def _make_all(scenes: "list[Scene]", out: Path, options: Options) -> None:
 def _make_here(scenes: "list[Scene]", plans: "dict[str, Plan]", out: Path, force: bool) -> None:
     """Make scenes one after another in this process; one that another process has finished meanwhile is there."""
     from ctsim.folder import is_complete
-    from ctsim.phantoms.scene import build, scene_id
+    from ctsim.phantoms.dataset import make_scene
+    from ctsim.phantoms.scene import scene_id
 
     for number, scene in enumerate(scenes, 1):
         if not force and is_complete(out, scene.name, scene_id(scene)):
             say(f"{scene.name}: already complete")
             continue
-        title = f"{number}/{len(scenes)} {scene.name}"
-        with memory(scene.name):
-            make_scene(scene, plans[scene.name], (build(scene), scene.resolve()), out, force=force, title=title)
+        watch = functools.partial(_watch, scene.name, f"{number}/{len(scenes)} {scene.name}")
+        make_scene(scene, out, plan=plans[scene.name], force=force, watch=watch)
+
+
+def _watch(name: str, title: str, views: "Iterable[Any]", first: int, n_views: int) -> "Iterable[Any]":
+    """Show a scene's views on a progress bar, which is hidden where nobody watches."""
+    from tqdm import tqdm
+
+    if first:
+        say(f"{name}: goes on from view {first} of {n_views}")
+    return tqdm(views, title, n_views, initial=first, unit="view", disable=None, file=sys.stderr)
+
+
+def say(text: str) -> None:
+    """Write a line for people, beside what the command prints."""
+    sys.stderr.write(text + "\n")
 
 
 def _make_apart(jobs: list[Job], pool: Pool) -> None:
@@ -276,7 +240,8 @@ def do(job: Job) -> None:
     """
     from ctsim.folder import is_complete
     from ctsim.locks import PATIENCE, Busy
-    from ctsim.phantoms.scene import build, scene_id
+    from ctsim.phantoms.dataset import make_scene
+    from ctsim.phantoms.scene import scene_id
     from ctsim.sources import source_hash
 
     name, waited = job.scene.name, 0.0
@@ -284,9 +249,7 @@ def do(job: Job) -> None:
         raise InputError(f"{name}: a worker runs other code of the simulator than make-dataset; start the workers anew")
     while job.force or not is_complete(job.out, name, scene_id(job.scene)):
         try:
-            with memory(name):
-                parts = build(job.scene), job.scene.resolve()
-                make_scene(job.scene, job.plan, parts, job.out, force=job.force, title=None)
+            make_scene(job.scene, job.out, plan=job.plan, force=job.force)
             return
         except Busy as error:
             if not error.certain and waited >= PATIENCE:

@@ -92,8 +92,8 @@ def artefact(scene: Path, volumes: list[Path], path: Path) -> None:
     """Draw one slice of a scene through most metal: the reference and reconstructions named SCENE__METHOD.tif."""
     import tifffile
 
-    from ctsim.benchmarks.panels import cut
-    from ctsim.benchmarks.protocol import truth_of
+    from ctsim.benchmarks.scores.protocol import truth_of
+    from ctsim.benchmarks.studies.methods.panels import cut
     from ctsim.store import open_scan
 
     truth = truth_of(open_scan(scene))

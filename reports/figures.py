@@ -14,10 +14,10 @@ from matplotlib.text import Annotation
 from matplotlib.ticker import LogLocator, NullFormatter
 from matplotlib.transforms import Bbox
 
-from ctsim.benchmarks.columns import COLUMNS
-from ctsim.benchmarks.records import Record
-from ctsim.benchmarks.tables import summary
-from ctsim.benchmarks.texts import pictured
+from ctsim.benchmarks.engine.texts import pictured
+from ctsim.benchmarks.scores.columns import COLUMNS
+from ctsim.benchmarks.studies.methods.records import Record
+from ctsim.benchmarks.studies.methods.tables import summary
 
 INK = "#4d4d4e"  # no other part of a figure has it
 COLOURS = ("#3b82c4", "#d9772b", "#2f9e77", "#b5579c", "#8a8a1f", "#c44e52")

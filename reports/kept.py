@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.benchmarks.artefact import water_attenuation
-from ctsim.benchmarks.panels import Look, cut, look_of
-from ctsim.benchmarks.protocol import Stored, Truth, truth_of
-from ctsim.benchmarks.records import Record, latest, read_all
-from ctsim.benchmarks.run import repetition
-from ctsim.benchmarks.volumes import identity_of, map_volume, own_at_50kev
+from ctsim.benchmarks.scores.artefact import water_attenuation
+from ctsim.benchmarks.scores.protocol import Stored, Truth, truth_of
+from ctsim.benchmarks.studies.methods.panels import Look, cut, look_of
+from ctsim.benchmarks.studies.methods.records import Record, latest, read_all
+from ctsim.benchmarks.studies.methods.run import repetition
+from ctsim.benchmarks.studies.methods.volumes import identity_of, map_volume, own_at_50kev
 from ctsim.errors import InputError
 from ctsim.store import list_scans, open_scan
 

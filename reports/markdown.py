@@ -1,4 +1,4 @@
-"""The Markdown of `ctsim.benchmarks.tables` as HTML: headings, paragraphs, lists, tables, bold, underline, code.
+"""The Markdown of the tables as HTML: headings, paragraphs, lists, tables, bold, underline, code.
 
 One renderer decides what a table holds; a page shows the same cells. Tables can be sorted by `page.js`.
 """

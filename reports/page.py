@@ -1,6 +1,6 @@
 """One HTML file that needs nothing else: tables that sort, figures, and a slice slider for each scene.
 
-Its parts are written by `ctsim.benchmarks.tables` and `ctsim.reports.figures`; here they are put in their places. A
+Its parts are written by the study of methods and `ctsim.reports.figures`; here they are put in their places. A
 policy in the file itself forbids it to load anything.
 """
 
@@ -16,8 +16,8 @@ import matplotlib
 import matplotlib.colors
 import numpy as np
 
-from ctsim.benchmarks.records import OK, Record
-from ctsim.benchmarks.tables import render
+from ctsim.benchmarks.studies.methods.records import OK, Record
+from ctsim.benchmarks.studies.methods.tables import render
 from ctsim.reports import figures, markdown, slices
 from ctsim.reports.kept import Case, Kept
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.benchmarks.metrics import erode
+from ctsim.benchmarks.scores.metrics import erode
 from ctsim.reports.kept import Case
 
 OUTLINE = 200  # points across an image: an outline is one of them wide, however few the voxels are

@@ -7,7 +7,7 @@ import sys
 import time
 from typing import Any
 
-from ctsim.benchmarks import host
+from ctsim.benchmarks.engine import host
 
 
 def tell() -> None:
@@ -31,7 +31,7 @@ def die_in_exact(case: str, setup: Any) -> list:
     import tempfile
     from pathlib import Path
 
-    from ctsim.benchmarks.peer_cases import Measurement
+    from ctsim.benchmarks.studies.peers.cases import Measurement
 
     if case == "exact":
         Path(os.environ["CTSIM_TEST_MARK"]).write_text(tempfile.mkdtemp(), encoding="utf-8")

@@ -76,24 +76,24 @@ def serve() -> None:
     import tqdm
 
     tqdm.tqdm.monitor_interval = 0  # a fork would lose its thread
-    import ctsim.benchmarks.cli_run
     import ctsim.benchmarks.make_dataset
-    import ctsim.benchmarks.panels
-    import ctsim.benchmarks.schedule
+    import ctsim.benchmarks.studies.methods.panels
+    import ctsim.benchmarks.studies.methods.schedule
+    import ctsim.benchmarks.studies.methods.study
     import ctsim.phantoms.scene
     import ctsim.writer
 
     note_every_view(ctsim.writer.SceneWriter)
     assert all(
         (
-            ctsim.benchmarks.cli_run,
+            ctsim.benchmarks.studies.methods.study,
             ctsim.benchmarks.make_dataset,
-            ctsim.benchmarks.panels,
-            ctsim.benchmarks.schedule,
+            ctsim.benchmarks.studies.methods.panels,
+            ctsim.benchmarks.studies.methods.schedule,
             ctsim.phantoms.scene,
         )
     )
-    ctsim.benchmarks.panels.DPI = 20  # a picture is to be there; most of the time it would be drawn
+    ctsim.benchmarks.studies.methods.panels.DPI = 20  # a picture is to be there; most of the time it would be drawn
     for line in sys.stdin:
         sys.stdout.write(json.dumps(attempt(**json.loads(line))) + "\n")
         sys.stdout.flush()

@@ -3,8 +3,8 @@
 import time
 from dataclasses import dataclass
 
-from ctsim.benchmarks.pareto_jobs import Ended
-from ctsim.benchmarks.pareto_records import Mark, Setting
+from ctsim.benchmarks.studies.pareto.jobs import Ended
+from ctsim.benchmarks.studies.pareto.records import Mark, Setting
 
 CALLS = []
 

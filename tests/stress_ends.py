@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 
-from ctsim.benchmarks.stress_cases import Case
+from ctsim.benchmarks.studies.stress.cases import Case
 
 
 def fine(side, found):

@@ -6,8 +6,11 @@ import msgspec
 import pytest
 from conftest import SMALLEST
 
-from ctsim.benchmarks import ablation, cli, make_dataset, methods, records, workers
-from ctsim.benchmarks.make_dataset import load as load_suite
+from ctsim.benchmarks import cli, make_dataset, methods
+from ctsim.benchmarks.engine import workers
+from ctsim.benchmarks.studies import ablation
+from ctsim.benchmarks.studies.methods import records
+from ctsim.benchmarks.suites import load as load_suite
 from ctsim.store import list_scans, open_scan
 
 STUB = """

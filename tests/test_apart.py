@@ -15,7 +15,7 @@ import pytest
 import torch
 from test_workers import until
 
-from ctsim.benchmarks import apart, host
+from ctsim.benchmarks.engine import apart, host
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import tifffile
 
 from ctsim import arrayfile
 from ctsim.arrayfile import read_array, read_arrays
-from ctsim.benchmarks.volumes import read_volume, write_volume
+from ctsim.benchmarks.studies.methods.volumes import read_volume, write_volume
 from ctsim.errors import InputError
 
 BLOCK = np.arange(60, dtype=np.int16).reshape(3, 4, 5)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from ctsim.benchmarks import artefact, metrics
-from ctsim.benchmarks.artefact import Layout, artefact_score, cupping_index, homogeneous, metal_lines, near_metal
-from ctsim.benchmarks.protocol import Truth
+from ctsim.benchmarks.scores import artefact, metrics
+from ctsim.benchmarks.scores.artefact import Layout, artefact_score, cupping_index, homogeneous, metal_lines, near_metal
+from ctsim.benchmarks.scores.protocol import Truth
 from ctsim.errors import InputError
 from ctsim.store import list_scans, open_scan
 
@@ -287,7 +287,7 @@ def test_water_is_that_of_the_effective_reference(smallest):
 
 def test_a_layout_of_stored_files_declares_itself(smallest):
     stored = open_scan(list_scans(smallest)[0])
-    from ctsim.benchmarks.protocol import truth_of as stored_truth
+    from ctsim.benchmarks.scores.protocol import truth_of as stored_truth
 
     note = artefact.layout_of(stored, stored_truth(stored)).note
     # voxels of 5 and 6 mm: the dilated metal reaches beyond 5 mm, and nothing is left for a ROI

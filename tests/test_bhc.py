@@ -11,7 +11,7 @@ import torch
 from ctsim.baselines import bhc, known_spectrum
 from ctsim.baselines.known_spectrum import Beam, precorrect
 from ctsim.baselines.metal import Metal, Trace
-from ctsim.benchmarks import intermediates
+from ctsim.benchmarks.studies.methods import intermediates
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation

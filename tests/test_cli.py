@@ -10,8 +10,9 @@ import pytest
 from conftest import SMALLEST
 from test_paper_tables import record
 
-from ctsim.benchmarks import cli, make_dataset, records
-from ctsim.benchmarks.devices import check_device
+from ctsim.benchmarks import cli, make_dataset
+from ctsim.benchmarks.engine.devices import check_device
+from ctsim.benchmarks.studies.methods import records
 from ctsim.errors import InputError
 from ctsim.store import list_scans, open_scan
 
@@ -97,8 +98,8 @@ def test_what_cannot_go_on_does_not_say_that_it_will(monkeypatch, capsys):
     def stopped(_arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("ctsim.benchmarks.tune_nmar.main", stopped)
-    assert cli.guarded("tune_nmar", "ctsim.benchmarks.tune_nmar", [], resumes=False) == 130
+    monkeypatch.setattr("ctsim.benchmarks.tools.tune_nmar.main", stopped)
+    assert cli.guarded("tune_nmar", "ctsim.benchmarks.tools.tune_nmar", [], resumes=False) == 130
     assert "begins anew" in capsys.readouterr().err
 
 

@@ -3,8 +3,8 @@ import gc
 import pytest
 from test_paper_tables import record
 
-from ctsim.benchmarks import records, tables
-from ctsim.benchmarks.collector import uncollected
+from ctsim.benchmarks.engine.collector import uncollected
+from ctsim.benchmarks.studies.methods import records, tables
 
 
 @pytest.mark.parametrize("on", [True, False])

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from ctsim.benchmarks.attempt import scan_for
 from ctsim.benchmarks.methods import TABLE, find
+from ctsim.benchmarks.studies.methods.attempt import scan_for
 from ctsim.store import list_scans, open_scan
 from ctsim.types import Status
 

@@ -9,11 +9,16 @@ from test_paper_tables import record
 from test_pareto_points import setting, timed
 
 from ctsim import locks, manifest
-from ctsim.benchmarks import lines, peer_cases, peer_tables, records, skipping_tables, stress_records, tables
-from ctsim.benchmarks.host import host
+from ctsim.benchmarks.engine import lines
+from ctsim.benchmarks.engine.host import host
 from ctsim.benchmarks.methods import parse_overrides
-from ctsim.benchmarks.pareto_records import latest, points
-from ctsim.benchmarks.pareto_records import read as read_pareto
+from ctsim.benchmarks.studies.methods import records, tables
+from ctsim.benchmarks.studies.pareto.records import latest, points
+from ctsim.benchmarks.studies.pareto.records import read as read_pareto
+from ctsim.benchmarks.studies.peers import cases as peer_cases
+from ctsim.benchmarks.studies.peers import tables as peer_tables
+from ctsim.benchmarks.studies.skipping import tables as skipping_tables
+from ctsim.benchmarks.studies.stress import tables as stress_records
 from ctsim.errors import InputError
 from ctsim.folder import read_progress
 from ctsim.scaninfo import read_info

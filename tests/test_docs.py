@@ -58,8 +58,8 @@ def commands(text: str) -> list[str]:
 def arguments_of(name: str, words: list[str]) -> tuple[type, list[str]] | None:
     """Return the form and the words of a command of ours, None for another, and where it is but named."""
     from ctsim.benchmarks.cli import OTHERS
-    from ctsim.benchmarks.cli_run import Arguments
     from ctsim.benchmarks.make_dataset import Options
+    from ctsim.benchmarks.studies.methods.study import Arguments
 
     if name.rpartition("/")[2] not in ("make-dataset", "run-benchmark"):
         return None
@@ -91,7 +91,7 @@ def test_commands_are_found_wherever_they_stand():
 
 
 def test_the_readme_names_every_recipe_and_suite():
-    from ctsim.benchmarks.make_dataset import bundled
+    from ctsim.benchmarks.suites import bundled
     from ctsim.phantoms.recipes import NAMES
 
     text = (ROOT / "README.md").read_text(encoding="utf-8")

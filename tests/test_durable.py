@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from ctsim import durable, process
-from ctsim.benchmarks import intermediates, volumes
-from ctsim.benchmarks.volumes import read_volume, write_volume
+from ctsim.benchmarks.studies.methods import intermediates, volumes
+from ctsim.benchmarks.studies.methods.volumes import read_volume, write_volume
 from ctsim.durable import replacing, write_synced
 from ctsim.reconstruct.splat.checkpoint import Checkpoint
 

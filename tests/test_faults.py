@@ -19,7 +19,8 @@ import pytest
 from forks import Forks, Run, running
 from test_workers import records_of, scores, tables, until
 
-from ctsim.benchmarks import make_dataset, records
+from ctsim.benchmarks import make_dataset
+from ctsim.benchmarks.studies.methods import records
 from ctsim.folder import partial_of
 from ctsim.manifest import list_scans, read_manifest, verify
 from ctsim.tiffstack import map_array

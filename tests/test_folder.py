@@ -11,11 +11,13 @@ from small_scan import STACKS, content, one_view, write
 from test_writer import interrupt
 
 import ctsim.benchmarks.make_dataset as command
-from ctsim import folder, locks, manifest, simulate, sources
-from ctsim.benchmarks.make_dataset import load, main
+from ctsim import folder, locks, manifest, sources
+from ctsim.benchmarks.make_dataset import main
+from ctsim.benchmarks.suites import load
 from ctsim.errors import InputError
 from ctsim.folder import is_complete, remarks, unfinished
 from ctsim.manifest import INDEX, MANIFEST, PROGRESS, IndexLine, read_index, read_manifest
+from ctsim.phantoms import dataset
 from ctsim.phantoms import scene as scenes
 from ctsim.phantoms.scene import scene_id
 from ctsim.store import open_scan, verify
@@ -79,7 +81,7 @@ def names(path: Path) -> set[str]:
 
 def interrupted_at(view: int, monkeypatch) -> None:
     """Let the simulator be interrupted when it has made so many views."""
-    real = simulate.simulate_views
+    real = dataset.simulate_views
 
     def views(*given, **more):
         for k, arrays in real(*given, **more):
@@ -87,7 +89,7 @@ def interrupted_at(view: int, monkeypatch) -> None:
                 raise KeyboardInterrupt
             yield k, arrays
 
-    monkeypatch.setattr(simulate, "simulate_views", views)
+    monkeypatch.setattr(dataset, "simulate_views", views)
 
 
 def test_an_unfinished_scan_of_other_code_is_begun_anew(tmp_path, other_code):
@@ -105,7 +107,7 @@ def test_an_unfinished_scan_of_other_code_is_begun_anew(tmp_path, other_code):
 
 
 def test_a_scan_is_of_one_version_of_the_simulator(tmp_path, suite, monkeypatch, other_code, capsys):
-    real = simulate.simulate_views
+    real = dataset.simulate_views
 
     def ones(*given, **more):
         for k, arrays in real(*given, **more):
@@ -115,7 +117,7 @@ def test_a_scan_is_of_one_version_of_the_simulator(tmp_path, suite, monkeypatch,
     with monkeypatch.context() as patch:
         interrupted_at(4, patch)
         assert main([suite, str(data), "--only", "rods"]) == 130
-    monkeypatch.setattr(simulate, "simulate_views", ones)
+    monkeypatch.setattr(dataset, "simulate_views", ones)
     other_code("v2")
     capsys.readouterr()
     assert main([suite, str(data), "--only", "rods", "--dry-run"]) == 0
@@ -164,7 +166,7 @@ def test_a_scan_of_the_former_format_is_read_and_named(made, suite, capsys):
 
 
 def test_a_table_of_scans_of_different_code_is_remarked_upon(made, suite, other_code, tmp_path, caplog):
-    from ctsim.benchmarks.cli_run import main as run
+    from ctsim.benchmarks.studies.methods.study import main as run
 
     assert run([str(made), str(tmp_path / "results"), "--dry-run"]) == 0 and not caplog.messages
     first = sources.source_hash()
@@ -186,7 +188,7 @@ def test_a_table_of_scans_of_different_code_is_remarked_upon(made, suite, other_
 
 def test_a_worker_of_other_code_is_refused(whole, suite, tmp_path):
     (scene,) = (s for s in load(suite) if s.name == "bare")
-    job = command.Job(scene=scene, plan=command._plan(scene)[0], out=tmp_path / "data", force=False, code="v2")
+    job = command.Job(scene=scene, plan=dataset.plan_scene(scene), out=tmp_path / "data", force=False, code="v2")
     with pytest.raises(InputError, match="bare: a worker runs other code of the simulator than make-dataset"):
         command.do(job)
     assert not (tmp_path / "data").exists()
@@ -199,9 +201,9 @@ def test_a_worker_does_not_wait_for_ever_for_a_lock_of_which_nothing_is_known(su
 
     scene, tried = load(suite)[1], []
     job = command.Job(
-        scene=scene, plan=command._plan(scene)[0], out=tmp_path, force=False, code=sources.source_hash()
+        scene=scene, plan=dataset.plan_scene(scene), out=tmp_path, force=False, code=sources.source_hash()
     )  # fmt: skip
-    monkeypatch.setattr(command, "make_scene", busy)
+    monkeypatch.setattr("ctsim.phantoms.dataset.make_scene", busy)
     monkeypatch.setattr(command.time, "sleep", lambda _: None)
     monkeypatch.setattr(locks, "PATIENCE", 2 * command.TICK)
     with pytest.raises(locks.Busy):
@@ -213,7 +215,7 @@ def test_complete_data_are_only_read(made, suite, monkeypatch, capsys):
     """Neither locked nor written to, nor is room asked for or anything built or planned."""
     for owner, name in [
         (locks, "lock"), (folder, "lock"), (locks, "locked"), (manifest, "locked"), (manifest, "write_synced"),
-        (shutil, "disk_usage"), (command, "_plan"), (scenes, "build"), (shutil, "rmtree"), (Path, "unlink"),
+        (shutil, "disk_usage"), (dataset, "plan_scene"), (dataset, "build"), (shutil, "rmtree"), (Path, "unlink"),
     ]:  # fmt: skip
         monkeypatch.setattr(owner, name, lambda *_, name=name, **__: pytest.fail(f"{name} was called"))
     before = content(made)
@@ -393,7 +395,7 @@ def test_complete_scenes_are_known_as_such_in_work_that_grows_as_their_number(tm
                     return real(*given, **more)
 
                 patch.setattr(owner, attribute, call)
-            for owner, attribute in ((scenes, "build"), (command, "_plan")):
+            for owner, attribute in ((dataset, "build"), (dataset, "plan_scene")):
                 patch.setattr(owner, attribute, lambda *_: pytest.fail("a scene that is there was planned"))
             assert main([suite, str(data)]) == 0
         counts.append(count)

@@ -7,10 +7,12 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio
 from test_metrics import truth
 
-from ctsim.benchmarks import cli, inspector, records
-from ctsim.benchmarks.inspector import BASE, SINGLE, WHOLE, Convention, score
-from ctsim.benchmarks.protocol import AT_50KEV, evaluate
-from ctsim.benchmarks.volumes import at_50kev_of, write_volume
+from ctsim.benchmarks import cli
+from ctsim.benchmarks.scores.protocol import AT_50KEV, evaluate
+from ctsim.benchmarks.studies import inspect as inspector
+from ctsim.benchmarks.studies.inspect import BASE, SINGLE, WHOLE, Convention, score
+from ctsim.benchmarks.studies.methods import records
+from ctsim.benchmarks.studies.methods.volumes import at_50kev_of, write_volume
 from ctsim.reconstruct.fdk import reconstruct as fdk
 
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from ctsim.benchmarks import attempt, intermediates, methods
+from ctsim.benchmarks import methods
+from ctsim.benchmarks.studies.methods import attempt, intermediates
 from ctsim.reconstruct.log import line_integrals
 from ctsim.store import list_scans, open_scan
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ctsim.benchmarks.limited import Limited, Stopped
+from ctsim.benchmarks.engine.limited import Limited, Stopped
 from ctsim.errors import InputError
 
 WHOLE = 60.0  # seconds that a process has to start beside other work

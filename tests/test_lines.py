@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from ctsim.benchmarks import lines
+from ctsim.benchmarks.engine import lines
 from ctsim.durable import write_synced
 from ctsim.errors import InputError
 

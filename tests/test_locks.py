@@ -16,7 +16,7 @@ from small_scan import STACKS, content, write
 from test_lines import Row, row
 
 from ctsim import locks, process
-from ctsim.benchmarks import lines
+from ctsim.benchmarks.engine import lines
 from ctsim.errors import InputError
 from ctsim.locks import Busy, Owner, lock, locked
 from ctsim.store import verify

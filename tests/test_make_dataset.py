@@ -10,10 +10,11 @@ import pytest
 import tifffile
 
 import ctsim.benchmarks.make_dataset as command
-from ctsim import simulate
-from ctsim.benchmarks.make_dataset import OF_COMMANDS, bundled, load, main, select
+from ctsim.benchmarks.make_dataset import main
+from ctsim.benchmarks.suites import STUDY_SUITES, bundled, load, select
 from ctsim.errors import InputError
 from ctsim.human import human_bytes, human_time
+from ctsim.phantoms import dataset
 from ctsim.phantoms.scene import load_suite, parse_suite, scene_id
 from ctsim.store import list_scans, open_scan
 
@@ -113,7 +114,7 @@ def test_finished_scenes_are_skipped(made, suite, tmp_path, capsys):
 
 @pytest.mark.parametrize("stop", [0, 3, 6])
 def test_an_interrupted_run_goes_on_to_the_same_bytes(made, suite, tmp_path, monkeypatch, capsys, stop):
-    real, first = simulate.simulate_views, []
+    real, first = dataset.simulate_views, []
 
     def interrupted(plan, phantom, scanner, first_view=0):
         first.append(first_view)
@@ -122,7 +123,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(made, suite, tmp_path, mon
                 raise KeyboardInterrupt
             yield view, arrays
 
-    monkeypatch.setattr(simulate, "simulate_views", interrupted)
+    monkeypatch.setattr(dataset, "simulate_views", interrupted)
     data = tmp_path / "data"
     assert main([suite, str(data), "--only", "rods"]) == 130
     assert "interrupted" in capsys.readouterr().err
@@ -219,11 +220,11 @@ def test_a_wrong_name_among_thousands_is_answered_with_the_nearest_and_their_num
 @pytest.mark.parametrize(
     ("where", "flags"),
     [
-        ("ctsim.phantoms.scene.build", []),
-        ("ctsim.phantoms.scene.build", ["--dry-run"]),
-        ("ctsim.plan.make_plan", []),
-        ("ctsim.simulate.simulate_views", []),
-        ("ctsim.simulate.truth_volumes", []),
+        ("ctsim.phantoms.dataset.build", []),
+        ("ctsim.phantoms.dataset.build", ["--dry-run"]),
+        ("ctsim.phantoms.dataset.make_plan", []),
+        ("ctsim.phantoms.dataset.simulate_views", []),
+        ("ctsim.phantoms.dataset.truth_volumes", []),
     ],
 )
 def test_a_scene_too_large_for_memory_is_named(suite, tmp_path, monkeypatch, capsys, where, flags):
@@ -234,7 +235,7 @@ def test_a_scene_too_large_for_memory_is_named(suite, tmp_path, monkeypatch, cap
 
 
 def test_what_commands_measure_is_no_suite_of_scenes(tmp_path, capsys):
-    assert {"quick", "core", "paper"} <= bundled().keys() and not bundled().keys() & set(OF_COMMANDS)
+    assert {"quick", "core", "paper"} <= bundled().keys() and not bundled().keys() & set(STUDY_SUITES)
     for name in bundled():
         assert load(name), name
     assert main(["pareto", str(tmp_path / "data")]) == 2

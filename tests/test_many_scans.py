@@ -12,7 +12,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from ctsim.benchmarks import cli_run, methods, records, run
+from ctsim.benchmarks import methods
+from ctsim.benchmarks.studies.methods import records, run
+from ctsim.benchmarks.studies.methods import study as cli_run
 from ctsim.errors import InputError
 from ctsim.manifest import INDEX, MANIFEST
 from ctsim.store import list_scans, open_scan

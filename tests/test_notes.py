@@ -6,12 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from ctsim.benchmarks import records
-from ctsim.benchmarks.attempt import scan_for
-from ctsim.benchmarks.cli_run import main as run_benchmark
-from ctsim.benchmarks.judge import Judge, Twin
 from ctsim.benchmarks.make_dataset import main as make_dataset
 from ctsim.benchmarks.methods import find
+from ctsim.benchmarks.scores.judge import Judge, Twin
+from ctsim.benchmarks.studies.methods import records
+from ctsim.benchmarks.studies.methods.attempt import scan_for
+from ctsim.benchmarks.studies.methods.study import main as run_benchmark
 from ctsim.detector import Detector
 from ctsim.geometry import Geometry
 from ctsim.notes import metal_notes

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ctsim.benchmarks.make_dataset import main as make_dataset
-from ctsim.benchmarks.protocol import metal_score, tissue_score, truth_of
+from ctsim.benchmarks.scores.protocol import metal_score, tissue_score, truth_of
 from ctsim.errors import InputError
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reconstruct.scatter import open_excess

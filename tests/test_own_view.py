@@ -15,9 +15,10 @@ import pytest
 import torch
 from test_run import GEOMETRY, double
 
-from ctsim.benchmarks import methods, run
-from ctsim.benchmarks.own import restored
-from ctsim.benchmarks.volumes import read_volume
+from ctsim.benchmarks import methods
+from ctsim.benchmarks.studies.methods import run
+from ctsim.benchmarks.studies.methods.own import restored
+from ctsim.benchmarks.studies.methods.volumes import read_volume
 from ctsim.store import list_scans, open_scan
 from ctsim.types import Volume
 
@@ -132,7 +133,7 @@ def test_nan_in_the_counts_is_no_change():
     counts = torch.full(GEOMETRY.shape, float("nan"))
     counts[0] = 3.0
     scan = Scan(geometry=GEOMETRY, counts=counts, flat=torch.full(GEOMETRY.n_detector, 9.0))
-    from ctsim.benchmarks.own import changed
+    from ctsim.benchmarks.studies.methods.own import changed
 
     assert changed(scan, Scan(geometry=GEOMETRY, counts=counts.clone(), flat=scan.flat.clone())) == []
 

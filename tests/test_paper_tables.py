@@ -5,12 +5,15 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
-from ctsim.benchmarks import cli, paper_layout, paper_tables, records
-from ctsim.benchmarks.host import Host
-from ctsim.benchmarks.make_dataset import load as load_suite
-from ctsim.benchmarks.protocol import Score
-from ctsim.benchmarks.records import Cost, Record, Run
-from ctsim.benchmarks.run import repetition
+from ctsim.benchmarks import cli
+from ctsim.benchmarks.engine.host import Host
+from ctsim.benchmarks.scores.protocol import Score
+from ctsim.benchmarks.studies.methods import records
+from ctsim.benchmarks.studies.methods.records import Cost, Record, Run
+from ctsim.benchmarks.studies.methods.run import repetition
+from ctsim.benchmarks.studies.paper import layout as paper_layout
+from ctsim.benchmarks.studies.paper import tables as paper_tables
+from ctsim.benchmarks.suites import load as load_suite
 from ctsim.errors import InputError
 from ctsim.phantoms.scene import scene_id
 
@@ -217,8 +220,8 @@ def test_the_commands_are_understood_and_make_the_label_of_the_cell():
 
     import tyro
 
-    from ctsim.benchmarks.cli_run import Arguments
     from ctsim.benchmarks.methods import Method, parse_overrides
+    from ctsim.benchmarks.studies.methods.study import Arguments
 
     for table in PAPER.table:
         for row in table.rows:

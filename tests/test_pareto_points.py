@@ -10,10 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctsim.benchmarks import lines, pareto, pareto_figure, pareto_table
-from ctsim.benchmarks.host import host
-from ctsim.benchmarks.pareto_front import beaten_by, faster, front, knee
-from ctsim.benchmarks.pareto_records import (
+from ctsim.benchmarks.engine import lines
+from ctsim.benchmarks.engine.host import host
+from ctsim.benchmarks.studies.pareto import figure as pareto_figure
+from ctsim.benchmarks.studies.pareto import study as pareto
+from ctsim.benchmarks.studies.pareto import tables as pareto_table
+from ctsim.benchmarks.studies.pareto.front import beaten_by, faster, front, knee
+from ctsim.benchmarks.studies.pareto.records import (
     VERSION,
     Mark,
     Setting,

@@ -7,8 +7,14 @@ import apart_jobs
 import msgspec
 import pytest
 
-from ctsim.benchmarks import cli, host, lines, peer_cases, peer_catalogue, peer_poly, peer_tables, peers
-from ctsim.benchmarks.peer_cases import MEASURED, OURS, RTK, Measurement, Setup
+from ctsim.benchmarks import cli
+from ctsim.benchmarks.engine import host, lines
+from ctsim.benchmarks.studies.peers import cases as peer_cases
+from ctsim.benchmarks.studies.peers import catalogue as peer_catalogue
+from ctsim.benchmarks.studies.peers import poly as peer_poly
+from ctsim.benchmarks.studies.peers import study as peers
+from ctsim.benchmarks.studies.peers import tables as peer_tables
+from ctsim.benchmarks.studies.peers.cases import MEASURED, OURS, RTK, Measurement, Setup
 from ctsim.errors import InputError
 
 WHOLE = """
@@ -69,7 +75,7 @@ def test_code_and_catalogue_know_the_same_names(monkeypatch):
 
 
 def test_the_scene_of_the_case_paper_is_the_suites_with_so_many_views():
-    from ctsim.benchmarks.make_dataset import load, select
+    from ctsim.benchmarks.suites import load, select
 
     case = peer_catalogue.case("paper")
     for suite in ("quick", "paper"):

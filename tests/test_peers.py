@@ -6,19 +6,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from ctsim.benchmarks import (
-    cli,
-    host,
-    lines,
-    peer_cases,
-    peer_catalogue,
-    peer_poly,
-    peer_rtk,
-    peer_tables,
-    peer_xcist,
-    peers,
-)
-from ctsim.benchmarks.peer_cases import OURS, RTK, XCIST, Measurement
+from ctsim.benchmarks import cli
+from ctsim.benchmarks.engine import host, lines
+from ctsim.benchmarks.studies.peers import cases as peer_cases
+from ctsim.benchmarks.studies.peers import catalogue as peer_catalogue
+from ctsim.benchmarks.studies.peers import poly as peer_poly
+from ctsim.benchmarks.studies.peers import rtk as peer_rtk
+from ctsim.benchmarks.studies.peers import study as peers
+from ctsim.benchmarks.studies.peers import tables as peer_tables
+from ctsim.benchmarks.studies.peers import xcist as peer_xcist
+from ctsim.benchmarks.studies.peers.cases import OURS, RTK, XCIST, Measurement
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.phantoms.shapes import cylinder
@@ -415,7 +412,7 @@ def test_repeats_must_be_positive(tmp_path):
 
 def test_help_imports_nothing_heavy():
     code = (
-        "import sys\nfrom ctsim.benchmarks.peers import main\n"
+        "import sys\nfrom ctsim.benchmarks.studies.peers.study import main\n"
         "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
         "assert not {'numba', 'torch', 'itk', 'gecatsim', 'scipy', 'pandas'} & set(sys.modules), sorted(sys.modules)\n"
     )

@@ -15,11 +15,12 @@ from test_paper_tables import record
 from test_pareto_points import setting, timed
 from test_run import GEOMETRY, Double, double, once
 
-from ctsim.benchmarks import panels, pareto_figure
-from ctsim.benchmarks.panels import Row, draw
-from ctsim.benchmarks.pareto_records import points
-from ctsim.benchmarks.protocol import truth_of
-from ctsim.benchmarks.volumes import write_volume
+from ctsim.benchmarks.scores.protocol import truth_of
+from ctsim.benchmarks.studies.methods import panels
+from ctsim.benchmarks.studies.methods.panels import Row, draw
+from ctsim.benchmarks.studies.methods.volumes import write_volume
+from ctsim.benchmarks.studies.pareto import figure as pareto_figure
+from ctsim.benchmarks.studies.pareto.records import points
 from ctsim.reports import figures, view
 
 # what matplotlib cannot parse as mathematics, what it would draw as such, and an escape of its own

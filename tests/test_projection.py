@@ -7,10 +7,11 @@ import pytest
 import torch
 from conftest import SMALLEST
 
-from ctsim.benchmarks import make_dataset, projection
-from ctsim.benchmarks.judge import Judge, Twin
-from ctsim.benchmarks.projection import REGIONS, HeldOut, half_way, held_out, projection_score, with_floor
-from ctsim.benchmarks.protocol import truth_of
+from ctsim.benchmarks import make_dataset
+from ctsim.benchmarks.scores import projection
+from ctsim.benchmarks.scores.judge import Judge, Twin
+from ctsim.benchmarks.scores.projection import REGIONS, HeldOut, half_way, held_out, projection_score, with_floor
+from ctsim.benchmarks.scores.protocol import truth_of
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.projector import forward
 from ctsim.store import list_scans, open_scan

@@ -5,10 +5,11 @@ import sys
 import msgspec
 import pytest
 
-from ctsim.benchmarks import cli, methods, records, tables
-from ctsim.benchmarks.host import host, measured
-from ctsim.benchmarks.protocol import Score
-from ctsim.benchmarks.records import Record, Run
+from ctsim.benchmarks import cli, methods
+from ctsim.benchmarks.engine.host import host, measured
+from ctsim.benchmarks.scores.protocol import Score
+from ctsim.benchmarks.studies.methods import records, tables
+from ctsim.benchmarks.studies.methods.records import Record, Run
 from ctsim.errors import InputError
 
 

@@ -17,8 +17,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ctsim.benchmarks import cli, cli_run, host, lines, make_dataset, stress_records, tables
-from ctsim.benchmarks.volumes import at_50kev_of, write_volume
+from ctsim.benchmarks import cli, make_dataset
+from ctsim.benchmarks.engine import host, lines
+from ctsim.benchmarks.studies.methods import study as cli_run
+from ctsim.benchmarks.studies.methods import tables
+from ctsim.benchmarks.studies.methods.volumes import at_50kev_of, write_volume
+from ctsim.benchmarks.studies.stress import tables as stress_records
 from ctsim.errors import InputError
 from ctsim.reports import figures, kept, markdown, report, slices, view
 

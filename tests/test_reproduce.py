@@ -4,9 +4,11 @@ import sys
 import pytest
 from conftest import SMALLEST
 
-from ctsim.benchmarks import cli, make_dataset, records, reproduce
-from ctsim.benchmarks.protocol import Score
-from ctsim.benchmarks.records import Cost, Record, Run
+from ctsim.benchmarks import cli, make_dataset
+from ctsim.benchmarks.scores.protocol import Score
+from ctsim.benchmarks.studies import claims as reproduce
+from ctsim.benchmarks.studies.methods import records
+from ctsim.benchmarks.studies.methods.records import Cost, Record, Run
 
 RMSE = {"fdk": 300.0, "limar": 150.0, "nmar": 120.0}
 WALL = {"fdk": 1.0, "limar": 2.0, "nmar": 4.0, "os-sart": 30.0}

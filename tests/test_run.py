@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 import torch
 
-from ctsim.benchmarks import artefact, attempt, cli, cli_run, intermediates, methods, records, run
-from ctsim.benchmarks.panels import Row, cut, draw, write_panels
-from ctsim.benchmarks.protocol import truth_of
-from ctsim.benchmarks.tables import caption
-from ctsim.benchmarks.volumes import at_50kev_of, identity_of, read_volume, write_volume
+from ctsim.benchmarks import cli, methods
+from ctsim.benchmarks.scores import artefact
+from ctsim.benchmarks.scores.protocol import truth_of
+from ctsim.benchmarks.studies.methods import attempt, intermediates, records, run
+from ctsim.benchmarks.studies.methods import study as cli_run
+from ctsim.benchmarks.studies.methods.panels import Row, cut, draw, write_panels
+from ctsim.benchmarks.studies.methods.tables import caption
+from ctsim.benchmarks.studies.methods.volumes import at_50kev_of, identity_of, read_volume, write_volume
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.scaninfo import ScanInfo

@@ -8,11 +8,12 @@ import pytest
 from test_run import double
 from test_tables import record
 
-from ctsim.benchmarks import cli_run, estimates, records, run, schedule, tables
-from ctsim.benchmarks.estimates import FDKS, fdk_seconds, in_fdks
+from ctsim.benchmarks.engine.workers import Lost
 from ctsim.benchmarks.methods import TABLE, Method, find
-from ctsim.benchmarks.schedule import Costs, ordered
-from ctsim.benchmarks.workers import Lost
+from ctsim.benchmarks.studies.methods import estimates, records, run, schedule, tables
+from ctsim.benchmarks.studies.methods import study as cli_run
+from ctsim.benchmarks.studies.methods.estimates import FDKS, fdk_seconds, in_fdks
+from ctsim.benchmarks.studies.methods.schedule import Costs, ordered
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.splat.course import PASSES

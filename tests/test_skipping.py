@@ -6,8 +6,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from ctsim.benchmarks import cli, host, lines, make_dataset, skipping, skipping_cases, skipping_methods, skipping_tables
-from ctsim.benchmarks.skipping_cases import Pair, Setup
+from ctsim.benchmarks import cli, make_dataset
+from ctsim.benchmarks.engine import host, lines
+from ctsim.benchmarks.studies.skipping import methods as skipping_methods
+from ctsim.benchmarks.studies.skipping import simulator as skipping_cases
+from ctsim.benchmarks.studies.skipping import study as skipping
+from ctsim.benchmarks.studies.skipping import tables as skipping_tables
+from ctsim.benchmarks.studies.skipping.simulator import Pair, Setup
 from ctsim.bricks import MIXED
 from ctsim.errors import InputError
 from ctsim.phantoms.scene import build
@@ -26,7 +31,7 @@ def run(tmp_path_factory):
 @pytest.fixture
 def here(monkeypatch):
     """Cases are measured in this process, where they can be replaced."""
-    monkeypatch.setattr("ctsim.benchmarks.limited.Limited.run", lambda self, function, *given: function(*given))
+    monkeypatch.setattr("ctsim.benchmarks.engine.limited.Limited.run", lambda self, function, *given: function(*given))
 
 
 def small(tmp_path):
@@ -213,7 +218,7 @@ def test_a_case_that_overstays_is_a_row_with_its_reason_and_is_tried_again(tmp_p
     assert [r.measured.status for r in skipping_tables.read(tmp_path / skipping.NAME)] == ["timeout"] * 2
     assert skipping.main([*words, "--dry-run"]) == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["rays", "twin", "total:"]
-    monkeypatch.setattr("ctsim.benchmarks.limited.Limited.run", lambda self, function, *given: function(*given))
+    monkeypatch.setattr("ctsim.benchmarks.engine.limited.Limited.run", lambda self, function, *given: function(*given))
     for case in ("rays", "twin"):
         monkeypatch.setitem(skipping_cases.CASES, case, lambda setup, case=case: iter([fake(0.0, case=case)]))
     assert skipping.main(words) == 0

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from ctsim.benchmarks.attempt import warm_up
 from ctsim.benchmarks.make_dataset import main as make_dataset
 from ctsim.benchmarks.methods import find
-from ctsim.benchmarks.metrics import psnr3d
-from ctsim.benchmarks.protocol import tissue_score, truth_of
+from ctsim.benchmarks.scores.metrics import psnr3d
+from ctsim.benchmarks.scores.protocol import tissue_score, truth_of
+from ctsim.benchmarks.studies.methods.attempt import warm_up
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ctsim.benchmarks import splat_kernels
+from ctsim.benchmarks.tools import splat_kernels
 from ctsim.phantoms.scanners import preset
 
 

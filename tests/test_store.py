@@ -155,7 +155,11 @@ def test_a_manifest_that_names_another_folder_is_refused(tmp_path, name, capsys)
         open_scan(folder)
     assert ["names the scene" in p for p in verify(tmp_path / "data")] == [True]
     results = tmp_path / "x" / "y" / "results"
-    command = ("run-benchmark", "ctsim.benchmarks.cli_run", [str(tmp_path / "data"), str(results), "--scene", name])
+    command = (
+        "run-benchmark",
+        "ctsim.benchmarks.studies.methods.study",
+        [str(tmp_path / "data"), str(results), "--scene", name],
+    )
     assert cli.guarded(*command) == 2
     assert "names the scene" in capsys.readouterr().err and {p.name for p in tmp_path.iterdir()} == {"data"}
 

@@ -9,12 +9,17 @@ from stress_ends import ENDS, catalogue
 
 from ctsim import plan
 from ctsim.baselines.known_spectrum import Beam
-from ctsim.benchmarks import stress, stress_chain, stress_methods, stress_records, stress_simulator, stress_splats
 from ctsim.benchmarks.methods import TABLE, find
-from ctsim.benchmarks.stress_cases import Findings, carry_out
-from ctsim.benchmarks.stress_scans import BONE, USUAL, WATER, example, geometry, in_air, rod
-from ctsim.benchmarks.stress_suite import load
-from ctsim.benchmarks.stress_worker import Worker
+from ctsim.benchmarks.studies.stress import chain as stress_chain
+from ctsim.benchmarks.studies.stress import methods as stress_methods
+from ctsim.benchmarks.studies.stress import simulator as stress_simulator
+from ctsim.benchmarks.studies.stress import splats as stress_splats
+from ctsim.benchmarks.studies.stress import study as stress
+from ctsim.benchmarks.studies.stress import tables as stress_records
+from ctsim.benchmarks.studies.stress.cases import Findings, carry_out
+from ctsim.benchmarks.studies.stress.scans import BONE, USUAL, WATER, example, geometry, in_air, rod
+from ctsim.benchmarks.studies.stress.suite import load
+from ctsim.benchmarks.studies.stress.worker import Worker
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.noise import Noise
@@ -126,7 +131,7 @@ class Here:
 
 @pytest.fixture
 def command(monkeypatch, tmp_path):
-    monkeypatch.setattr("ctsim.benchmarks.stress_worker.Worker", Here)
+    monkeypatch.setattr("ctsim.benchmarks.studies.stress.worker.Worker", Here)
     monkeypatch.setattr(stress, "catalogue", lambda *_: catalogue()[:3])
     Here.ran = 0
     return lambda *words: stress.main([str(tmp_path / "out"), "--short", *words])

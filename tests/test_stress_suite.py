@@ -9,11 +9,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from ctsim.benchmarks import stress, stress_methods, stress_records
-from ctsim.benchmarks.stress_cases import Findings, carry_out
-from ctsim.benchmarks.stress_changes import Filled, Magnified, Rounded, Turned, Twice
-from ctsim.benchmarks.stress_scans import BODY, USUAL, Circle, OfSide, geometry
-from ctsim.benchmarks.stress_suite import Scene, load
+from ctsim.benchmarks.studies.stress import methods as stress_methods
+from ctsim.benchmarks.studies.stress import study as stress
+from ctsim.benchmarks.studies.stress import tables as stress_records
+from ctsim.benchmarks.studies.stress.cases import Findings, carry_out
+from ctsim.benchmarks.studies.stress.changes import Filled, Magnified, Rounded, Turned, Twice
+from ctsim.benchmarks.studies.stress.scans import BODY, USUAL, Circle, OfSide, geometry
+from ctsim.benchmarks.studies.stress.suite import Scene, load
 from ctsim.errors import InputError
 
 SIDE = 8

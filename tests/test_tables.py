@@ -10,10 +10,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ctsim.benchmarks import latex, records, tables
-from ctsim.benchmarks.protocol import Score
-from ctsim.benchmarks.records import Cost, Record, Run
-from ctsim.benchmarks.texts import escape, ranked
+from ctsim.benchmarks.engine import latex
+from ctsim.benchmarks.engine.texts import escape, ranked
+from ctsim.benchmarks.scores.protocol import Score
+from ctsim.benchmarks.studies.methods import records, tables
+from ctsim.benchmarks.studies.methods.records import Cost, Record, Run
 from ctsim.errors import InputError
 
 

@@ -9,8 +9,10 @@ import pytest
 import torch
 from test_run import GEOMETRY, Double
 
-from ctsim.benchmarks import artefact, attempt, methods, records, run
-from ctsim.benchmarks.volumes import identity_of, map_volume, read_volume, write_volume
+from ctsim.benchmarks import methods
+from ctsim.benchmarks.scores import artefact
+from ctsim.benchmarks.studies.methods import attempt, records, run
+from ctsim.benchmarks.studies.methods.volumes import identity_of, map_volume, read_volume, write_volume
 from ctsim.errors import InputError
 from ctsim.materials import attenuation
 from ctsim.types import Scan, Volume

@@ -17,8 +17,9 @@ from pathlib import Path
 import pytest
 from test_cli import stopped
 
-from ctsim.benchmarks import cli, workers
-from ctsim.benchmarks.workers import Cluster, Local, Lost, open_pool, threads_of
+from ctsim.benchmarks import cli
+from ctsim.benchmarks.engine import workers
+from ctsim.benchmarks.engine.workers import Cluster, Local, Lost, open_pool, threads_of
 from ctsim.errors import InputError
 
 SUITE = """
@@ -108,7 +109,7 @@ def make(data: Path, *flags: str) -> int:
 
 
 def score(data: Path, results: Path, *flags: str) -> int:
-    from ctsim.benchmarks.cli_run import main
+    from ctsim.benchmarks.studies.methods.study import main
 
     return main([str(data), str(results), *METHODS, *flags])
 
@@ -119,7 +120,7 @@ def scores(results: Path) -> dict:
 
 
 def records_of(results: Path) -> list:
-    from ctsim.benchmarks import records
+    from ctsim.benchmarks.studies.methods import records
 
     found, torn = records.read_all(results)
     assert not torn and len({r.identity for r in found}) == len(found)
@@ -215,7 +216,7 @@ def test_a_clusters_worker_runs_methods_apart_within_a_time_limit(serial, cluste
     found = scores(tmp_path / "results")
     assert len(found) == 2 and found.items() <= scores(serial / "results").items()
     assert all(r.cost.isolated for r in records_of(tmp_path / "results"))
-    from ctsim.benchmarks.cli_run import main
+    from ctsim.benchmarks.studies.methods.study import main
 
     words = (serial / "data", tmp_path / "hung", "--method", "test_workers:hang", "--seconds", "2", *flags)
     assert main([*map(str, words)]) == 1
@@ -446,7 +447,7 @@ def test_sigterm_ends_the_workers_and_keeps_what_they_noted(serial, tmp_path):
 
 def test_workers_end_with_a_command_that_is_killed(tmp_path):
     code = (
-        "from ctsim.benchmarks.workers import Local; from test_workers import wait\n"
+        "from ctsim.benchmarks.engine.workers import Local; from test_workers import wait\n"
         f"with Local(2) as pool: list(pool.answers(wait, [{str(tmp_path / 'pid')!r}]))"
     )
     with subprocess.Popen(

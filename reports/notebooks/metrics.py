@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from ctsim.benchmarks import inspector
+from ctsim.benchmarks.studies import inspect as inspector
 from ctsim.reports import kept, show
 from ctsim.reports.figures import COLOURS, INK
 

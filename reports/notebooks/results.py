@@ -20,8 +20,8 @@
 import os
 from pathlib import Path
 
-from ctsim.benchmarks.records import read_all
-from ctsim.benchmarks.tables import render
+from ctsim.benchmarks.studies.methods.records import read_all
+from ctsim.benchmarks.studies.methods.tables import render
 from ctsim.errors import InputError
 from ctsim.reports import figures, kept, show
 

@@ -26,8 +26,8 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from ctsim.benchmarks import stress_records
-from ctsim.benchmarks.texts import pictured
+from ctsim.benchmarks.engine.texts import pictured
+from ctsim.benchmarks.studies.stress import tables as stress_records
 from ctsim.detector import Detector
 from ctsim.geometry import Geometry
 from ctsim.kernels import joseph_reference

@@ -1,0 +1,1 @@
+"""What every measuring command shares: tasks, records, tables, processes. Knows nothing of CT."""

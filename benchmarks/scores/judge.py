@@ -1,0 +1,64 @@
+"""All scores of one volume: every protocol that applies to it, from one scan's truth."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.benchmarks.scores.artefact import NO_TWIN, Layout, artefact_score, layout_of
+from ctsim.benchmarks.scores.projection import HeldOut, held_out, projection_score, with_floor
+from ctsim.benchmarks.scores.protocol import Score, Stored, Truth, evaluate, no_metal_score, truth_of
+from ctsim.notes import NOT_ON_GRID
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Twin:
+    """What a method made of the metal-free scan, [z, y, x] in 1/mm; where there is nothing, `reason` says why."""
+
+    values: NDArray[np.float32] | None = None
+    reason: str = NO_TWIN
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judge:
+    """What volumes of one scan are held against.
+
+    `absent` says that the metal of the scan's scene is on no voxel of the grid or in no view, "" where it is on both.
+    """
+
+    truth: Truth
+    layout: Layout
+    views: HeldOut | str
+    absent: str = ""
+
+    @classmethod
+    def of(cls, stored: Stored) -> "Judge":
+        """Load a scan's references and choose where its artefacts are measured."""
+        truth = truth_of(stored)
+        views = with_floor(held_out(stored), truth)
+        return cls(truth=truth, layout=layout_of(stored, truth), views=views, absent=_absent(stored, truth))
+
+    def scores(
+        self, values: NDArray[Any], variant: str, twin: Twin, at_50kev: NDArray[Any] | None = None
+    ) -> dict[str, Score]:
+        """Score a volume under every protocol; of the metal-free `variant` only what compares has a meaning.
+
+        `at_50kev` is what a method that knows energies makes of 50 keV.
+        """
+        scores = evaluate(values, self.truth, at_50kev=at_50kev, anchor=variant != "metal")
+        if variant == "metal":
+            scores["projection"] = projection_score(values, self.views, at_50kev)
+        if variant == "metal" and self.absent:
+            scores["metal"] = no_metal_score(self.absent)
+            scores["artefact"] = artefact_score(values, None, self.layout, self.truth, self.absent)
+        elif variant == "metal" and self.truth.metal.any():
+            scores["artefact"] = artefact_score(values, twin.values, self.layout, self.truth, twin.reason)
+        return scores
+
+
+def _absent(stored: Stored, truth: Truth) -> str:
+    """Return a scan's notes on its metal; where an older version made it, what its mask says."""
+    if stored.info.notes or truth.metal.any() or not stored.info.metal:
+        return "; ".join(stored.info.notes)
+    return f"{NOT_ON_GRID}: the scan's mask is empty, though its scene holds {', '.join(stored.info.metal)}"

@@ -1,0 +1,286 @@
+"""The protocols: which region, which reference, which range, and the scores of a volume under each.
+
+A score is never given without its region, reference, alignment and data range: they stand beside
+the numbers in the record and in the caption of every table.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from ctsim.benchmarks.scores import metrics
+from ctsim.benchmarks.scores.metrics import Mask
+from ctsim.errors import InputError
+
+if TYPE_CHECKING:
+    from ctsim.geometry import Geometry
+    from ctsim.scaninfo import ScanInfo
+    from ctsim.types import Scan
+
+VERSION = 3
+"""Part of every run's identity: a change of the protocol's meaning counts it up.
+
+1: tissue, aligned, paper, metal, cost. 2: every method runs on the metal-free twin too, for `artefact`.
+3: `projection`, and `rmse` of `artefact`. The version was not raised for `at_energy`: only new code has it, and code is
+part of the identity.
+"""
+
+METAL_MARGIN = 2
+BODY_MARGIN = 4
+RANGE_PERCENTILE = 99.9
+ReferenceKind = Literal["effective", "50kev"]
+AS_RETURNED, AT_50KEV = "as returned", "read at 50 keV"
+TISSUE = "inside the body dilated by 4 voxels, outside the metal dilated by 2"
+
+
+class Stored(Protocol):
+    """What the benchmark needs of a scan on disk; `ctsim.store.StoredScan` has it."""
+
+    @property
+    def folder(self) -> Path:
+        """The scan's folder."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """The scene's name."""
+        ...
+
+    @property
+    def scene_id(self) -> str:
+        """The hash of the recipe."""
+        ...
+
+    @property
+    def content_hash(self) -> str:
+        """The hash of the files."""
+        ...
+
+    @property
+    def code(self) -> str:
+        """The hash of the code that made the files."""
+        ...
+
+    @property
+    def scan(self) -> "Scan":
+        """What a method gets."""
+        ...
+
+    @property
+    def geometry(self) -> "Geometry":
+        """The scan's geometry."""
+        ...
+
+    @property
+    def info(self) -> "ScanInfo":
+        """What scan.json says."""
+        ...
+
+    @property
+    def labels(self) -> NDArray[np.uint8]:
+        """Material labels, 0 is air: [z, y, x]."""
+        ...
+
+    @property
+    def metal(self) -> NDArray[np.uint8]:
+        """1 in the metal, [z, y, x]."""
+        ...
+
+    @property
+    def l0(self) -> float:
+        """The water path in mm that the effective-spectrum reference was hardened by."""
+        ...
+
+    @property
+    def metal_free(self) -> "Stored | None":
+        """The same scan without its metal."""
+        ...
+
+    def reference(self, which: str) -> NDArray[np.float32]:
+        """Return the reference volume "effective" or "50kev", [z, y, x] in 1/mm."""
+        ...
+
+
+class Score(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The scores under one protocol, with all that is needed to read them.
+
+    `data_range` is 1/mm; `values` maps a metric to its number, or to None where it does not exist; `volume` says which
+    of a method's volumes was scored.
+    """
+
+    region: str
+    reference: str
+    alignment: str
+    data_range: float | None
+    n_voxels: int
+    values: dict[str, float | None]
+    identical: bool = False
+    note: str = ""
+    volume: str = AS_RETURNED
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Truth:
+    """What a volume is held against: two references and the regions, all [z, y, x].
+
+    `tissue` is the judged region of the protocols `tissue` and `aligned`; `judged` is the dilated body.
+    """
+
+    references: dict[str, NDArray[np.float32]]
+    metal: Mask
+    body: Mask
+    tissue: Mask
+    judged: Mask
+    near_metal: Mask
+    d_voxel: tuple[float, float, float]
+    l0: float
+
+
+def truth_of(stored: Stored) -> Truth:
+    """Load the references of a stored scan and derive the regions from its masks."""
+    metal, body = np.asarray(stored.metal) > 0, np.asarray(stored.labels) > 0
+    near_metal = metrics.dilate(metal, METAL_MARGIN) if metal.any() else metal
+    judged = metrics.dilate(body | metal, BODY_MARGIN)
+    tissue = judged & ~near_metal
+    if not tissue.any():
+        raise InputError(f"scan {stored.name!r}: nothing is left to judge outside the dilated metal")
+    references = {kind: np.asarray(stored.reference(kind), np.float32) for kind in ("effective", "50kev")}
+    for kind, volume in references.items():
+        if not np.isfinite(volume).all():
+            raise InputError(f"scan {stored.name!r}: the {kind} reference must be finite")
+    return Truth(
+        references=references,
+        metal=metal,
+        body=body,
+        tissue=tissue,
+        judged=judged,
+        near_metal=near_metal,
+        d_voxel=stored.geometry.d_voxel,
+        l0=float(stored.l0),
+    )
+
+
+def tissue_range(truth: Truth, kind: ReferenceKind) -> float:
+    """Return the data range of `tissue` and `aligned`: the 99.9 percentile of the reference in the region."""
+    found = float(np.percentile(truth.references[kind][truth.tissue], RANGE_PERCENTILE))
+    if found <= 0:
+        raise InputError(f"the {kind} reference is 0 in the judged region: there is no data range")
+    return found
+
+
+def _reference_text(truth: Truth, kind: ReferenceKind) -> str:
+    return f"effective spectrum behind {truth.l0:.1f} mm of water" if kind == "effective" else "50 keV"
+
+
+def paper_score(values: NDArray[Any], truth: Truth) -> Score:
+    """Score every voxel against μ at 50 keV, range = max − min of the reference; compatibility columns too."""
+    reference = truth.references["50kev"]
+    data_range = float(reference.max()) - float(reference.min())
+    mse = metrics.mse3d(values, reference)
+    return Score(
+        region="all voxels",
+        reference=_reference_text(truth, "50kev"),
+        alignment="none",
+        data_range=data_range,
+        n_voxels=reference.size,
+        identical=mse == 0,
+        values={
+            "psnr3d": metrics.psnr(mse, data_range),
+            "ssim3d": metrics.ssim3d(values, reference, data_range=data_range),
+            "rmse": mse**0.5,
+            "psnr3d_full_gtmax": metrics.psnr(mse, float(reference.max())),
+            "psnr3d_r2": metrics.psnr(mse, 1.0),
+            "ssim3d_r2": metrics.ssim3d_r2(values, reference),
+            "ssim3d_naf": metrics.ssim3d_naf(values, reference),
+        },
+    )
+
+
+def tissue_score(values: NDArray[Any], truth: Truth, kind: ReferenceKind = "effective") -> Score:
+    """Score the tissue outside the metal, without alignment: the primary protocol."""
+    return _region_score(values, truth, kind, "none", {})
+
+
+def aligned_score(values: NDArray[Any], truth: Truth, kind: ReferenceKind) -> Score:
+    """Score the tissue after one least-squares gain, fitted on the body outside the dilated metal."""
+    body = truth.body & ~truth.near_metal
+    gain = metrics.least_squares_gain(values, truth.references[kind], body if body.any() else truth.tissue)
+    if gain is None:
+        return _region_score(values, truth, kind, "none: the reconstruction is 0 in the body", {"gain": None})
+    scaled = values * np.float32(gain)
+    return _region_score(scaled, truth, kind, f"one least-squares gain on the body, {gain:.4f}", {"gain": gain})
+
+
+def _region_score(
+    values: NDArray[Any], truth: Truth, kind: ReferenceKind, alignment: str, extra: dict[str, float | None]
+) -> Score:
+    reference, data_range = truth.references[kind], tissue_range(truth, kind)
+    mse = metrics.mse3d(values, reference, truth.tissue)
+    ssim = metrics.ssim3d(values, reference, data_range=data_range, region=truth.tissue)
+    return Score(
+        region=TISSUE,
+        reference=_reference_text(truth, kind),
+        alignment=alignment,
+        data_range=data_range,
+        n_voxels=int(truth.tissue.sum()),
+        identical=mse == 0,
+        values={"psnr3d": metrics.psnr(mse, data_range), "ssim3d": ssim, "rmse": mse**0.5, **extra},
+    )
+
+
+def metal_score(values: NDArray[Any], truth: Truth) -> Score:
+    """Score the metal itself against its exact mask and the effective-spectrum reference."""
+    reference = truth.references["effective"]
+    cored = metrics.erode(truth.metal).any()
+    return Score(
+        region="metal",
+        reference="the exact solids, as voxels; " + _reference_text(truth, "effective"),
+        alignment="none",
+        data_range=None,
+        n_voxels=int(truth.metal.sum()),
+        values=metrics.metal_metrics(values, reference, truth.metal, truth.judged, truth.d_voxel),
+        note="" if cored else "the metal is too thin to be eroded: its core is all of it",
+    )
+
+
+def no_metal_score(reason: str) -> Score:
+    """Return the score under `metal` of a scan whose scene holds metal that it lacks: no numbers, and why."""
+    return Score(
+        region="metal",
+        reference="none",
+        alignment="none",
+        data_range=None,
+        n_voxels=0,
+        values=dict.fromkeys(metrics.METAL),
+        note=reason,
+    )
+
+
+def evaluate(
+    values: NDArray[Any], truth: Truth, *, at_50kev: NDArray[Any] | None = None, anchor: bool = False
+) -> dict[str, Score]:
+    """Score a volume [z, y, x] in 1/mm under every protocol that applies.
+
+    What is held against 50 keV is `at_50kev` where the method knows it. `anchor` is for a scan taken without the metal:
+    only `tissue` and `aligned` have a meaning then. The volumes must be finite; the caller has given a volume that is
+    not its own status.
+    """
+    if values.shape != truth.metal.shape:
+        raise InputError(f"the volume has shape {values.shape}, the reference {truth.metal.shape}")
+    mono, which = (values, AS_RETURNED) if at_50kev is None else (at_50kev, AT_50KEV)
+    scores = {
+        "tissue": tissue_score(values, truth),
+        "aligned": aligned_score(values, truth, "effective"),
+        "aligned_50kev": replace(aligned_score(mono, truth, "50kev"), volume=which),
+    }
+    if anchor:
+        return scores
+    scores["paper"] = replace(paper_score(mono, truth), volume=which)
+    if truth.metal.any():
+        scores["metal"] = metal_score(values, truth)
+    return scores

@@ -1,0 +1,1 @@
+"""What is measured: one folder or module for each command of `run-benchmark`."""

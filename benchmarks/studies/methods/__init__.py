@@ -1,0 +1,1 @@
+"""`run-benchmark DATA RESULTS`: reconstruction methods over a dataset, scored and timed."""

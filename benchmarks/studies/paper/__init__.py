@@ -1,0 +1,1 @@
+"""`run-benchmark paper-tables`: the tables of the published splat method."""

@@ -1,0 +1,1 @@
+"""`run-benchmark pareto`: run time against error."""

@@ -1,0 +1,70 @@
+"""The figure of `run-benchmark pareto`: a row of axes for each scene, error against time, with the Pareto front."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.colors import TABLEAU_COLORS
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator
+
+from ctsim.benchmarks.engine.texts import pictured
+from ctsim.benchmarks.studies.pareto.front import front
+from ctsim.benchmarks.studies.pareto.records import Part, Point, at_knee
+from ctsim.benchmarks.studies.pareto.tables import curves, groups
+
+DPI, WIDE, HIGH = 150, 9.0, 4.6
+MARKERS, STYLES = ("o", "^", "s", "D"), ("-", "--", ":", "-.")  # by group
+COLOURS = (*TABLEAU_COLORS.values(), "#aec7e8", "#ffbb78", "#98df8a", "#ff9896", "#c5b0d5", "#c49c94", "#f7b6d2")
+FRONT, KNEE = "#202020", "#d00000"
+AXES: dict[Part, tuple[str, str]] = {
+    "simulator": ("s for all views", "relative RMS of P = −ln(signal/open)"),
+    "methods": ("s", "RMSE of the tissue (1/mm)"),
+}
+
+
+def draw(every: Sequence[Point]) -> Figure:
+    """Draw each scene's points: time and error on log axes, defaults, and the front and knee of each group."""
+    scenes: dict[tuple[str, str], list[Point]] = {}
+    for p in every:
+        scenes.setdefault((p.setting.part, p.setting.scene), []).append(p)
+    figure = Figure(figsize=(WIDE, HIGH * len(scenes)), layout="constrained")
+    for axes, mine in zip(figure.subplots(len(scenes), 1, squeeze=False)[:, 0], scenes.values(), strict=True):
+        _scene(axes, mine)
+    return figure
+
+
+def _scene(axes: Axes, every: Sequence[Point]) -> None:
+    handles: list[Any] = []
+    known = list(dict.fromkeys(p.setting.curve for p in every))
+    for k, group in enumerate(groups(every)):
+        for curve, mine in curves(group).items():
+            x, y = zip(*sorted(p.pair for p in mine), strict=True)  # a default may stand anywhere on its curve
+            colour = COLOURS[known.index(curve) % len(COLOURS)]
+            marker = MARKERS[k % len(MARKERS)]
+            handles += axes.plot(x, y, marker=marker, markersize=5, linewidth=0.8, color=colour, label=pictured(curve))
+        pairs = [p.pair for p in group]
+        x, y = zip(*(pairs[i] for i in front(pairs)), strict=True)
+        label = pictured(f"front: {group[0].setting.group}")
+        handles += axes.step(
+            x, y, where="post", color=FRONT, linewidth=1.0, linestyle=STYLES[k % len(STYLES)], zorder=1, label=label
+        )
+        if (knee := at_knee(group)) is not None:
+            axes.plot(*knee.pair, "o", markersize=15, markerfacecolor="none", markeredgecolor=KNEE)
+    chosen = [p.pair for p in every if p.default]
+    if chosen:
+        axes.plot(*zip(*chosen, strict=True), "x", color=FRONT, markersize=9)
+    handles += [
+        Line2D([], [], color=KNEE, marker="o", markersize=11, markerfacecolor="none", linestyle="", label="knee"),
+        Line2D([], [], color=FRONT, marker="x", markersize=8, linestyle="", label="default"),
+    ]
+    setting = every[0].setting
+    x, y = AXES[setting.part]
+    axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y, title=pictured(f"{setting.part}, {setting.scene}"))
+    axes.grid(which="both", alpha=0.2)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_locator(LogLocator(subs=(2, 5)))
+        axis.set_minor_formatter("{x:g}")
+    axes.legend(handles=handles, loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=8, frameon=False)

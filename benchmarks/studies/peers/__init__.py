@@ -1,0 +1,1 @@
+"""`run-benchmark peers`: speed and error next to other libraries."""

@@ -1,0 +1,1 @@
+"""`run-benchmark skipping`: what is left out, the time it saves, and what it changes."""

@@ -1,0 +1,1 @@
+"""`run-benchmark stress`: numerically hard cases, each with its expected outcome."""

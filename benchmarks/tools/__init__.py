@@ -1,0 +1,1 @@
+"""Scripts of the developers; not part of an installed ctsim."""

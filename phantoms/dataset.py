@@ -1,0 +1,120 @@
+"""Datasets: one scene simulated into a folder, with its truth, so that a stopped run goes on where it was."""
+
+import contextlib
+import hashlib
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ctsim.detector import response
+from ctsim.errors import InputError
+from ctsim.phantoms.scene import Scene, build, scene_id, scene_to_toml, stream_id
+from ctsim.plan import Plan, make_plan
+from ctsim.simulate import scan_info, simulate_views, truth_volumes
+from ctsim.spectrum import spectrum
+from ctsim.types import Phantom, Scanner
+from ctsim.writer import SceneWriter, Stack
+
+Watch = Callable[[Iterable[Any], int, int], Iterable[Any]]
+"""Passes on views while it shows how far they are: (views, number of the first, number of all) -> the same views."""
+
+
+def plan_scene(scene: Scene) -> Plan:
+    """Plan a scene's simulation. Raises InputError where memory is short."""
+    with _memory(scene.name):
+        return _plan(scene, build(scene), scene.resolve())
+
+
+def _plan(scene: Scene, phantom: Phantom, scanner: Scanner) -> Plan:
+    return make_plan(phantom, scanner, scene.simulation, scene.truth, stream_id(scene))
+
+
+def make_scene(
+    scene: Scene,
+    out: Path,
+    *,
+    plan: Plan | None = None,
+    force: bool = False,
+    watch: Watch = lambda views, first, n: views,
+) -> Path:
+    """Simulate a scene into the data folder `out` and return its folder.
+
+    Goes on after the last view that an earlier run of the same scene and code left safe. `plan` is that of
+    `plan_scene`, where it is known; with `force`, another scene of the same name is replaced.
+
+    Raises
+    ------
+    InputError
+        Where another scene is in the way, the disk is full or memory is short.
+    """
+    with _memory(scene.name):
+        phantom, scanner = build(scene), scene.resolve()
+        plan = plan or _plan(scene, phantom, scanner)
+        stacks = tuple(
+            Stack(
+                name=o.name,
+                shape=(scanner.geometry.n_views, *o.shape),
+                dtype=o.dtype,
+                pixel=scanner.geometry.d_detector,
+            )
+            for o in plan.outputs
+        )
+        with SceneWriter(
+            out, scene.name, scene_id=scene_id(scene), plan_hash=plan_hash(plan), stacks=stacks, force=force
+        ) as writer:
+            views = simulate_views(plan, phantom, scanner, first_view=writer.first_view)
+            for view, arrays in watch(views, writer.first_view, scanner.geometry.n_views):
+                writer.put(view, arrays)
+            _write_truth(writer, plan, phantom, scanner)
+            writer.write_text("scene.toml", scene_to_toml(scene))
+            return writer.finish()
+
+
+def _write_truth(writer: SceneWriter, plan: Plan, phantom: Phantom, scanner: Scanner) -> None:
+    """Write what a scan has once: the flat, the true volumes, and how both were made."""
+    info = dict(scan_info(plan, phantom, scanner))
+    writer.write_image("flat", info.pop("flat"), scanner.geometry.d_detector)
+    for name, volume in truth_volumes(plan, phantom, scanner):
+        writer.write_image(name, volume, scanner.geometry.d_voxel)
+    writer.write_text("scan.json", _json(info))
+    writer.write_text("plan.json", _json(plan.to_dict()))
+    writer.write_text("spectrum.csv", spectrum_csv(scanner))
+
+
+def plan_hash(plan: Plan) -> str:
+    """Hash what a plan does, leaving out its estimates of time, which change with the machine."""
+    kept = {k: v for k, v in plan.to_dict().items() if k != "seconds"}
+    return hashlib.sha256(_json(kept)).hexdigest()
+
+
+def spectrum_csv(scanner: Scanner) -> str:
+    """Return the tube's spectrum and what the detector makes of it as CSV."""
+    tube = spectrum(scanner.tube)
+    signal = tube.weights * response(scanner.detector, tube.energies)[0]
+    signal = signal / signal.sum()
+    rows = zip(tube.energies, tube.weights, signal, strict=True)
+    return "energy_kev,photon_fraction,signal_fraction\n" + "".join(f"{e:.4f},{w:.8g},{s:.8g}\n" for e, w, s in rows)
+
+
+@contextlib.contextmanager
+def _memory(name: str) -> Iterator[None]:
+    """Turn a lack of memory into an InputError that names the scene."""
+    try:
+        yield
+    except MemoryError as error:
+        raise InputError(
+            f"{name}: there is not enough memory ({error or 'no size is known'}); expected a smaller "
+            "phantom.n_voxel, scanner.n_voxel or scanner.n_detector"
+        ) from error
+
+
+def _json(value: Any) -> bytes:
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray | np.generic):
+            return value.tolist()
+        raise TypeError(f"{type(value).__name__} cannot be written as JSON")
+
+    return msgspec.json.format(msgspec.json.encode(value, enc_hook=plain), indent=1) + b"\n"
