@@ -193,7 +193,7 @@ def test_closed_form_chord_through_the_axis_is_the_diameter():
 
 def test_turns_alternate_and_the_first_call_stands_apart():
     calls = []
-    timed = peer_cases.in_turns({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, 3)
+    timed = host.in_turns({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, 3)
     assert "".join(calls) == "abababab"
     assert [len(seconds) for _, seconds in timed.values()] == [3, 3]
 

@@ -8,7 +8,7 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -42,7 +42,8 @@ def _cpu_name() -> str:
 def _threads() -> int:
     """Return the threads that the kernels use."""
     numba = sys.modules.get("numba")
-    return int(numba.get_num_threads()) if numba else len(os.sched_getaffinity(0))
+    cores = len(os.sched_getaffinity(0))
+    return int(numba.get_num_threads()) if numba else int(os.environ.get("NUMBA_NUM_THREADS", cores))
 
 
 def _version(package: str) -> str:
@@ -144,3 +145,20 @@ def measured() -> Iterator[Usage]:
         usage.wall = time.perf_counter() - wall
         usage.cpu = time.process_time() - cpu
         usage.peak_bytes = peak_memory()
+
+
+def machine() -> str:
+    """Return the processor and the threads of the kernels: what times depend on."""
+    here = host()
+    return f"{here.cpu}, {here.threads} threads"
+
+
+def in_turns(runs: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, tuple[float, tuple[float, ...]]]:
+    """Call the functions once each, then in turns; return (seconds of the first call, seconds of the others)."""
+    seconds: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(repeats + 1):
+        for name, run in runs.items():
+            start = time.perf_counter()
+            run()
+            seconds[name].append(time.perf_counter() - start)
+    return {name: (s[0], tuple(s[1:])) for name, s in seconds.items()}

@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from ctsim.benchmarks.engine import apart
+from ctsim.benchmarks.engine.host import in_turns
 from ctsim.benchmarks.studies.peers import catalogue as peer_catalogue
 from ctsim.benchmarks.studies.peers import paper as peer_paper
 from ctsim.benchmarks.studies.peers import rtk as peer_rtk
@@ -87,19 +88,6 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     error_kind: str = ""
     peak_bytes: int | None = None
     note: str = ""
-
-
-def in_turns(
-    contenders: Mapping[str, Callable[[], object]], repeats: int
-) -> dict[str, tuple[float, tuple[float, ...]]]:
-    """Run the contenders once each, then in turns; return (seconds of the first call, seconds of the others)."""
-    seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    for _ in range(repeats + 1):
-        for name, run in contenders.items():
-            start = time.perf_counter()
-            run()
-            seconds[name].append(time.perf_counter() - start)
-    return {name: (s[0], tuple(s[1:])) for name, s in seconds.items()}
 
 
 def left_out(setup: Setup, case: Case, scene: str) -> list[Measurement]:

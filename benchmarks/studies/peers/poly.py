@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.benchmarks.engine import apart, host
+from ctsim.benchmarks.engine.host import in_turns
 from ctsim.benchmarks.studies.peers import catalogue as peer_catalogue
 from ctsim.benchmarks.studies.peers import rtk as peer_rtk
 from ctsim.benchmarks.studies.peers import xcist as peer_xcist
@@ -18,7 +19,6 @@ from ctsim.benchmarks.studies.peers.cases import (
     XCIST,
     Measurement,
     Setup,
-    in_turns,
     left_out,
     relative,
     voxelised,

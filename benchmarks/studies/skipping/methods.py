@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import io
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,15 @@ from ctsim.baselines.nmar import Normalise, normalised
 from ctsim.baselines.prior import Choice, choose_prior
 from ctsim.benchmarks import make_dataset
 from ctsim.benchmarks.cli import EXIT_INTERRUPTED
+from ctsim.benchmarks.engine.record import Task
 from ctsim.benchmarks.methods import Method, find
 from ctsim.benchmarks.studies.methods import study as cli_run
 from ctsim.benchmarks.studies.methods.attempt import scan_for
 from ctsim.benchmarks.studies.methods.volumes import read_volume
 from ctsim.benchmarks.studies.skipping import simulator as skipping_cases
+from ctsim.benchmarks.studies.skipping.finding import Skip
 from ctsim.benchmarks.studies.skipping.simulator import Pair, Pairs, Setup, largest
-from ctsim.benchmarks.studies.skipping.tables import Measured
+from ctsim.benchmarks.studies.skipping.study import Flags
 from ctsim.phantoms.scene import scene_to_toml
 from ctsim.reconstruct.fdk import fdk_stream
 from ctsim.reconstruct.fdk import reconstruct as fdk
@@ -135,7 +138,6 @@ def metal_free(setup: Setup) -> Iterator[Pair[torch.Tensor]]:
         scan = scan_for(method, stored, "metal_free")
 
         yield Pair(
-            case="metal-free",
             scene=f"{stored.name}, twin",
             what=f"all that {name.upper()} does after FDK where there is no metal",
             skipping=functools.partial(corrected, method, scan),
@@ -163,7 +165,6 @@ def rows(setup: Setup) -> Iterator[Pair[torch.Tensor]]:
     for name, (part, bridging) in ways.items():
         most = float(part().abs().max())
         yield Pair(
-            case="rows",
             scene=stored.name,
             what=f"detector rows that {name} leaves as they are",
             skipping=part,
@@ -186,7 +187,6 @@ def stored_scan(setup: Setup) -> Iterator[Pair[list[NDArray[Any]]]]:
         return [found.array(name) for name in names]  # mapped, not read
 
     yield Pair(
-        case="scan",
         scene=stored.name,
         what="make-dataset of a scan that is there",
         skipping=arrays,
@@ -206,7 +206,6 @@ def recorded_run(setup: Setup) -> Iterator[Pair[list[NDArray[np.float32]]]]:
         return [read_volume(path) for path in sorted((results / "volumes").glob("*.tif"))]
 
     yield Pair(
-        case="record",
         scene=name,
         what="run-benchmark of a run that is recorded, LIMAR on the scan and its twin",
         skipping=volumes,
@@ -219,6 +218,13 @@ def recorded_run(setup: Setup) -> Iterator[Pair[list[NDArray[np.float32]]]]:
 CASES: dict[str, Pairs] = {"metal-free": metal_free, "rows": rows, "scan": stored_scan, "record": recorded_run}
 
 
-def measured(case: str, setup: Setup) -> list[Measured]:
-    """Measure all pairs of a case, of those here and in `skipping_cases`."""
-    return [pair.measure(setup.repeats) for pair in (skipping_cases.CASES | CASES)[case](setup)]
+def measure(task: Task, given: Flags) -> list[Skip]:
+    """Measure all pairs of a case."""
+    setup = Setup(size=task.part, repeats=given.repeats, folder=_folder())
+    return [pair.measure(given.repeats) for pair in (skipping_cases.CASES | CASES)[task.case](setup)]
+
+
+@functools.cache
+def _folder() -> Path:
+    """Return a folder that all cases of this process share, so that a scan is made once."""
+    return Path(tempfile.mkdtemp(prefix="ctsim-skipping-"))  # goes with the process's own TMPDIR

@@ -17,9 +17,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.benchmarks.studies.peers.cases import in_turns
+from ctsim.benchmarks.engine.host import in_turns
+from ctsim.benchmarks.studies.skipping.finding import CORE, Skip
 from ctsim.benchmarks.studies.skipping.limits import rounding
-from ctsim.benchmarks.studies.skipping.tables import CORE, Measured
 from ctsim.benchmarks.suites import load, select
 from ctsim.bricks import Bricks, make_bricks
 from ctsim.geometry import Geometry
@@ -82,9 +82,8 @@ def shrunk(scene: Scene) -> Scene:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pair(Generic[T]):
-    """Two ways to one result, and how far apart results are. Fields as in `Measured`."""
+    """Two ways to one result, and how far apart results are. Fields as in `Skip`."""
 
-    case: str
     scene: str
     what: str
     skipping: Callable[[], T]
@@ -95,7 +94,7 @@ class Pair(Generic[T]):
     stated: str = "exact"
     note: str = ""
 
-    def measure(self, repeats: int) -> Measured:
+    def measure(self, repeats: int) -> Skip:
         """Run both in turns; the results of the last turn are compared."""
         last: dict[str, T] = {}
 
@@ -108,13 +107,13 @@ class Pair(Generic[T]):
         ways = {"skipping": run("skipping", self.skipping), "whole": run("whole", self.whole)}
         seconds = {name: counted for name, (_, counted) in in_turns(ways, repeats).items()}
         difference = self.difference(last["skipping"], last["whole"])
-        return Measured(
-            case=self.case,
+        finite = math.isfinite(difference)
+        return Skip(
+            ok=finite and (self.limit is None or difference <= self.limit),
+            seconds=seconds,
             scene=self.scene,
             what=self.what,
-            skipping=seconds["skipping"],
-            whole=seconds["whole"],
-            difference=difference if math.isfinite(difference) else None,
+            difference=difference if finite else None,
             unit=self.unit,
             limit=self.limit,
             stated=self.stated,
@@ -169,7 +168,6 @@ def materials(setup: Setup) -> Iterator[Pair[Images]]:
     plan = make_plan(phantom, scanner, scene.simulation, LINES, stream_id(scene))
     every = dataclasses.replace(plan, materials=phantom.materials)
     yield Pair(
-        case="materials",
         scene=scene.name,
         what=f"materials that do not occur: {', '.join(ABSENT)}",
         skipping=next_views(setup, plan, phantom, scanner),
@@ -207,7 +205,6 @@ def bricks(setup: Setup) -> Iterator[Pair[list[NDArray[np.float32]]]]:
 
     longest = max(float(np.max(view)) for view in lengths(fast))
     yield Pair(
-        case="bricks",
         scene=scene.name,
         what="bricks of one label, air among them, crossed in one step",
         skipping=lambda: lengths(fast),
@@ -226,7 +223,6 @@ def rays(setup: Setup) -> Iterator[Pair[Images]]:
         plan, phantom, scanner = planned(setup, scene=scene)
         every = dataclasses.replace(plan, settings=msgspec.structs.replace(plan.settings, skip=False))
         yield Pair(
-            case="rays",
             scene=scene.name,
             what="rays that miss the object, and inserts that a ray cannot meet",
             skipping=next_views(setup, plan, phantom, scanner),
@@ -264,7 +260,6 @@ def energies(setup: Setup) -> Iterator[Pair[list[NDArray[np.float32]]]]:
     alike = dataclasses.replace(every, edge_mu=few.edge_mu)
     moved = in_logarithm(signals(setup, scan, every), signals(setup, scan, alike))
     yield Pair(
-        case="energies",
         scene=setup.scene().name,
         what=f"{len(plan.rule.energies)} energies instead of {len(fine.energies)}",
         skipping=lambda: signals(setup, scan, few),
@@ -307,7 +302,6 @@ def edges(setup: Setup) -> Iterator[Pair[list[NDArray[np.float32]]]]:
 
     moved = in_logarithm(signals(setup, scan, few), signals(setup, scan, every))
     yield Pair(
-        case="edges",
         scene=scene.name,
         what=f"sub-rays where solids have no edge: {np.mean(central):.0%} of pixels",
         skipping=lambda: signals(setup, scan, few),
@@ -327,7 +321,6 @@ def refining(setup: Setup) -> Iterator[Pair[Images]]:
         plan, phantom, scanner = planned(setup, scene=scene)
         settings = msgspec.structs.replace(plan.settings, edge_tolerance=math.inf)
         yield Pair(
-            case="refining",
             scene=scene.name,
             what=f"further sub-rays for edge pixels estimated to be off by over {plan.settings.edge_tolerance} in P",
             skipping=next_views(setup, dataclasses.replace(plan, settings=settings), phantom, scanner),
@@ -345,7 +338,6 @@ def scatter(setup: Setup) -> Iterator[Pair[Images]]:
     plain, phantom, scanner = planned(setup)
     plan, _, scattering = planned(setup, scatter=Scatter(level=1))
     yield Pair(
-        case="scatter",
         scene=setup.scene().name,
         what="scatter at level 0, which leaves it out",
         skipping=next_views(setup, plain, phantom, scanner),
@@ -368,7 +360,6 @@ def twin(setup: Setup) -> Iterator[Pair[Images]]:
         without = make_plan(bare, scanner, scene.simulation, single, plan.stream_id)
         without = dataclasses.replace(without, rule=plan.rule, materials=plan.materials)
         yield Pair(
-            case="twin",
             scene=scene.name,
             what="rays and draws of the metal-free twin out of the metal's shadow",
             skipping=next_views(setup, plan, phantom, scanner),
@@ -391,7 +382,6 @@ def truth(setup: Setup) -> Iterator[Pair[Images]]:
     asked = Truth(noise_free=True, scatter_free=True, mono_kev=(60.0,), trace=True, metal_path=True, paths=True)
     every = planned(setup, asked)[0]
     yield Pair(
-        case="truth",
         scene=setup.scene().name,
         what="ground truth that is not asked for",
         skipping=next_views(setup, plan, phantom, scanner),

@@ -1,0 +1,137 @@
+"""Jobs on the workers of a Dask scheduler, and the choice between this process, a pool and a scheduler."""
+
+import contextlib
+import gc
+import importlib
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import CancelledError
+from typing import Any, Self
+
+from ctsim.benchmarks.engine.process import TICK, Answers, Function, Jobs, Lost, Pool, answered
+from ctsim.errors import InputError
+
+CONNECT = 10.0  # seconds that a scheduler has to answer
+CERTIFICATES = ("distributed.comm.tls.ca-file", "distributed.comm.tls.client.cert")
+
+
+def open_jobs(workers: int, scheduler: str | None) -> contextlib.AbstractContextManager[Jobs | None]:
+    """Return what --workers and --scheduler ask for; None where this process is to do all.
+
+    Raises InputError for less than one worker, for both at once, and for a scheduler that cannot be used.
+    """
+    if workers < 1:
+        raise InputError(f"--workers {workers}: expected 1 or more")
+    if scheduler is None:
+        return contextlib.nullcontext() if workers == 1 else Pool(workers)
+    if workers != 1:
+        raise InputError("--workers and --scheduler exclude each other: the scheduler's own workers do the work")
+    return Cluster(scheduler)
+
+
+class Cluster:
+    """The workers of a Dask scheduler: one job at a time each, with as many threads as Dask gave the worker.
+
+    Certificates for a scheduler at tls:// come from Dask's configuration. Workers may come and go. They outlive the
+    command: when it is interrupted, jobs that have begun there end by themselves.
+    """
+
+    def __init__(self, address: str) -> None:
+        try:
+            self._dask: Any = importlib.import_module("distributed")
+        except ImportError:
+            raise InputError("--scheduler needs the package distributed: pip install 'ctsim[cluster]'") from None
+        for name in ("distributed", "distributed.client"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # our errors say what matters
+        self._address, reason = address, ""
+        try:
+            self._client = self._dask.Client(address, timeout=CONNECT)
+        except (OSError, ValueError, RuntimeError, TypeError) as error:
+            said = " ".join(str(error).split()) or type(error).__name__
+            reason = f"no Dask scheduler answers there, expected tcp://host:port or tls://host:port ({said})"
+            if isinstance(error, TypeError) and address.startswith("tls://"):  # it would connect without a context
+                reason = f"needs certificates: expected {' and '.join(CERTIFICATES)} in Dask's configuration"
+        if reason:
+            # the client that failed closes itself when it is collected; while another is made that waits for ever
+            gc.collect()
+            raise InputError(f"--scheduler {address}: {reason}")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._client.close()  # jobs that nobody waits for do not begin
+
+    def answers(self, function: Function, jobs: Sequence[Any]) -> Answers:
+        """See `Jobs`. Raises InputError when the scheduler is gone."""
+        try:
+            yield from self._answers(function, jobs)
+        except (CancelledError, self._dask.comm.CommClosedError) as error:
+            raise self._gone() from error
+
+    def _gone(self) -> InputError:
+        return InputError(f"--scheduler {self._address}: it is gone; the same command goes on from here")
+
+    def _answers(self, function: Function, jobs: Sequence[Any]) -> Answers:
+        waiting, running = deque(range(len(jobs))), {}
+        while waiting or running:
+            # no more jobs than workers: Dask gives each to an idle one, and moves it when that is lost
+            for _ in range(min(len(waiting), self._workers() - len(running))):
+                number = waiting.popleft()
+                running[self._client.submit(_alone, function, jobs[number], pure=False)] = number
+            done = self._done(list(running))
+            if not done:
+                yield None
+            for future in done:
+                yield running.pop(future), self._answer(future)
+
+    def _workers(self) -> int:
+        try:
+            return len(self._client.nthreads())
+        except OSError as error:  # it does not answer in time
+            raise self._gone() from error
+
+    def _done(self, futures: list[Any]) -> set[Any]:
+        """Wait a little for one of the futures; return those that have ended."""
+        if not futures:  # no worker is there yet
+            time.sleep(TICK)
+            return set()
+        try:
+            return self._dask.wait(futures, timeout=TICK, return_when="FIRST_COMPLETED").done
+        except TimeoutError:
+            return set()
+
+    def _answer(self, future: Any) -> Any:
+        error = future.exception()
+        if isinstance(error, self._dask.scheduler.KilledWorker):
+            return Lost("its process died each time that Dask started it")
+        if error is not None:
+            raise error
+        failed, answer = future.result()
+        if failed:
+            raise answer
+        return answer
+
+
+_ALONE = threading.Lock()
+
+
+def _alone(function: Function, job: Any) -> tuple[bool, Any]:
+    """Be a Dask task: alone in its process, for neither kernels nor measurements share one.
+
+    An exception is returned: where Dask cannot pickle one, nobody hears of it and the client waits for ever.
+    """
+    with _ALONE:
+        import numba
+        import torch
+        from distributed import get_worker
+        from numba.core import config
+
+        threads: int = get_worker().state.nthreads
+        most = int(config.NUMBA_NUM_THREADS)  # pyright: ignore[reportAttributeAccessIssue]
+        numba.set_num_threads(min(threads, most))
+        torch.set_num_threads(threads)
+        return answered(function, job)

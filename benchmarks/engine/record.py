@@ -1,0 +1,268 @@
+"""Tasks, what was found, and the records of both: one JSON line each, appended as they are measured.
+
+A record is on the disk before the next task begins; a line whose writing was interrupted is cut off by the next one.
+"""
+
+import hashlib
+import logging
+import os
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import msgspec
+
+from ctsim.benchmarks.engine.collector import uncollected
+from ctsim.benchmarks.engine.host import Host
+from ctsim.durable import append_synced, cut_torn, write_synced
+from ctsim.errors import InputError
+from ctsim.locks import locked
+
+log = logging.getLogger(__name__)
+
+OK = "ok"
+
+
+class Task(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One row to measure: everything that determines the result, so that equal identities are measured once.
+
+    `part`, `case` and `subject` name the row. `data` and `code` are hashes; `machine` is set where time is what is
+    measured. A study counts `version` up when it measures something else. `place` orders tables and determines
+    nothing.
+    """
+
+    study: str
+    part: str = ""
+    case: str
+    subject: str = ""
+    settings: dict[str, Any] = {}
+    data: str = ""
+    code: str = ""
+    machine: str = ""
+    version: int = 1
+    place: tuple[int, ...] = ()
+
+    @property
+    def identity(self) -> str:
+        """SHA-256 over all fields but the place."""
+        fields = msgspec.structs.replace(self, place=())
+        return hashlib.sha256(msgspec.json.encode(fields, order="sorted")).hexdigest()
+
+    @property
+    def row(self) -> tuple[str, str, str]:
+        """The row of the table."""
+        return self.part, self.case, self.subject
+
+
+class Found(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The outcome of a task or of one part of it; studies add what they measure.
+
+    `ok` says whether it is as expected; `status` is not "ok" where it did not finish, for the `reason`. `seconds` are
+    the times of its runs by name, `files` what it left in the results folder, by path relative to that.
+    """
+
+    ok: bool = True
+    status: str = OK
+    reason: str = ""
+    seconds: dict[str, tuple[float, ...]] = {}
+    files: dict[str, str] = {}
+
+
+F = TypeVar("F", bound=Found)
+
+
+class Record(msgspec.Struct, Generic[F], frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A task and all that was found, and where, when and by which commit."""
+
+    task: Task
+    found: tuple[F, ...]
+    host: Host
+    commit: str
+    time: str
+
+    @property
+    def finished(self) -> bool:
+        """Whether every part ended well; what did not is measured again."""
+        return all(one.status == OK for one in self.found)
+
+    @property
+    def repeats(self) -> int:
+        """The least number of timed runs of its parts; 1 where none is timed."""
+        return min((len(s) for one in self.found for s in one.seconds.values()), default=1)
+
+
+class Store(Generic[F]):
+    """The records of one study in a results folder: `NAME.jsonl`, and files of other machines, `NAME-*.jsonl`."""
+
+    def __init__(self, folder: Path, name: str, kind: type[F], what: str) -> None:
+        self.folder, self.path, self._name = folder, folder / f"{name}.jsonl", name
+        self._decoder = msgspec.json.Decoder(Record[kind])
+        self._what = what
+
+    @uncollected()
+    def read(self) -> list[Record[F]]:
+        """Return all records, oldest first; none where there is no file. Warns of a last line that was cut short.
+
+        Raises InputError where a whole line is not a record.
+        """
+        return merged([list(self._of(path)) for path in self._files(self.folder)])
+
+    def append(self, records: Iterable[Record[F]]) -> None:
+        """Append records and force them to the disk; alone among processes."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with locked(self.path) as handle:
+            cut_torn(handle)  # of a command that was killed while it wrote
+            append_synced(self.path, handle, encoded(records))
+
+    def collect(self, others: Sequence[Path]) -> dict[Path, int]:
+        """Take over the records of other results folders that this one lacks; return how many came from each.
+
+        What ended well here, or failed here as there, is left out. Files of a record stay where they are. Raises
+        InputError for a folder without records.
+        """
+        brought = {other: Store.read(self._at(other)) for other in others}
+        for other, records in brought.items():
+            if not records:
+                raise InputError(f"--collect {other}: there are no records, expected a folder with {self.path.name}")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        counts: dict[Path, int] = {}
+        with locked(self.path) as handle:  # what another command appends meanwhile would be lost
+            cut_torn(handle)
+            files = [list(self._of(self.path))]
+            known = {r.task.identity: r.finished for r in sorted(self.read(), key=lambda r: r.finished)}
+            for other, records in brought.items():
+                lacked = [r for r in records if not known.get(r.task.identity, False)]
+                lacked = [r for r in lacked if r.finished or r.task.identity not in known]
+                known |= {r.task.identity: r.finished for r in sorted(lacked, key=lambda r: r.finished)}
+                files.append([_moved(r, other, self.folder) for r in lacked])
+                counts[other] = len(lacked)
+            if any(files[1:]):
+                write_synced(self.path, encoded(merged(files)))
+        return counts
+
+    def _at(self, folder: Path) -> "Store[F]":
+        other = Store.__new__(Store)
+        other.__dict__ |= self.__dict__ | {"folder": folder, "path": folder / self.path.name}
+        return other
+
+    def _files(self, folder: Path) -> list[Path]:
+        return sorted([*folder.glob(f"{self._name}.jsonl"), *folder.glob(f"{self._name}-*.jsonl")])
+
+    def _of(self, path: Path) -> Iterator[Record[F]]:
+        data = path.read_bytes() if path.exists() else b""
+        for number, line in enumerate(data.splitlines(keepends=True), 1):
+            try:
+                yield self._decoder.decode(line)
+            except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+                if not line.endswith(b"\n"):
+                    log.warning("%s: the last line was cut short; that measurement is left out", path)
+                    return
+                raise InputError(f"{path}, line {number}: expected {self._what}: {error}") from None
+
+
+def encoded(records: Iterable[msgspec.Struct]) -> bytes:
+    """Return records as lines."""
+    return b"".join(msgspec.json.encode(record) + b"\n" for record in records)
+
+
+def _moved(record: Record[F], source: Path, folder: Path) -> Record[F]:
+    """Return a record of another results folder with the paths from `folder` to its files."""
+
+    def path(name: str) -> str:
+        return os.path.relpath(source.resolve() / name, folder.resolve())
+
+    found = tuple(
+        msgspec.structs.replace(one, files={what: path(name) for what, name in one.files.items()})
+        for one in record.found
+    )
+    return msgspec.structs.replace(record, found=found)
+
+
+def merged(files: Sequence[Sequence[Record[F]]]) -> list[Record[F]]:
+    """Merge the records of several files, oldest first; those of one file keep their order.
+
+    Records are dated by the clocks of several machines, which may be wrong; the order of lines never is.
+    """
+    if len(files) == 1:
+        return list(files[0])
+    dated = [
+        (time, number, k)
+        for number, found in enumerate(files)
+        for k, time in enumerate(_never_falling([record.time for record in found]))
+    ]
+    return [files[number][k] for _, number, k in sorted(dated)]
+
+
+def _never_falling(times: Sequence[str]) -> list[str]:
+    """Return the times of a file's lines; where a clock was out of step with most others, that of the line before."""
+    if all(a <= b for a, b in pairwise(times)):
+        return list(times)
+    # the longest sequence that never falls: `last[n]` is the line that ends one of n + 1 lines at the earliest time
+    last: list[int] = []
+    ends: list[str] = []
+    before: list[int] = []
+    for k, time in enumerate(times):
+        n = bisect_right(ends, time)
+        before.append(last[n - 1] if n else -1)
+        last[n : n + 1], ends[n : n + 1] = [k], [time]
+    in_step, k = set(), last[-1]
+    while k >= 0:
+        in_step.add(k)
+        k = before[k]
+    out, now = [], times[min(in_step)]
+    for k, time in enumerate(times):
+        now = time if k in in_step else now
+        out.append(now)
+    return out
+
+
+def by_row(records: Sequence[Record[F]]) -> dict[tuple[str, str, str], list[Record[F]]]:
+    """Return, for each row, the records of its newest identity, those that ended well where any did.
+
+    Of a case only its newest data count, and the machine that was last to measure it: a scan that was made again
+    supersedes all that was measured on the old one, and times of two machines do not compare.
+    """
+    data = {r.task.row[:2]: r.task.data for r in records}
+    records = [r for r in records if r.task.data == data[r.task.row[:2]]]
+    machine = {r.task.row[:2]: r.task.machine for r in sorted(records, key=lambda r: r.finished)}
+    records = [r for r in records if r.task.machine == machine[r.task.row[:2]]]
+    rows: dict[tuple[str, str, str], list[Record[F]]] = {}
+    for record in records:
+        rows.setdefault(record.task.row, []).append(record)
+    return {row: _newest(found) for row, found in rows.items()}
+
+
+def _newest(found: list[Record[F]]) -> list[Record[F]]:
+    identity = found[-1].task.identity
+    newest = [r for r in found if r.task.identity == identity]
+    return [r for r in newest if r.finished] or newest[-1:]
+
+
+def latest(records: Sequence[Record[F]]) -> list[Record[F]]:
+    """Return the record of each row that tables show: the last that ended well, without one the last. By place."""
+    return sorted((found[-1] for found in by_row(records).values()), key=lambda r: r.task.place)
+
+
+def done(records: Sequence[Record[F]], repeats: int = 1) -> Counter[str]:
+    """Count the records of each identity that ended well with at least so many timed runs."""
+    return Counter(r.task.identity for r in records if r.finished and r.repeats >= repeats)
+
+
+def provenance(records: Sequence[Record[F]]) -> str:
+    """Say when, on which machines and by which commits the records were measured."""
+    times = sorted(r.time for r in records)
+    machines = dict.fromkeys(
+        f"{h.cpu}, {h.cores} cores, {h.threads} threads, Python {h.python}, numba {h.versions.get('numba', '?')}"
+        for h in (r.host for r in records)
+    )
+    commits = dict.fromkeys(short(r.commit) for r in records)
+    when = times[0] if times[0] == times[-1] else f"{times[0]} to {times[-1]}"
+    return f"{when}, commit {', '.join(commits)}, {' and '.join(machines)}."
+
+
+def short(commit: str) -> str:
+    """Return the first digits of a commit, and whether files differed from it."""
+    return commit[:12] + "+changes" * commit.endswith("+changes")

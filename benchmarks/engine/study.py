@@ -1,0 +1,326 @@
+"""The life of every measuring command: list tasks, skip what is recorded, measure, record, write tables."""
+
+import functools
+import pkgutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from statistics import median
+from typing import Annotated, Any, ClassVar, Generic, Self, TypeVar
+
+import tyro
+
+from ctsim.benchmarks.engine import host
+from ctsim.benchmarks.engine.dask import open_jobs
+from ctsim.benchmarks.engine.process import Lost, Process, Stopped, check_limit
+from ctsim.benchmarks.engine.record import OK, Found, Record, Store, Task, done, latest, provenance
+from ctsim.benchmarks.engine.table import Table
+from ctsim.durable import write_synced
+from ctsim.errors import InputError
+from ctsim.human import human_time
+
+SHARE = 0.1  # of the time that may go into tables while tasks are measured
+
+Others = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="OTHER [OTHER ...]")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """The flags that every measuring command has."""
+
+    seconds: float | None = None
+    """Time limit of one task, compilation and the start of its process included; a task that exceeds it is recorded
+    as a timeout, and the next one starts."""
+    force: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Measure again what is recorded already."""
+    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
+    """List what is left to measure and the time it is expected to take; write nothing."""
+    table: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Only write the tables from the records."""
+    collect: Others = ()
+    """Merge the records of these results folders, such as those of other machines, then only write the tables."""
+    workers: int = 1
+    """Processes that measure at the same time, each with its share of the cores; times are then those of a shared
+    machine."""
+    scheduler: Annotated[str | None, tyro.conf.arg(metavar="tcp://HOST:PORT")] = None
+    """Measure on the workers of this Dask scheduler; they must see the same folders under the same names."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flags(Options):
+    """The flags of a command whose tasks are timed in turns."""
+
+    results: tyro.conf.Positional[Path]
+    """Folder for records and tables; created if missing."""
+    repeats: int = 5
+    """Timed runs of each task; tables show medians."""
+
+
+G = TypeVar("G", bound=Options)
+F = TypeVar("F", bound=Found)
+
+
+class Study(Generic[F, G]):
+    """What a command adds to the engine: its flags, its tasks, how one is measured, and its tables.
+
+    `name` is the command's word, `file` the name of its records, `unit` what it calls a task. `kind` is what a task
+    finds. `work` names a function `work(task, given) -> Sequence[kind]` as "module:function"; it is imported where it
+    runs. `apart` says that tasks are measured in a process of their own also without a time limit. With `rounds` every
+    task is measured once a round, so that a drift of the machine meets all alike; with `follows` the tables are written
+    also while tasks are measured. `estimate` says in --dry-run what the seconds leave out.
+    """
+
+    name: ClassVar[str]
+    file: ClassVar[str]
+    unit: ClassVar[str] = "task"
+    work: ClassVar[str]
+    apart: ClassVar[bool] = False
+    rounds: ClassVar[bool] = False
+    follows: ClassVar[bool] = False
+    estimate: ClassVar[str] = "without compiling"
+    kind: type[F]
+    flags: type[G]
+
+    def check(self, given: G) -> None:
+        """Raise InputError for flags that do not go together; called before anything else."""
+
+    def folder(self, given: G) -> Path:
+        """Return the results folder."""
+        return given.results  # type: ignore[attr-defined]
+
+    def store(self, given: G) -> Store[F]:
+        """Return the records in the results folder."""
+        return Store(self.folder(given), self.file, self.kind, f"a record of run-benchmark {self.name}".rstrip())
+
+    def tasks(self, given: G) -> list[Task]:
+        """Return the tasks that the flags ask for, in the order of the table. Simulates and reconstructs nothing."""
+        raise NotImplementedError
+
+    def repeats(self, given: G) -> int:
+        """Return how many timed runs a task needs."""
+        return getattr(given, "repeats", 1)
+
+    def shows(self, task: Task, given: G) -> bool:
+        """Whether the tables of these flags show a recorded task."""
+        return True
+
+    def pending(self, tasks: Sequence[Task], records: Sequence[Record[F]], given: G) -> list[Task]:
+        """Return the tasks that are not recorded, in the order in which they are to be measured."""
+        wanted = self.repeats(given)
+        known = done([] if given.force else records, 1 if self.rounds else wanted)
+        rounds = range(wanted if self.rounds else 1)
+        # a commit with changes does not say what code ran
+        return [t for n in rounds for t in tasks if known[t.identity] <= n or not host.certain(t.code)]
+
+    def groups(self, left: Sequence[Task]) -> list[tuple[Task, ...]]:
+        """Part tasks into groups that one worker measures, in this order."""
+        return [(task,) for task in left]
+
+    def expected(self, task: Task, given: G) -> float | None:
+        """Return the seconds that a task takes which was never recorded, None where that is not known."""
+        return None
+
+    def took(self, record: Record[F], given: G) -> float | None:
+        """Return the seconds that measuring a recorded task again takes: all its timed runs, the first one untimed."""
+        once = sum(median(s) for one in record.found for s in one.seconds.values() if s)
+        return once * (self.repeats(given) + 1)
+
+    def line(self, task: Task) -> tuple[str, str]:
+        """Return the line of --dry-run that a task counts in: a name and more."""
+        return task.case, task.subject
+
+    def limit(self, task: Task, given: G) -> float | None:
+        """Return the time limit of a task in seconds."""
+        return given.seconds
+
+    def environment(self, given: G) -> Mapping[str, str]:
+        """Return variables for the process that measures."""
+        return {}
+
+    def measure(self, task: Task, given: G) -> Sequence[F]:
+        """Measure a task in this process."""
+        return pkgutil.resolve_name(self.work)(task, given)
+
+    def failed(self, task: Task, status: str, reason: str) -> F:
+        """Return what stands for a task that did not end."""
+        return self.kind(ok=False, status=status, reason=reason)
+
+    def tables(self, records: Sequence[Record[F]], given: G) -> list[Table]:
+        """Return the tables of records, one of each row, in order."""
+        raise NotImplementedError
+
+    def write(self, records: Sequence[Record[F]], given: G) -> str:
+        """Write the tables into the results folder; return what the command prints."""
+        shown = latest(records)
+        text = f"{provenance(shown)}\n\n" + "\n".join(table.markdown() for table in self.tables(shown, given))
+        path = self.folder(given) / f"{self.file}.md"
+        write_synced(path, text.encode())
+        return f"{text}\nWritten: {path}; records in {self.file}.jsonl\n"
+
+    def code(self, tasks: Sequence[Task], records: Sequence[Record[F]], given: G) -> int:
+        """Return the exit code: 0 if every task that was asked for ended as expected."""
+        rows = {task.row for task in tasks}
+        return int(any(not f.ok for r in latest(records) if not rows or r.task.row in rows for f in r.found))
+
+
+def main(study: Study[Any, Any], arguments: list[str]) -> int:
+    """Run a study's command; return 0 if every task that was asked for ended as expected, else 1."""
+    given = tyro.cli(study.flags, prog=f"run-benchmark {study.name}".rstrip(), args=arguments)
+    _check(study, given)
+    store = study.store(given)
+    tasks = [] if given.table or given.collect else study.tasks(given)
+    for other, count in store.collect(given.collect).items() if given.collect else ():
+        sys.stderr.write(f"{other}: {count} records taken over\n")
+    records = store.read()
+    if given.dry_run:
+        sys.stdout.write(listing(study, study.pending(tasks, records, given), records, given, len(tasks)))
+        return 0
+    if tasks:
+        measure_all(study, tasks, records, given)
+    shown = [r for r in store.read() if study.shows(r.task, given)]
+    if not shown:
+        raise InputError(f"{store.path}: there are no records to show; run without --table first")
+    sys.stdout.write(study.write(shown, given))
+    return study.code(tasks, shown, given)
+
+
+def _check(study: Study[Any, Any], given: Options) -> None:
+    """Raise InputError for flags that do not go together."""
+    if study.repeats(given) < 1:
+        raise InputError(f"--repeats must be at least 1, got {study.repeats(given)}")
+    check_limit(given.seconds)
+    if given.dry_run and (given.collect or given.table):
+        what = "--collect writes records" if given.collect else "--table writes tables"
+        raise InputError(f"{what}, --dry-run writes nothing: expected one of them")
+    study.check(given)
+
+
+def measure_all(study: Study[F, G], tasks: Sequence[Task], records: Sequence[Record[F]], given: G) -> list[Record[F]]:
+    """Measure what is not recorded, behind a progress bar; return the records of what did not end as expected.
+
+    Each record is on the disk before the next task begins. The tables follow as tasks end, and once more at the end,
+    also after Ctrl-C. Raises OSError where results cannot be written.
+    """
+    from tqdm import tqdm
+
+    left, store = study.pending(tasks, records, given), study.store(given)
+    if len(left) < len(tasks):
+        sys.stderr.write(f"{len(tasks) - len(left)} of {len(tasks)} {study.unit}s are recorded already (--force)\n")
+    failed, written, took = [], 0.0, 0.0
+    with tqdm(total=len(left), unit=study.unit, disable=not left, file=sys.stderr) as bar:
+        try:
+            for record in _records(study, study.groups(left), given):
+                store.append([record])
+                if not all(one.ok for one in record.found):
+                    failed.append(record)
+                bar.set_postfix_str(f"{record.task.case} {record.task.subject}: {_status(record)}")
+                bar.update()
+                if study.follows and time.monotonic() > written + took / SHARE:
+                    began = time.monotonic()
+                    study.write(store.read(), given)
+                    written, took = time.monotonic(), time.monotonic() - began
+        except KeyboardInterrupt:
+            if study.follows and (found := store.read()):
+                study.write(found, given)
+            raise
+    return failed
+
+
+def _status(record: Record[Any]) -> str:
+    return next((one.status for one in record.found if one.status != OK), OK)
+
+
+def _records(study: Study[F, G], groups: Sequence[tuple[Task, ...]], given: G) -> Iterator[Record[F]]:
+    """Measure groups of tasks here, on several processes or on a cluster; yield their records as they end.
+
+    What has failed is not tried again in a later round.
+    """
+    failed: set[str] = set()
+    with open_jobs(given.workers, given.scheduler) as jobs:
+        if jobs is None:
+            with _Here(study, given) as here:
+                for task in (task for group in groups for task in group if task.identity not in failed):
+                    yield (record := here.record(task))
+                    failed |= set() if record.finished else {task.identity}
+            return
+        for answer in jobs.answers(_measure_group, [(study, group, given) for group in groups]):
+            if answer is None:
+                continue
+            number, found = answer
+            if isinstance(found, Lost):
+                found = [_record(t, [study.failed(t, "error", found.reason)]) for t in groups[number]]
+            yield from found
+
+
+class _Here(Generic[F, G]):
+    """Measures tasks one after the other: in this process, or in another one where the study or a limit asks for it."""
+
+    def __init__(self, study: Study[F, G], given: G) -> None:
+        self._study, self._given = study, given
+        # what a process leaves behind that is killed goes with the folder
+        self._folder = tempfile.TemporaryDirectory(prefix="ctsim-", ignore_cleanup_errors=True)
+        self._process = Process({"TMPDIR": self._folder.name, **study.environment(given)})
+
+    def __enter__(self) -> Self:
+        host.commit()  # remembered: of the code that is loaded, not of what is committed meanwhile
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.close()
+        self._folder.cleanup()
+
+    def record(self, task: Task) -> Record[F]:
+        study, given = self._study, self._given
+        limit = study.limit(task, given)
+        try:
+            if limit is None and not study.apart:
+                found = study.measure(task, given)
+            else:
+                found = self._process.run(study.measure, task, given, seconds=limit)
+        except Stopped as end:
+            found = [study.failed(task, end.status, str(end))]
+        return _record(task, found)
+
+
+def _record(task: Task, found: Sequence[F]) -> Record[F]:
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    return Record(task=task, found=tuple(found), host=host.host(), commit=host.commit(), time=now)
+
+
+def _measure_group(job: tuple[Study[F, G], tuple[Task, ...], G]) -> list[Record[F]]:
+    """Be a worker: measure a group of tasks."""
+    study, group, given = job
+    here = _here(type(study), given)
+    return [here.record(task) for task in group]
+
+
+@functools.lru_cache(maxsize=1)
+def _here(study: type[Study[Any, Any]], given: Any) -> _Here[Any, Any]:
+    """Return what measures in this process, whose own process remembers what is compiled."""
+    return _Here(study(), given)
+
+
+def listing(study: Study[F, G], left: Sequence[Task], records: Sequence[Record[F]], given: G, n_all: int) -> str:
+    """Return what --dry-run prints: a line for each row with the seconds expected, and their sum."""
+    known = {r.task.row: study.took(r, given) for r in latest(records) if r.finished}
+    lines: dict[tuple[str, str], list[float | None]] = {}
+    for task in left:
+        once = known[task.row] if task.row in known else study.expected(task, given)
+        lines.setdefault(study.line(task), []).append(once)
+    wide, long = (max((len(line[k]) for line in lines), default=0) for k in (0, 1))
+    out = []
+    for (name, more), seconds in lines.items():
+        times = [s for s in seconds if s is not None]
+        total = human_time(sum(times)) if times else "unknown"
+        out.append(f"{name:{wide}}  {more:{long}}  {f'{len(seconds)} x ' if len(seconds) > 1 else ''}{total}")
+    every = [s for seconds in lines.values() for s in seconds]
+    unknown = [name for (name, _), seconds in lines.items() if None in seconds]
+    out.append(
+        f"total: {len(left)} of {n_all} {study.unit}s, {human_time(sum(s for s in every if s is not None))}, "
+        f"{study.estimate}" + (f"; never measured: {', '.join(dict.fromkeys(unknown))}" if unknown else "")
+    )
+    return "\n".join(out) + "\n"

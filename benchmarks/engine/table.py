@@ -1,0 +1,182 @@
+"""Tables: columns and cells, declared once, rendered as Markdown, LaTeX, HTML and CSV."""
+
+import csv
+import html
+import io
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+from ctsim.benchmarks.engine.texts import escape, harmless, one_line
+
+Better = Literal["", "max", "min", "one"]
+
+
+class Cell(NamedTuple):
+    """The text of a cell, and the number to rank it by where it has one."""
+
+    text: str
+    number: float | None = None
+
+
+class Column(NamedTuple):
+    """A column: title, the group it stands in, whether it holds numbers, and which number is best.
+
+    `better` is "max", "min", "one" (nearest to 1), or "" for a column without ranks.
+    """
+
+    title: str
+    group: str = ""
+    number: bool = False
+    better: Better = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """Rows of cells under columns, with a title, a caption and notes.
+
+    `rank_within` is the number of the column whose cells part the rows into classes that compete; None for no ranks.
+    """
+
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[Cell]]
+    title: str = ""
+    caption: str = ""
+    notes: Sequence[str] = ()
+    rank_within: int | None = None
+
+    def places(self) -> dict[tuple[int, int], str]:
+        """Return {(row, column): "best" or "second"} within each class."""
+        if self.rank_within is None:
+            return {}
+        classes: dict[str, list[int]] = {}
+        for i, row in enumerate(self.rows):
+            classes.setdefault(row[self.rank_within].text, []).append(i)
+        found: dict[tuple[int, int], str] = {}
+        for k, column in enumerate(self.columns):
+            for group in classes.values() if column.better else ():
+                ranks = ranked([self.rows[i][k].number for i in group], column.better)
+                found |= {(group[i], k): place for i, place in ranks.items()}
+        return found
+
+    def markdown(self) -> str:
+        """Return the table as Markdown; the best of each class is bold, the second underlined."""
+        marks = {"best": "**{}**", "second": "<u>{}</u>"}
+        lines = [_markdown_row(_title(c) for c in self.columns)]
+        lines.append("|" + "|".join("---:" if c.number else "---" for c in self.columns) + "|\n")
+        lines += [_markdown_row(row) for row in self._marked(lambda text: escape(text, "md"), marks)]
+        parts = [f"## {self.title}\n"] * bool(self.title) + [f"{escape(self.caption, 'md')}\n"] * bool(self.caption)
+        parts.append("".join(lines))
+        parts += ["".join(f"- {escape(note, 'md')}\n" for note in self.notes)] * bool(self.notes)
+        return "\n".join(parts)
+
+    def html(self) -> str:
+        """Return the table as HTML; a cell with a number has it in `data-number`, by which a page sorts."""
+        marks = {"best": "<strong>{}</strong>", "second": "<u>{}</u>"}
+        head = "".join(f"<th>{html.escape(_title(c))}</th>" for c in self.columns)
+        lines = []
+        for row, texts in zip(self.rows, self._marked(html.escape, marks), strict=True):
+            numbers = ("" if cell.number is None else f' data-number="{cell.number!r}"' for cell in row)
+            lines.append("<tr>" + "".join(f"<td{n}>{t}</td>" for n, t in zip(numbers, texts, strict=True)) + "</tr>\n")
+        notes = "".join(f"<li>{html.escape(note)}</li>\n" for note in self.notes)
+        return (
+            (f"<h2>{html.escape(self.title)}</h2>\n" if self.title else "")
+            + (f"<p>{html.escape(self.caption)}</p>\n" if self.caption else "")
+            + f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{''.join(lines)}</tbody>\n</table>\n"
+            + (f"<ul>\n{notes}</ul>\n" if notes else "")
+        )
+
+    def csv(self) -> str:
+        """Return columns and cells as CSV that no spreadsheet takes for formulas."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(harmless(_title(c)) for c in self.columns)
+        writer.writerows([harmless(cell.text) for cell in row] for row in self.rows)
+        return out.getvalue()
+
+    def latex(self, label: str = "") -> str:
+        """Return a table environment by booktabs, its notes as comments below it."""
+        marks = {"best": r"\textbf{{{}}}", "second": r"\underline{{{}}}"}
+        head = []
+        if any(c.group for c in self.columns):
+            head += latex_groups([c.group for c in self.columns])
+        head.append(latex_row(latex_prose(c.title) for c in self.columns))
+        body = [latex_row(row) for row in self._marked(lambda text: escape(text, "tex"), marks)]
+        lines = [
+            r"\begin{table}",
+            r"\centering",
+            rf"\caption{{{latex_prose(self.caption or self.title)}}}",
+            *([rf"\label{{{label}}}"] if label else []),
+            rf"\begin{{tabular}}{{{''.join('r' if c.number else 'l' for c in self.columns)}}}",
+            r"\toprule",
+            *head,
+            r"\midrule",
+            *body,
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table}",
+        ]
+        return "\n".join(lines) + "\n" + "".join(map(latex_comment, self.notes))
+
+    def _marked(self, write: Callable[[str], str], marks: dict[str, str]) -> list[list[str]]:
+        """Return the texts of all cells, written for a format, with the marks of the best and the second."""
+        places = self.places()
+        return [
+            [
+                marks[places[i, k]].format(write(cell.text)) if (i, k) in places else write(cell.text)
+                for k, cell in enumerate(row)
+            ]
+            for i, row in enumerate(self.rows)
+        ]
+
+
+def simple(columns: Sequence[str], rows: Sequence[Sequence[Any]], *, numbers: Sequence[str] = (), **more: Any) -> Table:
+    """Return a table of texts: `columns` are titles, `numbers` those of columns aligned to the right."""
+    heads = [Column(title, number=title in numbers) for title in columns]
+    return Table(columns=heads, rows=[[Cell(str(cell)) for cell in row] for row in rows], **more)
+
+
+def ranked(numbers: Sequence[float | None], better: str) -> dict[int, str]:
+    """Return {index: "best" or "second"}; equal numbers share a place, and a lone number has none."""
+    keys: dict[str, Callable[[float], float]] = {"max": lambda v: -v, "min": lambda v: v, "one": lambda v: abs(v - 1)}
+    if better not in keys or sum(n is not None for n in numbers) < 2:
+        return {}
+    found = {i: keys[better](n) for i, n in enumerate(numbers) if n is not None}
+    places = dict(zip(sorted(set(found.values())), ("best", "second"), strict=False))
+    return {i: places[n] for i, n in found.items() if n in places}
+
+
+def _title(column: Column) -> str:
+    return f"{column.group}: {column.title}" if column.group else column.title
+
+
+def _markdown_row(cells: Any) -> str:
+    return "| " + " | ".join(cells) + " |\n"
+
+
+def latex_comment(text: str) -> str:
+    """Return a text as a comment, which ends where its one line does."""
+    return f"% {' '.join(one_line(text).split())}\n"
+
+
+def latex_prose(text: str) -> str:
+    """Escape prose: a pair of hyphens is a flag and no dash, and what stands in backquotes is typewriter."""
+    parts = ["-{}-".join(escape(piece, "tex") for piece in part.split("--")) for part in text.split("`")]
+    return "".join(rf"\texttt{{{part}}}" if n % 2 else part for n, part in enumerate(parts))
+
+
+def latex_row(cells: Any) -> str:
+    """Return a line of cells that are LaTeX already."""
+    return " & ".join(cells) + r" \\"
+
+
+def latex_groups(groups: Sequence[str]) -> list[str]:
+    """Return a head line of group titles, each over its neighbouring columns, and the rules below them."""
+    cells, rules, first = [], "", 1
+    for title, of in itertools.groupby(groups):
+        n = len(list(of))
+        cells += [rf"\multicolumn{{{n}}}{{c}}{{{latex_prose(title)}}}"] if title else [""] * n
+        rules += rf"\cmidrule(lr){{{first}-{first + n - 1}}}" if title else ""
+        first += n
+    return [latex_row(cells), rules]
