@@ -30,8 +30,8 @@ class Task(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """One row to measure: everything that determines the result, so that equal identities are measured once.
 
     `part`, `case` and `subject` name the row. `data` and `code` are hashes; `machine` is set where time is what is
-    measured. A study counts `version` up when it measures something else. `place` orders tables and determines
-    nothing.
+    measured. A study counts `version` up when it measures something else. `place` orders tables, and `hints` tell a
+    worker where it finds its inputs; neither determines anything.
     """
 
     study: str
@@ -44,11 +44,12 @@ class Task(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     machine: str = ""
     version: int = 1
     place: tuple[int, ...] = ()
+    hints: dict[str, Any] = {}
 
     @property
     def identity(self) -> str:
-        """SHA-256 over all fields but the place."""
-        fields = msgspec.structs.replace(self, place=())
+        """SHA-256 over all fields but the place and the hints."""
+        fields = msgspec.structs.replace(self, place=(), hints={})
         return hashlib.sha256(msgspec.json.encode(fields, order="sorted")).hexdigest()
 
     @property
@@ -97,9 +98,9 @@ class Record(msgspec.Struct, Generic[F], frozen=True, kw_only=True, forbid_unkno
 class Store(Generic[F]):
     """The records of one study in a results folder: `NAME.jsonl`, and files of other machines, `NAME-*.jsonl`."""
 
-    def __init__(self, folder: Path, name: str, kind: type[F], what: str) -> None:
+    def __init__(self, folder: Path, name: str, kind: type[Record[F]], what: str) -> None:
         self.folder, self.path, self._name = folder, folder / f"{name}.jsonl", name
-        self._decoder = msgspec.json.Decoder(Record[kind])
+        self._decoder = msgspec.json.Decoder(kind)
         self._what = what
 
     @uncollected()

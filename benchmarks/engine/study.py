@@ -68,10 +68,11 @@ class Study(Generic[F, G]):
     """What a command adds to the engine: its flags, its tasks, how one is measured, and its tables.
 
     `name` is the command's word, `file` the name of its records, `unit` what it calls a task. `kind` is what a task
-    finds. `work` names a function `work(task, given) -> Sequence[kind]` as "module:function"; it is imported where it
-    runs. `apart` says that tasks are measured in a process of their own also without a time limit. With `rounds` every
-    task is measured once a round, so that a drift of the machine meets all alike; with `follows` the tables are written
-    also while tasks are measured. `estimate` says in --dry-run what the seconds leave out.
+    finds, `record` the record of it. `work` names a function `work(task, given) -> Sequence[kind]` as
+    "module:function"; it is imported where it runs. `apart` says that tasks are measured in a process of their own
+    also without a time limit. With `rounds` every task is measured once a round, so that a drift of the machine meets
+    all alike; with `follows` the tables are written also while tasks are measured. `estimate` says in --dry-run what
+    the seconds leave out.
     """
 
     name: ClassVar[str]
@@ -83,6 +84,7 @@ class Study(Generic[F, G]):
     follows: ClassVar[bool] = False
     estimate: ClassVar[str] = "without compiling"
     kind: type[F]
+    record: type[Record[F]]
     flags: type[G]
 
     def check(self, given: G) -> None:
@@ -94,7 +96,8 @@ class Study(Generic[F, G]):
 
     def store(self, given: G) -> Store[F]:
         """Return the records in the results folder."""
-        return Store(self.folder(given), self.file, self.kind, f"a record of run-benchmark {self.name}".rstrip())
+        what = f"a record of run-benchmark {self.name}".rstrip()
+        return Store(self.folder(given), self.file, self.record, what)
 
     def tasks(self, given: G) -> list[Task]:
         """Return the tasks that the flags ask for, in the order of the table. Simulates and reconstructs nothing."""
@@ -116,7 +119,7 @@ class Study(Generic[F, G]):
         # a commit with changes does not say what code ran
         return [t for n in rounds for t in tasks if known[t.identity] <= n or not host.certain(t.code)]
 
-    def groups(self, left: Sequence[Task]) -> list[tuple[Task, ...]]:
+    def groups(self, left: Sequence[Task], records: Sequence[Record[F]]) -> list[tuple[Task, ...]]:
         """Part tasks into groups that one worker measures, in this order."""
         return [(task,) for task in left]
 
@@ -213,7 +216,7 @@ def measure_all(study: Study[F, G], tasks: Sequence[Task], records: Sequence[Rec
     failed, written, took = [], 0.0, 0.0
     with tqdm(total=len(left), unit=study.unit, disable=not left, file=sys.stderr) as bar:
         try:
-            for record in _records(study, study.groups(left), given):
+            for record in _records(study, study.groups(left, records), given):
                 store.append([record])
                 if not all(one.ok for one in record.found):
                     failed.append(record)
@@ -252,7 +255,7 @@ def _records(study: Study[F, G], groups: Sequence[tuple[Task, ...]], given: G) -
                 continue
             number, found = answer
             if isinstance(found, Lost):
-                found = [_record(t, [study.failed(t, "error", found.reason)]) for t in groups[number]]
+                found = [record_of(study, t, [study.failed(t, "error", found.reason)]) for t in groups[number]]
             yield from found
 
 
@@ -283,12 +286,13 @@ class _Here(Generic[F, G]):
                 found = self._process.run(study.measure, task, given, seconds=limit)
         except Stopped as end:
             found = [study.failed(task, end.status, str(end))]
-        return _record(task, found)
+        return record_of(study, task, found)
 
 
-def _record(task: Task, found: Sequence[F]) -> Record[F]:
+def record_of(study: Study[F, Any], task: Task, found: Sequence[F]) -> Record[F]:
+    """Return the record of what was found, as of now and here."""
     now = datetime.now(UTC).isoformat(timespec="seconds")
-    return Record(task=task, found=tuple(found), host=host.host(), commit=host.commit(), time=now)
+    return study.record(task=task, found=tuple(found), host=host.host(), commit=host.commit(), time=now)
 
 
 def _measure_group(job: tuple[Study[F, G], tuple[Task, ...], G]) -> list[Record[F]]:

@@ -42,7 +42,7 @@ class Skipping(study.Study[Skip, Flags]):
 
     name = file = "skipping"
     unit = "case"
-    kind, flags = Skip, Flags
+    kind, record, flags = Skip, Record[Skip], Flags
     work = "ctsim.benchmarks.studies.skipping.methods:measure"
     apart = True
     estimate = "without compiling and preparing (a minute for all cases)"
