@@ -111,6 +111,9 @@ class Process:
             code = self._popen.wait()
             self.kill()
             raise Stopped("error", f"the process died with {how_it_ended(code)}", code) from None
+        except KeyboardInterrupt:  # half an answer was read
+            self.kill()
+            raise
         if failed:
             raise answer
         return answer
@@ -154,7 +157,8 @@ class Process:
         )
         os.close(read)
         theirs.close()
-        self.pipe.send(sys.path)
+        with contextlib.suppress(OSError):  # as in `send`
+            self.pipe.send(sys.path)
 
 
 def serve(pipe: connection.Connection) -> None:
@@ -165,8 +169,21 @@ def serve(pipe: connection.Connection) -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # a job can write down where it stopped
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
         while True:
-            function, arguments = pipe.recv()
-            pipe.send(answered(function, *arguments))
+            answer = answered(_called, pipe.recv_bytes())
+            try:
+                data = pickle.dumps(answer)
+            except Exception as error:
+                data = pickle.dumps(answered(_raise, error))
+            pipe.send_bytes(data)
+
+
+def _called(call: bytes) -> Any:
+    function, arguments = pickle.loads(call)
+    return function(*arguments)
+
+
+def _raise(error: Exception) -> None:
+    raise error
 
 
 def answered(function: Function, *arguments: Any) -> tuple[bool, Any]:
@@ -196,7 +213,7 @@ def _can_travel(error: Exception) -> bool:
 def _follow_parent(pipe: int) -> None:
     """End this process, with what it has started, when its parent has ended."""
     os.read(pipe, 1)
-    os.kill(os.getpid(), signal.SIGTERM)
+    os.killpg(0, signal.SIGTERM)  # this thread may not live to see that the others have ended
     time.sleep(GRACE)
     os.killpg(0, signal.SIGKILL)
 
@@ -227,22 +244,22 @@ class Pool:
         share = max(1, len(os.sched_getaffinity(0)) // n)
         before = {v: os.environ.get(v, "").partition(",")[0] for v in THREADS.values()}
         threads = {v: str(min(share, int(given)) if given.isdecimal() else share) for v, given in before.items()}
-        self._idle = [Process(threads) for _ in range(n)]
+        self._processes = [Process(threads) for _ in range(n)]
+        self._idle = list(self._processes)
         self._busy: dict[connection.Connection, tuple[Process, int]] = {}
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        processes = [*self._idle, *(process for process, _ in self._busy.values())]
-        for process in processes:
+        for process in self._processes:
             process.ask_to_end()
         end = time.monotonic() + GRACE
         try:
-            for process in processes:
+            for process in self._processes:
                 process.close(max(0.0, end - time.monotonic()))
         finally:
-            for process in processes:
+            for process in self._processes:
                 process.kill()
 
     def answers(self, function: Function, jobs: Sequence[Any]) -> Answers:
@@ -250,9 +267,9 @@ class Pool:
         waiting, deaths = deque(range(len(jobs))), Counter[int]()
         while waiting or self._busy:
             while waiting and self._idle:
-                process, number = self._idle.pop(), waiting.popleft()
-                process.send(function, jobs[number])
-                self._busy[process.pipe] = process, number
+                process, number = self._idle[-1], waiting[0]
+                process.send(function, jobs[number])  # raises where a job cannot be pickled
+                self._busy[process.pipe] = self._idle.pop(), waiting.popleft()
             ready = connection.wait(list(self._busy), TICK)
             if not ready:
                 yield None
