@@ -3,6 +3,7 @@
 A record is on the disk before the next task begins; a line whose writing was interrupted is cut off by the next one.
 """
 
+import contextlib
 import hashlib
 import logging
 import os
@@ -24,6 +25,7 @@ from ctsim.locks import locked
 log = logging.getLogger(__name__)
 
 OK = "ok"
+BROKEN = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)  # what a line that is no record raises
 
 
 class Task(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -102,6 +104,7 @@ class Store(Generic[F]):
         self.folder, self.path, self._name = folder, folder / f"{name}.jsonl", name
         self._decoder = msgspec.json.Decoder(kind)
         self._what = what
+        self._warned: set[Path] = set()
 
     @uncollected()
     def read(self) -> list[Record[F]]:
@@ -115,7 +118,7 @@ class Store(Generic[F]):
         """Append records and force them to the disk; alone among processes."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with locked(self.path) as handle:
-            cut_torn(handle)  # of a command that was killed while it wrote
+            self._end_last_line(handle)
             append_synced(self.path, handle, encoded(records))
 
     def collect(self, others: Sequence[Path]) -> dict[Path, int]:
@@ -131,7 +134,7 @@ class Store(Generic[F]):
         self.folder.mkdir(parents=True, exist_ok=True)
         counts: dict[Path, int] = {}
         with locked(self.path) as handle:  # what another command appends meanwhile would be lost
-            cut_torn(handle)
+            self._end_last_line(handle)
             files = [list(self._of(self.path))]
             known = {r.task.identity: r.finished for r in sorted(self.read(), key=lambda r: r.finished)}
             for other, records in brought.items():
@@ -154,14 +157,28 @@ class Store(Generic[F]):
 
     def _of(self, path: Path) -> Iterator[Record[F]]:
         data = path.read_bytes() if path.exists() else b""
-        for number, line in enumerate(data.splitlines(keepends=True), 1):
+        *lines, rest = data.split(b"\n")  # not splitlines: a carriage return ends no line
+        for number, line in enumerate(lines, 1):
             try:
                 yield self._decoder.decode(line)
-            except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-                if not line.endswith(b"\n"):
-                    log.warning("%s: the last line was cut short; that measurement is left out", path)
-                    return
+            except BROKEN as error:
                 raise InputError(f"{path}, line {number}: expected {self._what}: {error}") from None
+        try:
+            yield from [self._decoder.decode(rest)] if rest else []
+        except BROKEN:
+            if path not in self._warned:
+                log.warning("%s: the last line was cut short; that measurement is left out", path)
+            self._warned.add(path)
+
+    def _end_last_line(self, handle: int) -> None:
+        """Cut off what a command that was killed left of a line; end a record that only lacks the end of its line."""
+        size = os.fstat(handle).st_size
+        if not size or os.pread(handle, 1, size - 1) == b"\n":
+            return
+        with contextlib.suppress(*BROKEN):
+            self._decoder.decode(os.pread(handle, size, 0).rpartition(b"\n")[2])
+            append_synced(self.path, handle, b"\n")
+        cut_torn(handle)
 
 
 def encoded(records: Iterable[msgspec.Struct]) -> bytes:
