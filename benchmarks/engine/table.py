@@ -4,6 +4,7 @@ import csv
 import html
 import io
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -63,10 +64,12 @@ class Table:
     def markdown(self) -> str:
         """Return the table as Markdown; the best of each class is bold, the second underlined."""
         marks = {"best": "**{}**", "second": "<u>{}</u>"}
-        lines = [_markdown_row(_title(c) for c in self.columns)]
+        lines = [_markdown_row(escape(_title(c), "md") for c in self.columns)]
         lines.append("|" + "|".join("---:" if c.number else "---" for c in self.columns) + "|\n")
         lines += [_markdown_row(row) for row in self._marked(lambda text: escape(text, "md"), marks)]
-        parts = [f"## {self.title}\n"] * bool(self.title) + [f"{escape(self.caption, 'md')}\n"] * bool(self.caption)
+        parts = [f"## {one_line(self.title)}\n"] * bool(self.title) + [f"{escape(self.caption, 'md')}\n"] * bool(
+            self.caption
+        )
         parts.append("".join(lines))
         parts += ["".join(f"- {escape(note, 'md')}\n" for note in self.notes)] * bool(self.notes)
         return "\n".join(parts)
@@ -74,15 +77,15 @@ class Table:
     def html(self) -> str:
         """Return the table as HTML; a cell with a number has it in `data-number`, by which a page sorts."""
         marks = {"best": "<strong>{}</strong>", "second": "<u>{}</u>"}
-        head = "".join(f"<th>{html.escape(_title(c))}</th>" for c in self.columns)
+        head = "".join(f"<th>{_html(_title(c))}</th>" for c in self.columns)
         lines = []
-        for row, texts in zip(self.rows, self._marked(html.escape, marks), strict=True):
-            numbers = ("" if cell.number is None else f' data-number="{cell.number!r}"' for cell in row)
+        for row, texts in zip(self.rows, self._marked(_html, marks), strict=True):
+            numbers = ("" if cell.number is None else f' data-number="{float(cell.number)!r}"' for cell in row)
             lines.append("<tr>" + "".join(f"<td{n}>{t}</td>" for n, t in zip(numbers, texts, strict=True)) + "</tr>\n")
-        notes = "".join(f"<li>{html.escape(note)}</li>\n" for note in self.notes)
+        notes = "".join(f"<li>{_html(note)}</li>\n" for note in self.notes)
         return (
-            (f"<h2>{html.escape(self.title)}</h2>\n" if self.title else "")
-            + (f"<p>{html.escape(self.caption)}</p>\n" if self.caption else "")
+            (f"<h2>{_html(self.title)}</h2>\n" if self.title else "")
+            + (f"<p>{_html(self.caption)}</p>\n" if self.caption else "")
             + f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{''.join(lines)}</tbody>\n</table>\n"
             + (f"<ul>\n{notes}</ul>\n" if notes else "")
         )
@@ -92,7 +95,7 @@ class Table:
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(harmless(_title(c)) for c in self.columns)
-        writer.writerows([harmless(cell.text) for cell in row] for row in self.rows)
+        writer.writerows([_csv(cell.text) for cell in row] for row in self.rows)
         return out.getvalue()
 
     def latex(self, label: str = "") -> str:
@@ -138,7 +141,8 @@ def simple(columns: Sequence[str], rows: Sequence[Sequence[Any]], *, numbers: Se
 
 
 def ranked(numbers: Sequence[float | None], better: str) -> dict[int, str]:
-    """Return {index: "best" or "second"}; equal numbers share a place, and a lone number has none."""
+    """Return {index: "best" or "second"}; equal numbers share a place, and a lone number has none, nor has NaN."""
+    numbers = [None if n is None or math.isnan(n) else n for n in numbers]
     keys: dict[str, Callable[[float], float]] = {"max": lambda v: -v, "min": lambda v: v, "one": lambda v: abs(v - 1)}
     if better not in keys or sum(n is not None for n in numbers) < 2:
         return {}
@@ -149,6 +153,19 @@ def ranked(numbers: Sequence[float | None], better: str) -> dict[int, str]:
 
 def _title(column: Column) -> str:
     return f"{column.group}: {column.title}" if column.group else column.title
+
+
+def _html(text: str) -> str:
+    return html.escape(one_line(text))
+
+
+def _csv(text: str) -> str:
+    """Return a cell of CSV; a number below zero is no formula."""
+    try:
+        float(text)
+    except ValueError:
+        return harmless(text)
+    return text.strip()
 
 
 def _markdown_row(cells: Any) -> str:
