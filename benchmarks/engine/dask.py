@@ -18,18 +18,23 @@ CONNECT = 10.0  # seconds that a scheduler has to answer
 CERTIFICATES = ("distributed.comm.tls.ca-file", "distributed.comm.tls.client.cert")
 
 
+def check_workers(workers: int, scheduler: str | None) -> None:
+    """Raise InputError for less than one worker, and for --workers with --scheduler."""
+    if workers < 1:
+        raise InputError(f"--workers {workers}: expected 1 or more")
+    if scheduler is not None and workers != 1:
+        raise InputError("--workers and --scheduler exclude each other: the scheduler's own workers do the work")
+
+
 def open_jobs(workers: int, scheduler: str | None) -> contextlib.AbstractContextManager[Jobs | None]:
     """Return what --workers and --scheduler ask for; None where this process is to do all.
 
-    Raises InputError for less than one worker, for both at once, and for a scheduler that cannot be used.
+    Raises InputError as `check_workers` does, and for a scheduler that cannot be used.
     """
-    if workers < 1:
-        raise InputError(f"--workers {workers}: expected 1 or more")
-    if scheduler is None:
-        return contextlib.nullcontext() if workers == 1 else Pool(workers)
-    if workers != 1:
-        raise InputError("--workers and --scheduler exclude each other: the scheduler's own workers do the work")
-    return Cluster(scheduler)
+    check_workers(workers, scheduler)
+    if scheduler is not None:
+        return Cluster(scheduler)
+    return contextlib.nullcontext() if workers == 1 else Pool(workers)
 
 
 class Cluster:

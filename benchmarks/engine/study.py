@@ -1,10 +1,10 @@
 """The life of every measuring command: list tasks, skip what is recorded, measure, record, write tables."""
 
-import functools
 import pkgutil
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -15,8 +15,8 @@ from typing import Annotated, Any, ClassVar, Generic, Self, TypeVar
 import tyro
 
 from ctsim.benchmarks.engine import host
-from ctsim.benchmarks.engine.dask import open_jobs
-from ctsim.benchmarks.engine.process import Lost, Process, Stopped, check_limit
+from ctsim.benchmarks.engine.dask import check_workers, open_jobs
+from ctsim.benchmarks.engine.process import Jobs, Lost, Process, Stopped, check_limit
 from ctsim.benchmarks.engine.record import OK, Found, Record, Store, Task, done, latest, provenance
 from ctsim.benchmarks.engine.table import Table
 from ctsim.durable import write_synced
@@ -180,15 +180,26 @@ def main(study: Study[Any, Any], arguments: list[str]) -> int:
         sys.stderr.write(f"{other}: {count} records taken over\n")
     records = store.read()
     if given.dry_run:
-        sys.stdout.write(listing(study, study.pending(tasks, records, given), records, given, len(tasks)))
+        sys.stdout.write(
+            listing(study, study.pending(tasks, records, given), records, given, _all(study, tasks, given))
+        )
         return 0
-    if tasks:
-        measure_all(study, tasks, records, given)
-    shown = [r for r in store.read() if study.shows(r.task, given)]
+    failed = measure_all(study, tasks, records, given) if tasks else []
+    shown = _shown(study, store, given)
     if not shown:
         raise InputError(f"{store.path}: there are no records to show; run without --table first")
     sys.stdout.write(study.write(shown, given))
-    return study.code(tasks, shown, given)
+    return int(bool(failed)) or study.code(tasks, shown, given)
+
+
+def _all(study: Study[Any, G], tasks: Sequence[Task], given: G) -> int:
+    """Return how many measurements the flags ask for."""
+    return len(tasks) * (study.repeats(given) if study.rounds else 1)
+
+
+def _shown(study: Study[F, G], store: Store[F], given: G) -> list[Record[F]]:
+    """Return the records that the tables of these flags show."""
+    return [record for record in store.read() if study.shows(record.task, given)]
 
 
 def _check(study: Study[Any, Any], given: Options) -> None:
@@ -196,6 +207,7 @@ def _check(study: Study[Any, Any], given: Options) -> None:
     if study.repeats(given) < 1:
         raise InputError(f"--repeats must be at least 1, got {study.repeats(given)}")
     check_limit(given.seconds)
+    check_workers(given.workers, given.scheduler)
     if given.dry_run and (given.collect or given.table):
         what = "--collect writes records" if given.collect else "--table writes tables"
         raise InputError(f"{what}, --dry-run writes nothing: expected one of them")
@@ -210,53 +222,77 @@ def measure_all(study: Study[F, G], tasks: Sequence[Task], records: Sequence[Rec
     """
     from tqdm import tqdm
 
-    left, store = study.pending(tasks, records, given), study.store(given)
-    if len(left) < len(tasks):
-        sys.stderr.write(f"{len(tasks) - len(left)} of {len(tasks)} {study.unit}s are recorded already (--force)\n")
+    left, store, n_all = study.pending(tasks, records, given), study.store(given), _all(study, tasks, given)
+    if len(left) < n_all:
+        sys.stderr.write(f"{n_all - len(left)} of {n_all} {study.unit}s are recorded already (--force)\n")
     failed, written, took = [], 0.0, 0.0
-    with tqdm(total=len(left), unit=study.unit, disable=not left, file=sys.stderr) as bar:
-        try:
-            for record in _records(study, study.groups(left, records), given):
-                store.append([record])
-                if not all(one.ok for one in record.found):
-                    failed.append(record)
-                bar.set_postfix_str(f"{record.task.case} {record.task.subject}: {_status(record)}")
-                bar.update()
-                if study.follows and time.monotonic() > written + took / SHARE:
-                    began = time.monotonic()
-                    study.write(store.read(), given)
-                    written, took = time.monotonic(), time.monotonic() - began
-        except KeyboardInterrupt:
-            if study.follows and (found := store.read()):
-                study.write(found, given)
-            raise
+    with open_jobs(given.workers, given.scheduler) as jobs:
+        store.folder.mkdir(parents=True, exist_ok=True)  # before anything is measured that could not be recorded
+        with tqdm(total=len(left), unit=study.unit, disable=not left, file=sys.stderr) as bar:
+            try:
+                for record in _records(study, study.groups(left, records), given, jobs):
+                    store.append([record])
+                    if not all(one.ok for one in record.found):
+                        failed.append(record)
+                    bar.set_postfix_str(f"{record.task.case} {record.task.subject}: {_status(record)}")
+                    bar.update()
+                    if study.follows and time.monotonic() > written + took / SHARE:
+                        began = time.monotonic()
+                        _follow(study, store, given)
+                        written, took = time.monotonic(), time.monotonic() - began
+            except KeyboardInterrupt:
+                if study.follows:
+                    _follow(study, store, given)
+                raise
     return failed
+
+
+def _follow(study: Study[F, G], store: Store[F], given: G) -> None:
+    """Write the tables, where there is something to show."""
+    if shown := _shown(study, store, given):
+        study.write(shown, given)
 
 
 def _status(record: Record[Any]) -> str:
     return next((one.status for one in record.found if one.status != OK), OK)
 
 
-def _records(study: Study[F, G], groups: Sequence[tuple[Task, ...]], given: G) -> Iterator[Record[F]]:
-    """Measure groups of tasks here, on several processes or on a cluster; yield their records as they end.
+def _records(
+    study: Study[F, G], groups: Sequence[tuple[Task, ...]], given: G, jobs: Jobs | None
+) -> Iterator[Record[F]]:
+    """Measure groups of tasks here, or by `jobs` on several processes or a cluster; yield their records as they end.
 
     What has failed is not tried again in a later round.
     """
     failed: set[str] = set()
-    with open_jobs(given.workers, given.scheduler) as jobs:
-        if jobs is None:
-            with _Here(study, given) as here:
-                for task in (task for group in groups for task in group if task.identity not in failed):
-                    yield (record := here.record(task))
-                    failed |= set() if record.finished else {task.identity}
-            return
-        for answer in jobs.answers(_measure_group, [(study, group, given) for group in groups]):
+    if jobs is None:
+        with _Here(study, given) as here:
+            for task in (task for group in groups for task in group if task.identity not in failed):
+                yield (record := here.record(task))
+                failed |= set() if record.finished else {task.identity}
+        return
+    for of_round in _rounds(groups):
+        parts = [tuple(task for task in group if task.identity not in failed) for group in of_round]
+        parts = [part for part in parts if part]
+        for answer in jobs.answers(_measure_group, [(study, part, given) for part in parts]):
             if answer is None:
                 continue
             number, found = answer
             if isinstance(found, Lost):
-                found = [record_of(study, t, [study.failed(t, "error", found.reason)]) for t in groups[number]]
+                found = [record_of(study, t, [study.failed(t, "error", found.reason)]) for t in parts[number]]
+            failed |= {record.task.identity for record in found if not record.finished}
             yield from found
+
+
+def _rounds(groups: Sequence[tuple[Task, ...]]) -> list[list[tuple[Task, ...]]]:
+    """Part groups into rounds; in each a task is measured by one group only."""
+    rounds: dict[int, list[tuple[Task, ...]]] = {}
+    times = Counter[str]()
+    for group in groups:
+        identities = {task.identity for task in group}
+        rounds.setdefault(max(times[i] for i in identities), []).append(group)
+        times.update(identities)
+    return [rounds[n] for n in sorted(rounds)]
 
 
 class _Here(Generic[F, G]):
@@ -264,12 +300,12 @@ class _Here(Generic[F, G]):
 
     def __init__(self, study: Study[F, G], given: G) -> None:
         self._study, self._given = study, given
+        host.commit()  # remembered: of the code that is loaded, not of what is committed meanwhile
         # what a process leaves behind that is killed goes with the folder
         self._folder = tempfile.TemporaryDirectory(prefix="ctsim-", ignore_cleanup_errors=True)
         self._process = Process({"TMPDIR": self._folder.name, **study.environment(given)})
 
     def __enter__(self) -> Self:
-        host.commit()  # remembered: of the code that is loaded, not of what is committed meanwhile
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -302,10 +338,20 @@ def _measure_group(job: tuple[Study[F, G], tuple[Task, ...], G]) -> list[Record[
     return [here.record(task) for task in group]
 
 
-@functools.lru_cache(maxsize=1)
+_heres: dict[Any, _Here[Any, Any]] = {}
+
+
 def _here(study: type[Study[Any, Any]], given: Any) -> _Here[Any, Any]:
-    """Return what measures in this process, whose own process remembers what is compiled."""
-    return _Here(study(), given)
+    """Return what measures in this process, whose own process remembers what is compiled.
+
+    A worker of Dask lives on: what measured for another command is closed.
+    """
+    if (study, given) not in _heres:
+        for here in _heres.values():
+            here.__exit__()
+        _heres.clear()
+        _heres[study, given] = _Here(study(), given)
+    return _heres[study, given]
 
 
 def listing(study: Study[F, G], left: Sequence[Task], records: Sequence[Record[F]], given: G, n_all: int) -> str:
