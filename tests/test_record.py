@@ -60,7 +60,7 @@ def record(hour: int = 0, /, value: float = 0.0, *, status="ok", runs=(), files=
 
 
 def store(folder: Path) -> Store:
-    return Store(folder, "rows", Value, "a record of tests")
+    return Store(folder, "rows", Record[Value], "a record of tests")
 
 
 def written(folder: Path, *records: Record) -> Store:
@@ -74,14 +74,14 @@ def written(folder: Path, *records: Record) -> Store:
 # --- tasks -----------------------------------------------------------------------------------------------
 
 
-def test_the_identity_counts_everything_but_the_place():
-    one = task(settings={"a": 1, "b": {"c": 2.5, "d": [1, 2]}}, place=(1,))
+def test_the_identity_counts_everything_but_place_and_hints():
+    one = task(settings={"a": 1, "b": {"c": 2.5, "d": [1, 2]}}, place=(1,), hints={"a": 1})
     assert one.identity == task(settings={"b": {"d": [1, 2], "c": 2.5}, "a": 1}, place=(7, 7)).identity
     changes = {
         "study": "other", "part": "x", "case": "two", "subject": "x", "settings": {"a": 2}, "data": "x", "code": "x",
         "machine": "x", "version": 2,
     }  # fmt: skip
-    assert changes.keys() | {"place"} == set(Task.__struct_fields__)
+    assert changes.keys() | {"place", "hints"} == set(Task.__struct_fields__)
     identities = {task(**{name: value}).identity for name, value in changes.items()} | {task().identity}
     assert len(identities) == len(changes) + 1
     assert task(settings={"a": [1, 2]}).identity != task(settings={"a": [2, 1]}).identity

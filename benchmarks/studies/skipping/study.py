@@ -86,7 +86,7 @@ COLUMNS: dict[str, Callable[[str, Skip], str]] = {
     "without (s)": lambda _, f: f"{median(f.seconds['whole']):.4f}" if f.seconds else "–",
     "gain": lambda _, f: f"{f.gain:.2f}" if f.seconds else "–",
     "largest difference": lambda _, f: _difference(f),
-    "allowed": lambda _, f: f.stated if not f.limit else f"≤ {f.limit:.2g} ({f.stated})",
+    "allowed": lambda _, f: f.stated or "–" if not f.limit else f"≤ {f.limit:.2g} ({f.stated})",
     "held": lambda _, f: "NO" if not f.ok else "–" if f.limit is None else "yes",
     "note": lambda _, f: f.note if f.status == OK else f"{f.status}: {f.reason}",
 }
