@@ -17,18 +17,15 @@ from ctsim.benchmarks.studies.pareto.records import latest, points
 from ctsim.benchmarks.studies.pareto.records import read as read_pareto
 from ctsim.benchmarks.studies.peers import cases as peer_cases
 from ctsim.benchmarks.studies.peers import tables as peer_tables
-from ctsim.benchmarks.studies.skipping import tables as skipping_tables
 from ctsim.benchmarks.studies.stress import tables as stress_records
 from ctsim.errors import InputError
 from ctsim.folder import read_progress
 from ctsim.scaninfo import read_info
 
 BY = {"host": host(), "commit": "a" * 40, "time": "2026-01-01T00:00:00+00:00"}
-SKIPPED = skipping_tables.failed("rays", "ok", "")
 KINDS = {
     "records": (records.NAME, record(params={"a": [1, {"b": 2.5}]}, time=BY["time"])),
     "pareto": ("pareto.jsonl", timed(setting(params={"a": [1]}), ("1", 1.0, 2.0))),
-    "skipping": ("skipping.jsonl", skipping_tables.SkipRecord(measured=SKIPPED, size="core", run="r", **BY)),
     "stress": (
         stress_records.NAME,
         stress_records.StressRecord(
@@ -117,7 +114,6 @@ def read_records(path):
 READERS = {
     "records": read_records,
     "pareto": lambda path: points(latest(read_pareto(path))),
-    "skipping": skipping_tables.read,
     "stress": stress_records.read,
     "peers": peer_tables.read,
 }

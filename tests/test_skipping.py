@@ -134,7 +134,7 @@ def test_a_twin_that_keeps_metal_on_open_detector_is_found(here, tmp_path, monke
 def test_a_row_tells_both_ways_and_what_is_left_takes_as_long(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(host, "commit", lambda: "a" * 40)
     study, given = skipping.Skipping(), skipping.Flags(results=tmp_path, repeats=3, case=("rays", "twin"))
-    rays, twin = study.tasks(given)
+    rays, _ = study.tasks(given)
     # the times of neighbouring runs are 2, 3 and 2 times as long without the skip
     seconds = {"skipping": (1.0, 2.0, 3.0), "whole": (2.0, 6.0, 6.0)}
     pair = Skip(seconds=seconds, scene="s", what="w", difference=0.25, unit="P", limit=0.5, stated="rounding", note="n")
