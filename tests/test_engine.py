@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 import tiny_study
 from engine_jobs import lives, until
+from test_record import places
 
 from ctsim.benchmarks import cli
 from ctsim.benchmarks.engine import host, study
@@ -176,6 +177,30 @@ def test_a_line_that_was_cut_short_is_warned_of_once(command, tmp_path, capsys, 
         caplog.clear()
         assert command.call(tmp_path, *words, cases=1) == 0
         assert len([r for r in caplog.records if "cut short" in r.getMessage()]) == 1, words
+
+
+def test_what_was_found_may_be_anything_and_is_shown_or_refused(command, tmp_path, capsys):
+    """A single exception of another kind is a traceback on every further call on that folder."""
+    assert command.call(tmp_path, cases=1) == 0
+    capsys.readouterr()
+    path, seen = tmp_path / f"{command.study.file}.jsonl", set()
+    whole = json.loads(path.read_text())
+    for *way, key in places(whole["found"])[1:]:
+        for value in (None, [], {}, "a|b\n", -1, [1.0, 2.0], {"a": [1.0]}):
+            bad = json.loads(json.dumps(whole))
+            inner = bad["found"]
+            for k in way:
+                inner = inner[k]
+            inner[key] = value
+            path.write_text(json.dumps(bad) + "\n")
+            for words in (["--table"], ["--dry-run", "--force"]):
+                try:
+                    seen.add(code := command.call(tmp_path, *words, cases=1))
+                except Exception as error:
+                    raise AssertionError(f"{type(error).__name__}: {error} at {bad['found']}") from error
+                said = capsys.readouterr().err
+                assert code != 2 or (said.count("\n") == 1 and len(said) < 2000)
+    assert {0, 2} <= seen <= {0, 1, 2}
 
 
 @pytest.mark.parametrize("word", ["--table", "--collect"])
@@ -416,6 +441,18 @@ def test_two_workers_find_the_same_as_one(tiny, tmp_path, capsys):
     assert tables[0] == tables[1]
     assert tiny(tmp_path / "2", cases, "--workers", "2") == 1  # only what failed is left
     assert log(tmp_path / "2")[5:] == ["fails"]
+
+
+def test_a_cluster_finds_the_same_also_within_a_limit(tiny, tmp_path, capsys):
+    pytest.importorskip("distributed")
+    from distributed import LocalCluster
+
+    cases = "good bad fails"
+    assert tiny(tmp_path / "here", cases) == 1
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL") as cluster:
+        for name, words in (("there", ()), ("limited", ("--seconds", "60"))):
+            assert tiny(tmp_path / name, cases, "--scheduler", cluster.scheduler_address, *words) == 1
+            assert sorted(found(tmp_path / name)) == sorted(found(tmp_path / "here"))
 
 
 def test_a_task_whose_worker_dies_each_time_is_a_row(tiny, tmp_path, capsys):

@@ -22,6 +22,13 @@ class Skip(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
     stated: str = ""
     note: str = ""
 
+    def __post_init__(self) -> None:
+        pairs = [self.seconds.get(way, ()) for way in ("skipping", "whole")]
+        if self.seconds and not (len(self.seconds) == 2 and len(pairs[0]) == len(pairs[1]) > 0):
+            raise ValueError('seconds must be as many for "skipping" as for "whole", and for nothing else')
+        if not all(second > 0 for seconds in pairs for second in seconds):
+            raise ValueError("seconds must be positive")
+
     @property
     def gain(self) -> float:
         """Median over pairs of neighbouring runs of the time without the skip over that with it."""
