@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from ctsim.benchmarks.engine import host
+from ctsim.benchmarks.engine import host, process
 from ctsim.benchmarks.engine.process import Pool, Process, Stopped
 from ctsim.errors import InputError
 
@@ -146,12 +146,17 @@ def sleep_on(path: str) -> None:
         time.sleep(60)
 
 
+def sleep_on_with_little_grace(path: str) -> None:
+    process.GRACE = 0.2
+    sleep_on(path)
+
+
 def touch_at_exit(path: str) -> None:
     atexit.register(Path(path).touch)
 
 
 def call_from_here(path: str) -> None:
     """Use processes from this one, such as a daemon, which may have no children of multiprocessing."""
-    with Process() as process, Pool(2) as pool:
+    with Process() as one, Pool(2) as pool:
         answers = dict(a for a in pool.answers(job, ["one", "two"]) if a is not None)
-        write(path, f"{process.run(os.getppid) == os.getpid()} {sorted(a[:3] for a in answers.values())}")
+        write(path, f"{one.run(os.getppid) == os.getpid()} {sorted(a[:3] for a in answers.values())}")

@@ -281,11 +281,7 @@ def test_a_call_can_write_down_where_it_stopped_when_its_parent_is_killed(tmp_pa
 
 def test_what_does_not_hear_is_killed_after_its_grace_when_its_parent_is_killed(tmp_path):
     pid = tmp_path / "pid"
-    code = f"{CALLS}from ctsim.benchmarks.engine import process\nprocess.serve.__globals__\n"
-    short = "import engine_jobs; from ctsim.benchmarks.engine import process; process.GRACE = 0.2"
-    (tmp_path / "shorter.py").write_text(f"{short}\ndef job(path): engine_jobs.sleep_on(path)\n")
-    code += f"sys.path.insert(0, {str(tmp_path)!r}); import shorter; Process().run(shorter.job, sys.argv[1])"
-    with subprocess.Popen(script(code, pid), env=ENVIRONMENT) as it:
+    with subprocess.Popen(script(IN_PROCESS, "sleep_on_with_little_grace", pid), env=ENVIRONMENT) as it:
         until(pid.exists)
         it.kill()
     until(lambda: not lives(*numbers(pid)))

@@ -47,6 +47,10 @@ class Tiny(study.Study):
     def expected(self, task, given):
         return {"good": 60.0}.get(task.case)
 
+    def limit(self, task, given):
+        # other tasks have the time to start on a busy machine
+        return 60.0 if given.seconds and given.seconds >= 1 and task.case != "slow" else given.seconds
+
     def tables(self, records, given):
         rows = [[r.task.case, f.status, f.reason, f.value] for r in records for f in r.found]
         return [simple(["case", "status", "reason", "value"], rows, title="Tiny")]
