@@ -21,13 +21,13 @@ from conftest import SMALLEST
 from ctsim.benchmarks import cli
 from ctsim.benchmarks.engine.limited import Limited
 from ctsim.benchmarks.methods import TABLE
+from ctsim.benchmarks.oracles import relative
 from ctsim.benchmarks.studies.pareto import jobs as pareto_jobs
 from ctsim.benchmarks.studies.pareto import methods as pareto_methods
 from ctsim.benchmarks.studies.pareto import simulator as pareto_simulator
 from ctsim.benchmarks.studies.pareto import study as pareto
 from ctsim.benchmarks.studies.pareto import suite as pareto_suite
 from ctsim.benchmarks.studies.pareto.records import read
-from ctsim.benchmarks.studies.peers.cases import relative
 from ctsim.settings import Simulation
 from ctsim.types import Volume
 

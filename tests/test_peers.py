@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from ctsim.benchmarks import cli
+from ctsim.benchmarks import cli, oracles
 from ctsim.benchmarks.engine import host, lines
 from ctsim.benchmarks.studies.peers import cases as peer_cases
 from ctsim.benchmarks.studies.peers import catalogue as peer_catalogue
@@ -63,9 +63,9 @@ def test_rtk_sees_the_same_rays_as_we_do():
     assert theirs.shape == GEOMETRY.shape
     # Joseph interpolates between voxels, so the block's edges are blurred by one: a few per cent in RMS.
     # An axis exchanged, turned round or shifted by a voxel gives 13 % and more.
-    assert peer_cases.relative(theirs, ours) < 0.09
+    assert oracles.relative(theirs, ours) < 0.09
     for wrong in (theirs[:, ::-1], theirs[:, :, ::-1], theirs[::-1], np.roll(theirs, 1, 1), np.roll(theirs, 1, 2)):
-        assert peer_cases.relative(wrong, ours) > 0.11
+        assert oracles.relative(wrong, ours) > 0.11
 
 
 @NEEDS_RTK
@@ -114,7 +114,7 @@ def test_xcist_sees_the_same_rays_as_we_do():
     assert os.environ["PATH"] == path
     (n_v, n_u), (d_v, d_u) = XCIST_GEOMETRY.n_detector, XCIST_GEOMETRY.d_detector
     fine = msgspec.structs.replace(XCIST_GEOMETRY, n_detector=(n_v * 8, n_u * 8), d_detector=(d_v / 8, d_u / 8))
-    views = [peer_cases.upright_chord(fine, k, solid) for k in range(fine.n_views)]
+    views = [oracles.upright_chord(fine, k, solid) for k in range(fine.n_views)]
     ours = np.stack(views).reshape(-1, n_v, 8, n_u, 8).mean((2, 4))
     assert theirs.shape == XCIST_GEOMETRY.shape
     # The shadow's centre in each view, in pixels. Shares of voxels keep the rod's centre to second order; half a
@@ -126,7 +126,7 @@ def test_xcist_sees_the_same_rays_as_we_do():
     # the rod's volume, which shares keep but for their sampling: 0.05 % measured
     np.testing.assert_allclose(theirs.sum((1, 2)), ours.sum((1, 2)), rtol=2e-3)
     # voxels of 1.2 mm blur the edges of a rod of 7 mm: 12 %; a pixel astray gives 23 %
-    assert peer_cases.relative(theirs, ours) < 0.15
+    assert oracles.relative(theirs, ours) < 0.15
 
 
 @NEEDS_XCIST
@@ -156,7 +156,7 @@ def test_both_peers_measure_the_same_quantity_in_poly():
     contenders = peer_poly.Contenders(peer_cases.Setup(n=64), POLY_SCENE)
     theirs, rtk = contenders.prepare(XCIST)(), contenders.prepare(RTK)()
     # Joseph and distance-driven differ at edges, 0.7 % on this grid and less on finer ones; a pixel astray gives 9 %
-    assert peer_cases.relative(theirs, rtk) < 0.02
+    assert oracles.relative(theirs, rtk) < 0.02
 
 
 def test_what_xcist_cannot_have_is_refused():
@@ -176,7 +176,7 @@ def test_closed_form_chord_through_the_axis_is_the_diameter():
     geometry = Geometry(
         dso=200.0, dsd=320.0, n_voxel=(4, 4, 4), d_voxel=(1, 1, 1), n_detector=(5, 7), d_detector=(1.0, 1.0), n_views=1
     )
-    chord = peer_cases.upright_chord(geometry, 0, cylinder("rod", "Fe", (6.0, 20.0)))
+    chord = oracles.upright_chord(geometry, 0, cylinder("rod", "Fe", (6.0, 20.0)))
     assert chord[2, 3] == pytest.approx(12.0, abs=1e-12)
     # a ray tilted by v/dsd is longer by 1/cos within the same diameter
     assert chord[3, 3] == pytest.approx(12.0 * np.hypot(1, 1 / 320), abs=1e-12)
@@ -184,8 +184,8 @@ def test_closed_form_chord_through_the_axis_is_the_diameter():
     distance = 200.0 * np.sin(np.arctan(3 / 320))
     assert chord[2, 6] == pytest.approx(2 * np.sqrt(36 - distance**2), abs=1e-9)
     # a ray that misses, and one that leaves through a cap
-    assert peer_cases.upright_chord(geometry, 0, cylinder("rod", "Fe", (6.0, 20.0), centre=(0.0, 30.0, 0.0))).max() == 0
-    short = peer_cases.upright_chord(geometry, 0, cylinder("rod", "Fe", (6.0, 1.0)))
+    assert oracles.upright_chord(geometry, 0, cylinder("rod", "Fe", (6.0, 20.0), centre=(0.0, 30.0, 0.0))).max() == 0
+    short = oracles.upright_chord(geometry, 0, cylinder("rod", "Fe", (6.0, 1.0)))
     steep = short[4, 3]
     # it enters the slab |z| < 0.5 at the wall (z = 2·194/320 > 0.5), so it never meets the short rod
     assert steep == 0
@@ -210,11 +210,11 @@ def test_eighty_bins_keep_weight_and_mean_energy():
 def test_the_measured_pixel_averages_intensity_not_line_integrals():
     setup = peer_cases.Setup(n=16)
     contenders = peer_poly.Contenders(setup, POLY_SCENE)
-    oracle = peer_poly.measured_pixel(contenders.phantom, contenders.scanner, (0,))
+    oracle = oracles.measured_pixel(contenders.phantom, contenders.scanner, (0,))
     assert oracle.shape == (1, 16, 16)
     ours = contenders.ours(voxels=False)()[:1]
     # 34 sub-rays in pixels of 8 mm against 256: a few per cent
-    assert peer_cases.relative(ours, oracle) < 0.05
+    assert oracles.relative(ours, oracle) < 0.05
     assert oracle.max() > 1 and oracle.min() >= -1e-6
 
 

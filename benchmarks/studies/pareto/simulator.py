@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.benchmarks.methods import code_version
+from ctsim.benchmarks.oracles import SIZE, poly_scene, relative, voxelised
 from ctsim.benchmarks.studies.pareto.records import Mark, Setting
 from ctsim.benchmarks.studies.pareto.suite import Choices, Level
-from ctsim.benchmarks.studies.peers.cases import SIZE, relative, voxelised
-from ctsim.benchmarks.studies.peers.poly import poly_scene
 from ctsim.noise import Noise
 from ctsim.phantoms.scanners import preset
 from ctsim.plan import Plan, make_plan

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ctsim.benchmarks.engine import apart
 from ctsim.benchmarks.engine.host import in_turns
+from ctsim.benchmarks.oracles import SIZE, relative, upright_chord, voxelised
 from ctsim.benchmarks.studies.peers import catalogue as peer_catalogue
 from ctsim.benchmarks.studies.peers import paper as peer_paper
 from ctsim.benchmarks.studies.peers import rtk as peer_rtk
@@ -34,14 +35,12 @@ from ctsim.plan import present_materials
 from ctsim.project import Tracer, path_lengths
 from ctsim.reconstruct.fdk import fdk as ours_fdk
 from ctsim.simulate import compact
-from ctsim.solids import Solid
 from ctsim.types import Phantom, Scanner
-from ctsim.voxelise import attenuation_volume, label_volume
+from ctsim.voxelise import attenuation_volume
 
 OURS = "ctsim"
 MEASURED = RTK, XCIST = "itk-rtk", "xcist"  # the catalogue's peers that there is code for
 FAILED = ("error", "timeout")
-SIZE = 60.0  # edge of the scenes' cube in mm
 FULL, SMALL = 256, 32  # side of grids and detectors
 KEV = np.array([50.0])
 
@@ -103,11 +102,6 @@ def left_out(setup: Setup, case: Case, scene: str) -> list[Measurement]:
     return out
 
 
-def relative(p: NDArray, exact: NDArray) -> float:
-    """Return the root mean square of p − exact over that of exact."""
-    return float(np.sqrt(np.mean((np.asarray(p, np.float64) - exact) ** 2) / np.mean(np.asarray(exact) ** 2)))
-
-
 # --- 1: path lengths ---------------------------------------------------------------------------------
 
 
@@ -158,34 +152,6 @@ def _trace_all(tracer: Tracer, geometry: Geometry) -> None:
 
 
 # --- 2: error against closed form --------------------------------------------------------------------
-
-
-def upright_chord(geometry: Geometry, view: int, solid: Solid) -> NDArray[np.float64]:
-    """Chord (mm) of every central ray through an upright cylinder, in closed form and float64: [v, u]."""
-    primitive = solid.primitives[0]
-    half, radius = primitive.params[:2]
-    source, centre, e_u, e_v = geometry.pose_array()[view].reshape(4, 3)
-    n_v, n_u = geometry.n_detector
-    u, v = np.arange(n_u) - (n_u - 1) / 2, np.arange(n_v) - (n_v - 1) / 2
-    ray = (centre - source) + u[None, :, None] * e_u + v[:, None, None] * e_v
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    start = source - np.asarray(primitive.centre)
-    a = ray[..., 0] ** 2 + ray[..., 1] ** 2
-    b = ray[..., 0] * start[0] + ray[..., 1] * start[1]
-    root = np.sqrt(np.maximum(b**2 - a * (start[0] ** 2 + start[1] ** 2 - radius**2), 0))
-    flat = np.where(np.abs(ray[..., 2]) < 1e-300, 1e-300, ray[..., 2])
-    caps = np.stack([(-half - start[2]) / flat, (half - start[2]) / flat])
-    enter = np.maximum((-b - root) / a, caps.min(0))
-    leave = np.minimum((-b + root) / a, caps.max(0))
-    return np.where(root > 0, np.maximum(leave - enter, 0), 0.0)
-
-
-def voxelised(phantom: Phantom, geometry: Geometry, keep: tuple[Solid, ...]) -> Phantom:
-    """Return the phantom with all solids but `keep` turned into labels on the geometry's grid."""
-    rest = tuple(s for s in phantom.solids if s not in keep)
-    body = Phantom(labels=phantom.labels, materials=phantom.materials, d_voxel=phantom.d_voxel, solids=rest)
-    labels = label_volume(body, geometry)
-    return Phantom(labels=labels, materials=phantom.materials, d_voxel=geometry.d_voxel, solids=keep)
 
 
 def exact(setup: Setup) -> list[Measurement]:

@@ -3,53 +3,33 @@
 import sys
 from collections.abc import Callable
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.benchmarks.engine import apart, host
 from ctsim.benchmarks.engine.host import in_turns
+from ctsim.benchmarks.oracles import measured_pixel, poly_scene, relative, voxelised
 from ctsim.benchmarks.studies.peers import catalogue as peer_catalogue
 from ctsim.benchmarks.studies.peers import rtk as peer_rtk
 from ctsim.benchmarks.studies.peers import xcist as peer_xcist
 from ctsim.benchmarks.studies.peers.cases import (
     OURS,
     RTK,
-    SIZE,
     XCIST,
     Measurement,
     Setup,
     left_out,
-    relative,
-    voxelised,
 )
 from ctsim.materials import attenuation
-from ctsim.phantoms.shapes import cylinder
 from ctsim.plan import make_plan
 from ctsim.project import Response, Tracer, transmit
 from ctsim.quadrature import EnergyRule, full_rule
 from ctsim.settings import Simulation, Truth
 from ctsim.spectrum import spectrum
-from ctsim.types import Phantom, Scanner
 from ctsim.voxelise import fractions
 
 BINS = 80
-FINER = 16  # rays along each side of a pixel in the oracle
 CHECKED = 2  # views that the oracle measures
-
-
-def poly_scene(n: int) -> Phantom:
-    """Return the scene of case 5, all analytic: water cylinder, bone rod, two iron rods."""
-    solids = (
-        cylinder("water", "water", (25.0, 54.0), metal=False),
-        cylinder("bone", "cortical_bone", (5.0, 48.0), centre=(11.0, 6.0, 0.0), metal=False),
-        cylinder("iron 1", "Fe", (2.5, 44.0), centre=(-9.0, 9.0, 0.0)),
-        cylinder("iron 2", "Fe", (2.0, 44.0), centre=(-4.0, -13.0, 0.0)),
-    )
-    names = ("air", "water", "cortical_bone", "Fe")
-    return Phantom(
-        labels=np.zeros((n, n, n), np.uint8), materials=names, d_voxel=(SIZE / n, SIZE / n, SIZE / n), solids=solids
-    )
 
 
 SCENES = {"water, bone, Fe": poly_scene}
@@ -63,23 +43,6 @@ def eighty_bins(rule: EnergyRule) -> tuple[NDArray[np.float64], NDArray[np.float
     kept = share > 0
     energy = np.bincount(of, rule.w1 * rule.energies, BINS)[kept] / share[kept]
     return energy, np.asarray(share[kept], np.float64)
-
-
-def measured_pixel(phantom: Phantom, scanner: Scanner, views: tuple[int, ...]) -> NDArray[np.float64]:
-    """P of every pixel as a detector has it: 16² rays a pixel averaged in intensity, the whole fine spectrum.
-
-    Chords are our tracer's closed forms, for an all-analytic scene, in central rays of a 16-fold finer detector.
-    """
-    coarse = scanner.geometry
-    (n_v, n_u), (d_v, d_u) = coarse.n_detector, coarse.d_detector
-    fine = msgspec.structs.replace(coarse, n_detector=(n_v * FINER, n_u * FINER), d_detector=(d_v / FINER, d_u / FINER))
-    tracer = Tracer.of(phantom)
-    response = Response.of(full_rule(spectrum(scanner.tube), scanner.detector), tracer.materials)
-    out = np.empty((len(views), n_v, n_u))
-    for k, view in enumerate(views):
-        signal, _ = transmit(tracer, fine, view, response, subrays=1)
-        out[k] = signal.reshape(n_v, FINER, n_u, FINER).mean((1, 3), dtype=np.float64)
-    return -np.log(out)
 
 
 class Contenders:

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from ctsim.baselines.morphology import dilate
-from ctsim.benchmarks.studies.peers.cases import upright_chord
+from ctsim.benchmarks.oracles import upright_chord
 from ctsim.benchmarks.studies.stress.cases import FULL, SHORT
 from ctsim.errors import InputError
 from ctsim.geometry import Count, Geometry, Pair, Triple

@@ -1,0 +1,89 @@
+"""Closed forms and converged references that studies compare results with, and the analytic scene for them.
+
+Lengths are in mm, projections are P = -ln(signal/open), [v, u] or [view, v, u]; everything is float64.
+"""
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.geometry import Geometry
+from ctsim.phantoms.shapes import cylinder
+from ctsim.project import Response, Tracer, transmit
+from ctsim.quadrature import full_rule
+from ctsim.solids import Solid
+from ctsim.spectrum import spectrum
+from ctsim.types import Phantom, Scanner
+from ctsim.voxelise import label_volume
+
+SIZE = 60.0  # edge of the scene's cube in mm
+FINER = 16  # finer pixels along each side of a pixel in `measured_pixel`
+
+
+def relative(p: NDArray, exact: NDArray) -> float:
+    """Return the root mean square of p − exact over that of exact."""
+    return float(np.sqrt(np.mean((np.asarray(p, np.float64) - exact) ** 2) / np.mean(np.asarray(exact) ** 2)))
+
+
+def upright_chord(geometry: Geometry, view: int, solid: Solid) -> NDArray[np.float64]:
+    """Return the chord (mm) of every central ray through an upright cylinder: [v, u]."""
+    primitive = solid.primitives[0]
+    half, radius = primitive.params[:2]
+    source, centre, e_u, e_v = geometry.pose_array()[view].reshape(4, 3)
+    n_v, n_u = geometry.n_detector
+    u, v = np.arange(n_u) - (n_u - 1) / 2, np.arange(n_v) - (n_v - 1) / 2
+    ray = (centre - source) + u[None, :, None] * e_u + v[:, None, None] * e_v
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    start = source - np.asarray(primitive.centre)
+    a = ray[..., 0] ** 2 + ray[..., 1] ** 2
+    b = ray[..., 0] * start[0] + ray[..., 1] * start[1]
+    root = np.sqrt(np.maximum(b**2 - a * (start[0] ** 2 + start[1] ** 2 - radius**2), 0))
+    flat = np.where(np.abs(ray[..., 2]) < 1e-300, 1e-300, ray[..., 2])
+    caps = np.stack([(-half - start[2]) / flat, (half - start[2]) / flat])
+    enter = np.maximum((-b - root) / a, caps.min(0))
+    leave = np.minimum((-b + root) / a, caps.max(0))
+    return np.where(root > 0, np.maximum(leave - enter, 0), 0.0)
+
+
+def voxelised(phantom: Phantom, geometry: Geometry, keep: tuple[Solid, ...]) -> Phantom:
+    """Return the phantom with all solids but `keep` turned into labels on the geometry's grid."""
+    rest = tuple(s for s in phantom.solids if s not in keep)
+    body = Phantom(labels=phantom.labels, materials=phantom.materials, d_voxel=phantom.d_voxel, solids=rest)
+    labels = label_volume(body, geometry)
+    return Phantom(labels=labels, materials=phantom.materials, d_voxel=geometry.d_voxel, solids=keep)
+
+
+def poly_scene(n: int) -> Phantom:
+    """Return an analytic scene on a grid of n³ voxels: water cylinder, bone rod, two iron rods."""
+    solids = (
+        cylinder("water", "water", (25.0, 54.0), metal=False),
+        cylinder("bone", "cortical_bone", (5.0, 48.0), centre=(11.0, 6.0, 0.0), metal=False),
+        cylinder("iron 1", "Fe", (2.5, 44.0), centre=(-9.0, 9.0, 0.0)),
+        cylinder("iron 2", "Fe", (2.0, 44.0), centre=(-4.0, -13.0, 0.0)),
+    )
+    names = ("air", "water", "cortical_bone", "Fe")
+    return Phantom(
+        labels=np.zeros((n, n, n), np.uint8), materials=names, d_voxel=(SIZE / n, SIZE / n, SIZE / n), solids=solids
+    )
+
+
+def measured_pixel(
+    phantom: Phantom, scanner: Scanner, views: Sequence[int], *, finer: int = FINER, subrays: int = 1
+) -> NDArray[np.float64]:
+    """Return P of every pixel as a detector has it: rays averaged in intensity, the whole fine spectrum.
+
+    A pixel is `finer`² finer pixels of up to `subrays` rays each; 1 and 1 is the central ray alone. Chords are the
+    tracer's closed forms, so the scene has to be analytic.
+    """
+    coarse = scanner.geometry
+    (n_v, n_u), (d_v, d_u) = coarse.n_detector, coarse.d_detector
+    fine = msgspec.structs.replace(coarse, n_detector=(n_v * finer, n_u * finer), d_detector=(d_v / finer, d_u / finer))
+    tracer = Tracer.of(phantom)
+    response = Response.of(full_rule(spectrum(scanner.tube), scanner.detector), tracer.materials)
+    out = np.empty((len(views), n_v, n_u))
+    for k, view in enumerate(views):
+        signal, _ = transmit(tracer, fine, view, response, subrays=subrays)
+        out[k] = signal.reshape(n_v, finer, n_u, finer).mean((1, 3), dtype=np.float64)
+    return -np.log(out)
