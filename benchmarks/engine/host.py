@@ -15,6 +15,8 @@ from pathlib import Path
 
 import msgspec
 
+from ctsim.benchmarks.engine.process import THREADS, at_most
+
 VERSIONS_OF = ("ctsim", "numpy", "numba", "torch", "scipy", "scikit-image", "xraylib")
 
 
@@ -54,13 +56,13 @@ def _version(package: str) -> str:
 
 
 def use_threads(threads: int) -> None:
-    """Let the kernels and torch have so many threads, before numba is loaded."""
-    os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
-    import numba
-    import torch
-
-    numba.set_num_threads(min(threads, numba.get_num_threads()))
-    torch.set_num_threads(numba.get_num_threads())
+    """Let the kernels and torch have at most so many threads, now or when they are loaded; loads neither."""
+    variables = at_most(threads)
+    for name, variable in THREADS.items():
+        if library := sys.modules.get(name):
+            library.set_num_threads(min(threads, library.get_num_threads()))
+        else:
+            os.environ[variable] = variables[variable]
 
 
 def host() -> Host:

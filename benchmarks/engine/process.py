@@ -51,6 +51,12 @@ def how_it_ended(exit_code: int) -> str:
     return f"signal {signal.Signals(-exit_code).name}" if exit_code < 0 else f"exit code {exit_code}"
 
 
+def at_most(threads: int) -> dict[str, str]:
+    """Return the variables that give libraries so many threads, or fewer where they are set to fewer."""
+    before = {v: os.environ.get(v, "").partition(",")[0] for v in THREADS.values()}
+    return {v: str(min(threads, int(given)) if given.isdecimal() else threads) for v, given in before.items()}
+
+
 class Stopped(RuntimeError):
     """A call that did not end within its limit, or whose process died.
 
@@ -241,9 +247,7 @@ class Pool:
     """Several processes of this machine, each with its share of the cores."""
 
     def __init__(self, n: int) -> None:
-        share = max(1, len(os.sched_getaffinity(0)) // n)
-        before = {v: os.environ.get(v, "").partition(",")[0] for v in THREADS.values()}
-        threads = {v: str(min(share, int(given)) if given.isdecimal() else share) for v, given in before.items()}
+        threads = at_most(max(1, len(os.sched_getaffinity(0)) // n))
         self._processes = [Process(threads) for _ in range(n)]
         self._idle = list(self._processes)
         self._busy: dict[connection.Connection, tuple[Process, int]] = {}

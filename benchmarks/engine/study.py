@@ -107,15 +107,19 @@ class Study(Generic[F, G]):
         """Return how many timed runs a task needs."""
         return getattr(given, "repeats", 1)
 
+    def runs(self, task: Task, given: G) -> int:
+        """Return how many timed runs this task needs, 1 where it is not timed."""
+        return self.repeats(given)
+
     def shows(self, task: Task, given: G) -> bool:
         """Whether the tables of these flags show a recorded task."""
         return True
 
     def pending(self, tasks: Sequence[Task], records: Sequence[Record[F]], given: G) -> list[Task]:
         """Return the tasks that are not recorded, in the order in which they are to be measured."""
-        wanted = self.repeats(given)
-        known = done([] if given.force else records, 1 if self.rounds else wanted)
-        rounds = range(wanted if self.rounds else 1)
+        records = [r for r in records if self.rounds or r.repeats >= self.runs(r.task, given)]
+        known = done([] if given.force else records)
+        rounds = range(self.repeats(given) if self.rounds else 1)
         # a commit with changes does not say what code ran
         return [t for n in rounds for t in tasks if known[t.identity] <= n or not host.certain(t.code)]
 
@@ -130,7 +134,7 @@ class Study(Generic[F, G]):
     def took(self, record: Record[F], given: G) -> float | None:
         """Return the seconds that measuring a recorded task again takes: all its timed runs, the first one untimed."""
         once = sum(median(s) for one in record.found for s in one.seconds.values() if s)
-        return once * (self.repeats(given) + 1)
+        return once * (self.runs(record.task, given) + 1)
 
     def line(self, task: Task) -> tuple[str, str]:
         """Return the line of --dry-run that a task counts in: a name and more."""
