@@ -3,12 +3,14 @@
 Everything heavy is imported after the command line is understood, so that --help answers at once.
 """
 
+import contextlib
 import importlib
 import io
 import os
 import signal
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 OTHERS = {
     "inspect": "ctsim.benchmarks.studies.inspect",
@@ -66,6 +68,20 @@ def guarded(name: str, module: str, arguments: list[str], *, resumes: bool = Tru
         return EXIT_INTERRUPTED
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def quietly(command: Callable[[list[str]], int], *arguments: str | Path) -> None:
+    """Run a command of ours without what it says; raise RuntimeError with that where it fails.
+
+    Raises KeyboardInterrupt where the command was interrupted and says so by its exit code.
+    """
+    said = io.StringIO()
+    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+        code = command([str(argument) for argument in arguments])
+    if code == EXIT_INTERRUPTED:
+        raise KeyboardInterrupt
+    if code:
+        raise RuntimeError(f"exit code {code}: {said.getvalue().strip()}")
 
 
 def _write_anything() -> None:

@@ -1,8 +1,6 @@
 """What `run-benchmark skipping` measures of reconstruction methods and commands (see `skipping_cases`)."""
 
-import contextlib
 import functools
-import io
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,7 +16,7 @@ from ctsim.baselines.metal import Trace, find_metal
 from ctsim.baselines.nmar import Normalise, normalised
 from ctsim.baselines.prior import Choice, choose_prior
 from ctsim.benchmarks import make_dataset
-from ctsim.benchmarks.cli import EXIT_INTERRUPTED
+from ctsim.benchmarks.cli import quietly
 from ctsim.benchmarks.engine.record import Task
 from ctsim.benchmarks.methods import Method, find
 from ctsim.benchmarks.studies.methods import study as cli_run
@@ -39,20 +37,6 @@ HOW = "rows"
 Bridge = Callable[[NDArray[np.float32], slice, Filled], None]
 # float32 sums in the same order, of rows read at places that were worked out from another centre
 MOVED, MOVED_AT = 1e-5, "tests/test_fdk.py"
-
-
-def quietly(command: Callable[[list[str]], int], *arguments: str | Path) -> None:
-    """Run a command of ours without what it says; raise RuntimeError with that where it fails.
-
-    Raises KeyboardInterrupt where the command was interrupted and says so by its exit code.
-    """
-    said = io.StringIO()
-    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
-        code = command([str(argument) for argument in arguments])
-    if code == EXIT_INTERRUPTED:
-        raise KeyboardInterrupt
-    if code:
-        raise RuntimeError(f"exit code {code}: {said.getvalue().strip()}")
 
 
 def made(setup: Setup, *flags: str) -> StoredScan:
