@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.geometry import Geometry
+from ctsim.phantoms.scanners import preset
 from ctsim.phantoms.shapes import cylinder
 from ctsim.project import Response, Tracer, transmit
 from ctsim.quadrature import full_rule
@@ -53,6 +54,11 @@ def voxelised(phantom: Phantom, geometry: Geometry, keep: tuple[Solid, ...]) -> 
     body = Phantom(labels=phantom.labels, materials=phantom.materials, d_voxel=phantom.d_voxel, solids=rest)
     labels = label_volume(body, geometry)
     return Phantom(labels=labels, materials=phantom.materials, d_voxel=geometry.d_voxel, solids=keep)
+
+
+def scanner_of(side: int, views: int) -> Scanner:
+    """Return the desktop scanner of the bundled suites on side² pixels, with side³ voxels in the scene's cube."""
+    return preset("skyscan1273", views, (side, side), (side, side, side), SIZE)
 
 
 def poly_scene(n: int) -> Phantom:

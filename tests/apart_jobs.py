@@ -4,10 +4,13 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
+from pathlib import Path
 from typing import Any
 
 from ctsim.benchmarks.engine import host
+from ctsim.benchmarks.studies.peers.finding import Measurement
 
 
 def tell() -> None:
@@ -26,14 +29,9 @@ def sleep_in_two(file: str) -> None:
     time.sleep(60)
 
 
-def die_in_exact(case: str, setup: Any) -> list:
+def die_in_exact(task: Any, given: Any) -> list:
     """Measure as `run-benchmark peers` does, but for the case exact: leave a temporary folder and die."""
-    import tempfile
-    from pathlib import Path
-
-    from ctsim.benchmarks.studies.peers.cases import Measurement
-
-    if case == "exact":
+    if task.case == "exact":
         Path(os.environ["CTSIM_TEST_MARK"]).write_text(tempfile.mkdtemp(), encoding="utf-8")
         os._exit(3)
-    return [Measurement(case=case, scene="s", contender="ctsim", seconds=(1.0,), note=f"{setup.n} {os.getpid()}")]
+    return [Measurement(scene="s", contender="ctsim", seconds={"run": (1.0,)}, note=f"{task.part} {os.getpid()}")]

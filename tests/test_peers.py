@@ -6,16 +6,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from ctsim.benchmarks import cli, oracles
-from ctsim.benchmarks.engine import host, lines
-from ctsim.benchmarks.studies.peers import cases as peer_cases
-from ctsim.benchmarks.studies.peers import catalogue as peer_catalogue
-from ctsim.benchmarks.studies.peers import poly as peer_poly
-from ctsim.benchmarks.studies.peers import rtk as peer_rtk
-from ctsim.benchmarks.studies.peers import study as peers
-from ctsim.benchmarks.studies.peers import tables as peer_tables
-from ctsim.benchmarks.studies.peers import xcist as peer_xcist
-from ctsim.benchmarks.studies.peers.cases import OURS, RTK, XCIST, Measurement
+from ctsim.benchmarks import oracles
+from ctsim.benchmarks.engine import host
+from ctsim.benchmarks.engine.record import Record, Task
+from ctsim.benchmarks.studies.peers import cases, catalogue, poly, study, tables
+from ctsim.benchmarks.studies.peers.finding import OURS, RTK, XCIST, Measurement, Setup
+from ctsim.benchmarks.studies.peers.rtk import Rtk
+from ctsim.benchmarks.studies.peers.xcist import Xcist
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.phantoms.shapes import cylinder
@@ -38,12 +35,16 @@ GEOMETRY = Geometry(
     off_origin=(1.0, 2.0, -1.5),
     off_detector=(1.1, -2.3),
 )
-INSTALLED = peer_catalogue.installed()
+INSTALLED = catalogue.installed()
 NEEDS_RTK = pytest.mark.skipif(RTK not in INSTALLED, reason="itk-rtk is not installed")
 NEEDS_XCIST = pytest.mark.skipif(XCIST not in INSTALLED, reason="gecatsim is not installed")
 POLY_SCENE = "water, bone, Fe"
 # what XCIST can have: voxels square in x and y, a detector shifted along v only
 XCIST_GEOMETRY = msgspec.structs.replace(GEOMETRY, d_voxel=(1.5, 1.2, 1.2), off_detector=(1.1, 0.0))
+
+
+def setup(case, **more):
+    return Setup(case=catalogue.case(case), **more)
 
 
 def block(geometry):
@@ -56,7 +57,7 @@ def block(geometry):
 @NEEDS_RTK
 def test_rtk_sees_the_same_rays_as_we_do():
     phantom = block(GEOMETRY)
-    rtk = peer_rtk.Rtk(GEOMETRY)
+    rtk = Rtk(GEOMETRY)
     theirs = rtk.project(rtk.volume(phantom.labels.astype(np.float32)))
     tracer = Tracer.of(phantom)
     ours = np.stack([path_lengths(tracer, GEOMETRY, k)[1] for k in range(GEOMETRY.n_views)])
@@ -74,7 +75,7 @@ def test_rtk_reconstructs_on_our_grid():
     geometry = msgspec.structs.replace(GEOMETRY, n_views=90, off_detector=(0.0, 0.0))
     tracer = Tracer.of(phantom)
     p = np.stack([path_lengths(tracer, geometry, k)[1] for k in range(90)])
-    rtk = peer_rtk.Rtk(geometry)
+    rtk = Rtk(geometry)
     volume = rtk.fdk(rtk.stack(p))
     assert volume.shape == geometry.n_voxel
     inside = volume[7:12, 8:14, 12:20]
@@ -86,7 +87,7 @@ def test_rtk_reconstructs_on_our_grid():
 def test_poses_are_refused_by_rtk():
     posed = msgspec.structs.replace(GEOMETRY, poses=tuple(map(tuple, GEOMETRY.pose_array())))
     with pytest.raises(InputError, match="circular orbit"):
-        peer_rtk.Rtk(posed)
+        Rtk(posed)
 
 
 def rod():
@@ -103,7 +104,7 @@ def rod():
 
 
 def xcist(volumes, mu=((1.0,),), energies=(50.0,), weights=(1.0,), geometry=XCIST_GEOMETRY):
-    return peer_xcist.Xcist(geometry, volumes, np.array(mu), np.array(energies), np.array(weights))
+    return Xcist(geometry, volumes, np.array(mu), np.array(energies), np.array(weights))
 
 
 @NEEDS_XCIST
@@ -153,7 +154,7 @@ def test_xcist_holds_one_phantom_and_says_so():
 @NEEDS_XCIST
 @NEEDS_RTK
 def test_both_peers_measure_the_same_quantity_in_poly():
-    contenders = peer_poly.Contenders(peer_cases.Setup(n=64), POLY_SCENE)
+    contenders = poly.Contenders(setup("poly", side=64), POLY_SCENE)
     theirs, rtk = contenders.prepare(XCIST)(), contenders.prepare(RTK)()
     # Joseph and distance-driven differ at edges, 0.7 % on this grid and less on finer ones; a pixel astray gives 9 %
     assert oracles.relative(theirs, rtk) < 0.02
@@ -199,17 +200,16 @@ def test_turns_alternate_and_the_first_call_stands_apart():
 
 
 def test_eighty_bins_keep_weight_and_mean_energy():
-    scanner = peer_cases.Setup(n=16).scanner(2)
+    scanner = oracles.scanner_of(16, 2)
     rule = full_rule(spectrum(scanner.tube), scanner.detector)
-    energies, weights = peer_poly.eighty_bins(rule)
+    energies, weights = poly.eighty_bins(rule)
     assert len(energies) <= 80
     assert weights.sum() == pytest.approx(rule.w1.sum(), rel=1e-12)
     assert energies @ weights == pytest.approx(rule.energies @ rule.w1, rel=1e-12)
 
 
 def test_the_measured_pixel_averages_intensity_not_line_integrals():
-    setup = peer_cases.Setup(n=16)
-    contenders = peer_poly.Contenders(setup, POLY_SCENE)
+    contenders = poly.Contenders(setup("poly", side=16), POLY_SCENE)
     oracle = oracles.measured_pixel(contenders.phantom, contenders.scanner, (0,))
     assert oracle.shape == (1, 16, 16)
     ours = contenders.ours(voxels=False)()[:1]
@@ -218,204 +218,187 @@ def test_the_measured_pixel_averages_intensity_not_line_integrals():
     assert oracle.max() > 1 and oracle.min() >= -1e-6
 
 
-def measurement(contender, seconds=(), error=None, case="fdk", peak=None):
-    return Measurement(case=case, scene="s", contender=contender, seconds=seconds, error=error, peak_bytes=peak)
+def measurement(contender, runs=(), **more):
+    return Measurement(scene="s", contender=contender, seconds={"run": runs} if runs else {}, **more)
 
 
 def test_verdicts_pair_the_runs_and_name_what_is_missed():
     # the machine slows down threefold in the second run; the paired ratio stays 0.25
-    ours = measurement(OURS, (1.0, 3.0, 1.0), 2e-3)
-    theirs = measurement(RTK, (4.0, 12.0, 4.0), 1e-3)
-    time, error = peer_tables.verdicts([ours, theirs])
+    ours = measurement(OURS, (1.0, 3.0, 1.0), error=2e-3)
+    theirs = measurement(RTK, (4.0, 12.0, 4.0), error=1e-3)
+    time, error = tables.verdicts("fdk", [ours, theirs])
     assert (time.value, time.met) == (0.25, True)
     assert (error.value, error.met) == (2.0, False)
 
 
-def test_each_quantity_is_held_against_the_peer_that_is_best_in_it():
-    ours = measurement(f"{OURS}, exact solids", (1.0, 1.0), 1e-3, "poly")
-    quick, close = measurement(RTK, (4.0, 4.0), 1e-2, "poly"), measurement(XCIST, (8.0, 8.0), 4e-3, "poly")
-    found = peer_tables.verdicts([ours, close, quick])
-    assert [(v.quantity, v.against, v.value, v.met) for v in found] == [
+def test_each_quantity_is_compared_with_the_peer_that_is_best_in_it():
+    ours = measurement(f"{OURS}, exact solids", (1.0, 1.0), error=1e-3)
+    quick, close = measurement(RTK, (4.0, 4.0), error=1e-2), measurement(XCIST, (8.0, 8.0), error=4e-3)
+    found = tables.verdicts("poly", [ours, close, quick])
+    assert [(v.quantity, v.peer, v.value, v.met) for v in found] == [
         ("time ratio", RTK, 0.25, False),
         ("error ratio", XCIST, 0.25, False),
     ]
     # a peer that failed is no peer
     failed = msgspec.structs.replace(quick, status="error")
-    assert {v.against for v in peer_tables.verdicts([ours, close, failed])} == {XCIST}
+    assert {v.peer for v in tables.verdicts("poly", [ours, close, failed])} == {XCIST}
 
 
 def test_without_peers_only_our_own_limits_are_judged():
-    missing = peer_cases.left_out(peer_cases.Setup(), peer_catalogue.case("poly"), "s")
-    assert [(m.contender, m.status) for m in missing] == [(RTK, "absent"), (XCIST, "absent")]
+    missing = [msgspec.structs.replace(m, scene="s") for m in setup("poly").left_out()]
+    assert [(m.contender, m.skipped) for m in missing] == [(RTK, "absent"), (XCIST, "absent")]
     assert all("pip install" in m.reason for m in missing)
-    found = peer_tables.verdicts([measurement(f"{OURS}, exact solids", (1.0,), 1e-3, "poly", 4 * 10**8), *missing])
+    ours = measurement(f"{OURS}, exact solids", (1.0,), error=1e-3, peak_bytes=4 * 10**8)
+    found = tables.verdicts("poly", [ours, *missing])
     assert [(v.quantity, v.value, v.met) for v in found] == [("peak GB", 0.4, True)]
 
 
-def test_records_of_before_xcist_can_be_read(tmp_path):
-    old = peer_tables.PeerRecord(
-        measurement=measurement(OURS), side=256, rtk="2.7", host=host.host(), commit="", time=""
-    )
-    fields = {k: v for k, v in msgspec.to_builtins(old).items() if k not in ("xcist", "others")}
-    (tmp_path / peers.NAME).write_bytes(msgspec.json.encode(fields) + b"\n")
-    assert peer_tables.read(tmp_path / peers.NAME) == [old]
+def test_only_exact_solids_have_a_target_for_their_error():
+    found = [measurement(f"{OURS}, {what}", error=1e-3) for what in ("exact solids", "voxels only")]
+    assert [(v.scene, v.value, v.met) for v in tables.verdicts("exact", found)] == [("s (exact solids)", 1e-3, False)]
+    (paper,) = [measurement(OURS, (61.0,), peak_bytes=10**9)]
+    assert [(v.quantity, v.met) for v in tables.verdicts("paper", [paper])] == [("seconds", False), ("peak GB", True)]
+
+
+def stored(folder):
+    """The records of a results folder."""
+    return study.Peers().store(study.Flags(results=folder)).read()
 
 
 @NEEDS_XCIST
 def test_the_command_measures_xcist(tmp_path, capsys):
-    assert peers.main([str(tmp_path), "--small", "--repeats", "1", "--case", "exact"]) == 0
-    assert f"gecatsim {INSTALLED[XCIST]}" in capsys.readouterr().out
-    errors = {(m.scene, m.contender): m.error for m in (r.measurement for r in peer_tables.read(tmp_path / peers.NAME))}
+    assert study.main([str(tmp_path), "--small", "--repeats", "1", "--case", "exact"]) == 0
+    assert f"xcist {INSTALLED[XCIST]}" in capsys.readouterr().out
+    errors = {(m.scene, m.contender): m.error for r in stored(tmp_path) for m in r.found}
     for scene in {scene for scene, _ in errors}:
         # it sees voxels of 2 mm, like ours without solids, but with partial volumes
         assert 1e-3 < errors[scene, XCIST] < errors[scene, f"{OURS}, voxels only"]
 
 
 def test_the_command_without_peers_says_so_and_stores_records(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(peer_catalogue, "installed", dict)
-    assert peers.main([str(tmp_path / "new"), "--small", "--repeats", "2", "--case", "exact", "--case", "fdk"]) == 0
+    monkeypatch.setattr(catalogue, "installed", dict)
+    assert study.main([str(tmp_path / "new"), "--small", "--repeats", "2", "--case", "exact", "--case", "fdk"]) == 0
     table = capsys.readouterr().out
     assert "absent" in table and "itk-rtk is not installed" in table and "gecatsim is not installed" in table
-    records = peer_tables.read(tmp_path / "new" / peers.NAME)
-    assert {r.measurement.case for r in records} == {"exact", "fdk"}
-    beside = [r.measurement for r in records if not r.measurement.contender.startswith(OURS)]
-    assert {m.status for m in beside} == {"absent"}
-    assert [m.contender for m in beside if m.case == "fdk"] == [RTK, "leap", "tigre", "r2-gaussian"]
+    assert "Installed peers: none" in table and "Grids this small" in table and "target" not in table.splitlines()[-5]
+    exact, fdk = stored(tmp_path / "new")
+    assert [(r.task.case, r.task.part) for r in (exact, fdk)] == [("exact", "small"), ("fdk", "small")]
+    assert {m.skipped for r in (exact, fdk) for m in r.found if not m.contender.startswith(OURS)} == {"absent"}
+    assert [m.contender for m in fdk.found] == [OURS, RTK, "leap", "tigre", "r2-gaussian"]
     assert "pytigre is not installed" in table and "https://github.com/LLNL/LEAP" in table
-    timed = next(r.measurement for r in records if r.measurement.seconds)
-    assert len(timed.seconds) == 2 and timed.warm_up is not None
+    assert len(fdk.found[0].runs) == 2 and fdk.found[0].warm_up is not None
     # closed form against float32 path lengths: a few roundings of 6e-8
-    exact = next(r.measurement for r in records if r.measurement.contender == f"{OURS}, exact solids")
-    assert exact.error is not None and exact.error < 1e-6
-    assert records[0].host.cores > 0 and records[0].commit
+    assert exact.found[0].contender == f"{OURS}, exact solids" and exact.found[0].error < 1e-6
     assert (tmp_path / "new" / "peers.md").read_text() in table
 
 
-def no_peers(monkeypatch, *, case="fdk", fails=False):
-    """Let a case be measured at once, without peers, by the code of a commit; return the list that counts it."""
+def test_poly_is_measured_alone_in_a_process_too():
+    found = poly.poly(setup("poly", side=16, repeats=1), POLY_SCENE)
+    assert [m.contender for m in found] == [name for name in poly.NOTES if name.startswith(OURS)]
+    # an interpreter with numba, which loads no torch
+    assert all(5e7 < m.peak_bytes < 1e9 and 0 < m.error < 1 and len(m.runs) == 1 for m in found)
+
+
+def test_a_dataset_that_is_not_made_is_a_row():
+    (failed,) = cases.paper(setup("paper"), "no-such-scene")
+    assert (failed.ok, failed.status, failed.contender) == (False, "error", OURS)
+    assert failed.reason.startswith("make-dataset quick: exit code 2: make-dataset: ")
+
+
+@pytest.fixture
+def faked(monkeypatch):
+    """Let cases be measured at once, without peers, by the code of a commit; return the list that counts them."""
     done = []
 
-    def once(setup):
-        done.append(case)
-        status = {"status": "error", "reason": "it failed"} if fails else {"seconds": (2.0,) * setup.repeats}
-        return [peer_cases.Measurement(case=case, scene="s", contender=OURS, **status)]
+    def fake(name):
+        def once(setup, scene):
+            done.append(name)
+            runs = () if name == "exact" else (2.0,) * (1 if name == "paper" else setup.repeats)
+            return [Measurement(contender=OURS, seconds={"run": runs} if runs else {})]
 
-    monkeypatch.setattr(peer_catalogue, "installed", dict)
+        return once
+
+    for name in cases.CASES:
+        monkeypatch.setitem(cases.CASES, name, fake(name))
+    monkeypatch.setattr(catalogue, "installed", dict)
     monkeypatch.setattr(host, "use_threads", lambda threads: None)  # those of this process are not ours to set
     monkeypatch.setattr(host, "commit", lambda: "a" * 40)
-    monkeypatch.setattr(peer_cases, case, once)
     return done
 
 
-def test_an_interrupted_command_goes_on_from_the_case_it_was_in(tmp_path, monkeypatch, capsys):
-    def interrupted(setup):
-        raise KeyboardInterrupt
-
-    done = no_peers(monkeypatch)
-    monkeypatch.setattr(peer_cases, "exact", interrupted)
-    words = [str(tmp_path), "--repeats", "2", "--case", "fdk", "--case", "exact"]
-    monkeypatch.setattr("sys.argv", ["run-benchmark", "peers", *words])
-    assert cli.run_benchmark() == cli.EXIT_INTERRUPTED and done == ["fdk"]
-    with (tmp_path / peers.NAME).open("ab") as file:
-        file.write(b'{"measurement": {')  # as a kill leaves it
-    no_peers(monkeypatch, case="exact")
-    assert cli.run_benchmark() == 0 and done == ["fdk"]
-    assert "fdk: recorded already" in capsys.readouterr().err
-    assert [r.measurement.case for r in peer_tables.read(tmp_path / peers.NAME)] == ["fdk", "exact"]
-    for change in (["--force"], ["--small"], ["--repeats", "3"]):
-        before = len(done)
-        peers.main([*words, *change])
-        assert len(done) == before + 1, change
-    for there in ({RTK: "2.7"}, {RTK: "2.8"}, {"leap": "1.26"}, {}):  # beside other peers nothing is known
-        before = len(done)
-        monkeypatch.setattr(peer_catalogue, "installed", lambda there=there: there)
-        peers.main(words)
-        assert len(done) == before + 1, there
-    monkeypatch.setattr(host, "commit", lambda: "a" * 40 + "+changes")
-    before = len(done)
-    assert [peers.main(words), peers.main(words)] == [0, 0] and len(done) == before + 2
+def test_what_is_recorded_depends_on_peers_grids_and_threads(tmp_path, monkeypatch, faked):
+    words = [str(tmp_path), "--repeats", "2", "--case", "fdk"]
+    assert [study.main(words), study.main(words)] == [0, 0] and faked == ["fdk"]
+    for change in (["--small"], ["--repeats", "3"], ["--threads", "1"]):
+        before = len(faked)
+        assert [study.main([*words, *change]), study.main([*words, *change])] == [0, 0]
+        assert len(faked) == before + 1, change
+    for there in ({RTK: "2.7"}, {RTK: "2.8"}, {"leap": "1.26"}):
+        before = len(faked)
+        monkeypatch.setattr(catalogue, "installed", lambda there=there: there)
+        assert [study.main(words), study.main(words)] == [0, 0] and len(faked) == before + 1, there
 
 
-def test_what_failed_is_measured_again(tmp_path, monkeypatch, capsys):
-    done = no_peers(monkeypatch, case="paper", fails=True)
-    words = [str(tmp_path), "--case", "paper"]
-    assert [peers.main(words), peers.main(words)] == [1, 1] and len(done) == 2
-    assert peers.main([*words, "--table"]) == 1 and len(done) == 2
-    assert "| paper | s | ctsim | error |" in capsys.readouterr().out
+def test_cases_without_turns_are_not_measured_again(tmp_path, faked):
+    words = [str(tmp_path), "--repeats", "4", "--case", "exact", "--case", "paper"]
+    assert study.main(words) == 0 and faked == ["exact", "exact", "paper"]  # rods of two metals
+    assert study.main(words) == 0 and len(faked) == 3
 
 
-def test_the_table_is_rendered_from_the_records_alone(tmp_path, monkeypatch, capsys):
-    done = no_peers(monkeypatch)
-    assert peers.main([str(tmp_path), "--case", "fdk"]) == 0
-    (tmp_path / "peers.md").rename(tmp_path / "first.md")
-    assert peers.main([str(tmp_path), "--table"]) == 0 and len(done) == 1
-    assert (tmp_path / "peers.md").read_bytes() == (tmp_path / "first.md").read_bytes()
-    capsys.readouterr()
-    for none in ([str(tmp_path / "none")], [str(tmp_path), "--small"]):
-        monkeypatch.setattr("sys.argv", ["run-benchmark", "peers", *none, "--table"])
-        assert cli.run_benchmark() == cli.EXIT_USER
-        said = capsys.readouterr().err
-        assert said.count("\n") == 1 and "there are no records of grids of side" in said
-    assert not (tmp_path / "none").exists()
-
-
-def test_a_dry_run_lists_what_is_left_and_what_it_takes(tmp_path, monkeypatch, capsys):
+def test_a_dry_run_counts_turns_and_the_rest(tmp_path, capsys, faked):
     def dry(*words):
-        assert peers.main([*words, "--dry-run"]) == 0
-        return capsys.readouterr().out.splitlines()
+        assert study.main([str(tmp_path / "out"), *words, "--dry-run"]) == 0
+        return [line.split() for line in capsys.readouterr().out.splitlines()]
 
-    done = no_peers(monkeypatch)
-    out = tmp_path / "out"
-    listed = dry(str(out), "--repeats", "2")
-    assert not out.exists()
-    assert [line.split()[0] for line in listed[:-1]] == ["paths", "exact", "paper", "fdk", "poly"]
-    assert listed[3].split() == ["fdk", "3", "runs", "of", "each", "contender", "58", "s"]  # 3 × 16.3 s + 9 s
-    assert listed[-1].startswith("total: 5 of 5 cases, ")
-    assert dry(str(out), "--small", "--case", "fdk")[0].endswith("unknown") and not done
-
-    def record(case, seconds, minute, side=256):
-        return peer_tables.PeerRecord(
-            measurement=peer_cases.Measurement(case=case, scene="s", contender=OURS, seconds=seconds), side=side,
-            rtk=peer_tables.ABSENT, xcist=peer_tables.ABSENT, host=host.host(), commit="a" * 40,
-            time=f"2026-01-01T00:0{minute}:00+00:00", run="2026-01-01T00:00:00+00:00",
-        )  # fmt: skip
-
-    out.mkdir()
-    lines.append(out / peers.NAME, record("exact", (), 1), record("fdk", (2.0, 2.0), 2))
-    words = [str(out), "--case", "exact", "--case", "fdk"]
-    assert dry(*words, "--repeats", "2") == ["total: 0 of 2 cases, 0 s " + listed[-1].partition(" min ")[2]]
-    (exact, fdk, total) = dry(*words, "--repeats", "5", "--force")
-    assert exact.endswith("  60 s") and fdk.endswith("  66 s") and "2 of 2 cases, 2 min" in total  # 3 runs more of 2 s
+    listed = dry("--repeats", "2")
+    assert [line[0] for line in listed[:-1]] == ["paths", "exact", "paper", "fdk", "poly"]
+    assert listed[3] == ["fdk", "58", "s"]  # 3 x 16.3 s + 9 s
+    assert [line[0] for line in dry("--small")[:-1]] == ["paths", "exact", "fdk", "poly"]
+    assert dry("--small", "--case", "paper")[0] == ["paper", "unknown"]
+    assert not faked and not (tmp_path / "out").exists()
+    assert study.main([str(tmp_path / "out"), "--case", "exact", "--case", "fdk"]) == 0
+    capsys.readouterr()
+    words = ("--case", "exact", "--case", "fdk", "--force", "--repeats", "2")
+    assert dry(*words)[:2] == [["exact", "53", "s"], ["fdk", "15", "s"]]  # 3 x 2 s as recorded + 9 s
 
 
-def test_the_table_keeps_contenders_of_one_run_together():
-    def record(contender, run, case="fdk", side=256):
-        m = measurement(contender, (1.0,), case=case)
-        where = host.host()
-        return peer_tables.PeerRecord(measurement=m, side=side, rtk="", host=where, commit="", time=run, run=run)
+def test_tables_say_which_case_is_of_which_machine_and_peers():
+    def record(case, cpu, **peers):
+        where = msgspec.structs.replace(host.host(), cpu=cpu)
+        task = Task(study="peers", part="full", case=case, settings={"threads": 2, **peers})
+        found = (measurement(OURS, (1.0,)),)
+        return Record(task=task, found=found, host=where, commit="a" * 40, time="2026-01-01T00:00:00+00:00")
 
-    stored = [
-        record(OURS, "1"),
-        record(RTK, "1"),
-        record(OURS, "1", "exact"),
-        record(OURS, "2"),
-        record(OURS, "3", side=32),
-    ]
-    kept = [(r.measurement.case, r.measurement.contender, r.run) for r in peer_tables.latest(stored, 256)]
-    assert kept == [("exact", OURS, "1"), ("fdk", OURS, "2")]
+    same = [record("fdk", "ours", **{RTK: "2.7"}), record("paths", "ours", **{RTK: "2.7"})]
+    assert tables.measured(same, "full").notes == [f"Installed peers: {RTK} 2.7."]
+    notes = tables.measured([*same, record("exact", "theirs")], "full").notes
+    assert [note.partition(": ")[0] for note in notes] == ["fdk, paths", "exact"]
+    assert "aaaaaaaaaaaa, ours" in notes[0] and "theirs" in notes[1] and notes[1].endswith("Installed peers: none.")
 
 
-def test_repeats_must_be_positive(tmp_path):
-    with pytest.raises(InputError, match="at least 1"):
-        peers.main([str(tmp_path), "--repeats", "0"])
+def test_threads_must_be_positive(tmp_path):
+    with pytest.raises(InputError, match="--threads must be at least 1"):
+        study.main([str(tmp_path), "--threads", "0"])
 
 
-def test_help_imports_nothing_heavy():
+@pytest.mark.parametrize("words", ["['--help']", "['none', '--dry-run', '--threads', '1']"])
+def test_help_and_a_dry_run_import_nothing_heavy(words):
     code = (
         "import sys\nfrom ctsim.benchmarks.studies.peers.study import main\n"
-        "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
+        f"try:\n    main({words})\nexcept SystemExit:\n    pass\n"
         "assert not {'numba', 'torch', 'itk', 'gecatsim', 'scipy', 'pandas'} & set(sys.modules), sorted(sys.modules)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "--repeats" in done.stdout
+    assert "--repeats" in done.stdout or "total: 5 of 5 cases" in done.stdout
+
+
+def test_threads_reach_libraries_that_are_loaded_later():
+    code = (
+        "import os\nos.environ.pop('OMP_NUM_THREADS', None)\nos.environ['NUMBA_NUM_THREADS'] = '3'\n"
+        "from ctsim.benchmarks.engine import host\nhost.use_threads(2)\n"
+        "import numba, torch\nprint(numba.get_num_threads(), torch.get_num_threads())\n"
+        "host.use_threads(1)\nprint(numba.get_num_threads(), torch.get_num_threads())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["2", "2", "1", "1"]

@@ -1,4 +1,4 @@
-"""The catalogue of `run-benchmark peers`, `benchmarks/suites/peers.toml`: its cases, and the libraries beside us."""
+"""The catalogue of `run-benchmark peers`, `benchmarks/suites/peers.toml`: its cases and the other libraries."""
 
 import functools
 from importlib import metadata, resources, util
@@ -14,7 +14,7 @@ Seconds = Annotated[float, msgspec.Meta(ge=0)]
 
 
 class Case(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A case: on which scenes, or on rods of which metals, in how many views, and beside which peers.
+    """A case: on which scenes, or on rods of which metals, in how many views, and with which peers.
 
     `turn` and `rest` are seconds expected on full grids, see the file.
     """

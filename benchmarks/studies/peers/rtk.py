@@ -16,6 +16,8 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.interop import Library, angles_to, volume_from, volume_to
 
+AXES = (1, 0, 2)  # their x, y, z are our y, z, x
+
 
 class Rtk:
     """RTK set up for one circular scan on a given number of threads.
@@ -42,62 +44,51 @@ class Rtk:
         self._orbit = RTK.ThreeDCircularProjectionGeometry.New()
         for angle in angles_to(Library.RTK, geometry.angles):
             self._orbit.AddProjection(geometry.dso, geometry.dsd, float(angle))
-        # their x, y, z are our y, z, x
-        z, y, x = range(3)
-        self._axes = (y, z, x)
 
     def volume(self, values: NDArray[np.float32]) -> Any:
         """Return a volume [z, y, x] on the geometry's grid as an image of RTK's."""
-        g = self._geometry
-        image = self._itk.image_from_array(np.ascontiguousarray(volume_to(Library.RTK, values)))
-        image.SetSpacing([g.d_voxel[k] for k in self._axes])
-        image.SetOrigin([-(g.n_voxel[k] - 1) / 2 * g.d_voxel[k] + g.off_origin[k] for k in self._axes])
-        return image
+        return self._image(volume_to(Library.RTK, values), *self._grid())
 
     def stack(self, projections: NDArray[np.float32]) -> Any:
         """Return projections [view, v, u] as an image of RTK's."""
-        image = self._itk.image_from_array(np.ascontiguousarray(projections))
-        image.SetSpacing(self._pixels()[0])
-        image.SetOrigin(self._pixels()[1])
-        return image
-
-    def _pixels(self) -> tuple[list[float], list[float]]:
-        """Spacing and origin of the projections, (u, v, view)."""
-        (n_v, n_u), (d_v, d_u), (off_v, off_u) = (
-            self._geometry.n_detector,
-            self._geometry.d_detector,
-            self._geometry.off_detector,
-        )
-        return [d_u, d_v, 1.0], [-(n_u - 1) / 2 * d_u + off_u, -(n_v - 1) / 2 * d_v + off_v, 0.0]
+        return self._image(projections, *self._pixels())
 
     def project(self, volume: Any) -> NDArray[np.float32]:
         """Integrate an image of `volume` along the rays of all views by Joseph's method: [view, v, u]."""
-        g = self._geometry
-        zero = self._zero.New()
-        spacing, origin = self._pixels()
-        zero.SetSpacing(spacing)
-        zero.SetOrigin(origin)
-        zero.SetSize([g.n_detector[1], g.n_detector[0], g.n_views])
-        zero.SetConstant(0.0)
-        joseph = self._joseph.New()
-        joseph.SetInput(0, zero.GetOutput())
-        joseph.SetInput(1, volume)
-        joseph.SetGeometry(self._orbit)
-        joseph.Update()
-        return self._itk.array_view_from_image(joseph.GetOutput())
+        (n_v, n_u), n_views = self._geometry.n_detector, self._geometry.n_views
+        return self._run(self._joseph, volume, [n_u, n_v, n_views], *self._pixels())
 
     def fdk(self, stack: Any) -> NDArray[np.float32]:
         """Reconstruct an image of `stack` by FDK with the plain ramp: [z, y, x] in 1/mm."""
-        n = self._geometry.n_voxel
-        grid = self.volume(np.zeros((1, 1, 1), np.float32))  # for spacing and origin only
-        zero = self._zero.New()
-        zero.SetSpacing(grid.GetSpacing())
-        zero.SetOrigin(grid.GetOrigin())
-        zero.SetSize([n[k] for k in self._axes])
+        size = [self._geometry.n_voxel[k] for k in AXES]
+        return volume_from(Library.RTK, self._run(self._feldkamp, stack, size, *self._grid()))
+
+    def _grid(self) -> tuple[list[float], list[float]]:
+        """Return spacing and origin of volumes, in their axes."""
+        g = self._geometry
+        return [g.d_voxel[k] for k in AXES], [-(g.n_voxel[k] - 1) / 2 * g.d_voxel[k] + g.off_origin[k] for k in AXES]
+
+    def _pixels(self) -> tuple[list[float], list[float]]:
+        """Return spacing and origin of the projections, (u, v, view)."""
+        g = self._geometry
+        corner = [-(g.n_detector[k] - 1) / 2 * g.d_detector[k] + g.off_detector[k] for k in (1, 0)]
+        return [g.d_detector[1], g.d_detector[0], 1.0], [*corner, 0.0]
+
+    def _image(self, values: NDArray[np.float32], spacing: list[float], origin: list[float]) -> Any:
+        image = self._itk.image_from_array(np.ascontiguousarray(values))
+        image.SetSpacing(spacing)
+        image.SetOrigin(origin)
+        return image
+
+    def _run(self, kind: Any, image: Any, size: list[int], spacing: list[float], origin: list[float]) -> NDArray:
+        """Run one of RTK's filters from an image to one of zeros."""
+        zero, step = self._zero.New(), kind.New()
+        zero.SetSpacing(spacing)
+        zero.SetOrigin(origin)
+        zero.SetSize(size)
         zero.SetConstant(0.0)
-        feldkamp = self._feldkamp.New()
-        feldkamp.SetInput(0, zero.GetOutput())
-        feldkamp.SetInput(1, stack)
-        feldkamp.SetGeometry(self._orbit)
-        feldkamp.Update()
-        return volume_from(Library.RTK, self._itk.array_view_from_image(feldkamp.GetOutput()))
+        step.SetInput(0, zero.GetOutput())
+        step.SetInput(1, image)
+        step.SetGeometry(self._orbit)
+        step.Update()
+        return self._itk.array_view_from_image(step.GetOutput())

@@ -13,7 +13,7 @@ import os
 import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar
@@ -47,12 +47,7 @@ class Xcist:
         energies: NDArray[np.float64],
         weights: NDArray[np.float64],
     ) -> None:
-        if geometry.poses is not None:
-            raise InputError("XCIST's geometry here is a circular orbit: give angles instead of poses")
-        if geometry.d_voxel[1] != geometry.d_voxel[2]:
-            raise InputError(f"XCIST's voxels are square in x and y, got {geometry.d_voxel[:0:-1]} mm")
-        if geometry.off_detector[1] != 0:
-            raise InputError(f"XCIST turns a detector that is shifted along u, got {geometry.off_detector[1]} mm")
+        _check(geometry)
         table = np.ascontiguousarray(mu, np.float32)
         if table.shape != (len(energies), len(volumes)):
             raise InputError(f"mu must be [bin, material], {(len(energies), len(volumes))}, got {table.shape}")
@@ -126,69 +121,58 @@ class Xcist:
         return np.asarray(cfg.thisView, np.float32).reshape(n_u, n_v).T[:, ::-1]
 
 
+def _check(geometry: Geometry) -> None:
+    if geometry.poses is not None:
+        raise InputError("XCIST's geometry here is a circular orbit: give angles instead of poses")
+    if geometry.d_voxel[1] != geometry.d_voxel[2]:
+        raise InputError(f"XCIST's voxels are square in x and y, got {geometry.d_voxel[:0:-1]} mm")
+    if geometry.off_detector[1] != 0:
+        raise InputError(f"XCIST turns a detector that is shifted along u, got {geometry.off_detector[1]} mm")
+
+
 @contextmanager
 def _undisturbed() -> Iterator[None]:
     """Ignore the warnings of XCIST's start (unclosed files, numpy.matlib), and keep it from changing PATH."""
     path = os.environ["PATH"]
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        os.environ["PATH"] = path
+    with warnings.catch_warnings(action="ignore"), ExitStack() as after:
+        after.callback(os.environ.update, PATH=path)
+        yield
 
 
 def _configure(cfg: Any, geometry: Geometry) -> None:
     """Set the scanner, the physics and the scan in XCIST's terms."""
     (n_v, n_u), (d_v, d_u) = geometry.n_detector, geometry.d_detector
-    _assign(
-        cfg.scanner,
-        # a third-generation detector of a single module is flat
-        detectorCallback="Detector_ThirdgenCurved",
-        detectorRowCount=n_v,
-        detectorRowsPerMod=n_v,
-        detectorColCount=n_u,
-        detectorColsPerMod=n_u,
-        detectorRowSize=d_v,
-        detectorColSize=d_u,
-        detectorRowOffset=geometry.off_detector[0] / d_v,
-        detectorColOffset=0.0,
-        detectorPrefilter=[],
-        detectorDepth=1e9,  # absorbs everything, whatever the energy
-        detectionCallback="Detection_EI",
-        detectionGain=1.0,
-        focalspotShape="Uniform",
-        sid=geometry.dso,
-        sdd=geometry.dsd,
-    )
+    scanner = {
+        "detectorCallback": "Detector_ThirdgenCurved",  # flat where it is a single module
+        **{"detectorRowCount": n_v, "detectorRowsPerMod": n_v, "detectorColCount": n_u, "detectorColsPerMod": n_u},
+        **{"detectorRowSize": d_v, "detectorRowOffset": geometry.off_detector[0] / d_v},
+        **{"detectorColSize": d_u, "detectorColOffset": 0.0},
+        **{"detectorPrefilter": [], "detectorDepth": 1e9},  # absorbs everything, at every energy
+        **{"detectionCallback": "Detection_EI", "detectionGain": 1.0, "focalspotShape": "Uniform"},
+        **{"sid": geometry.dso, "sdd": geometry.dsd},
+    }
     samples = ("colSampleCount", "rowSampleCount", "srcXSampleCount", "srcYSampleCount", "viewSampleCount")
-    _assign(cfg.physics, **dict.fromkeys(samples, 1), scatterCallback="")
-    _assign(cfg.protocol, flatFilter=[], bowtie="")
-    _assign(cfg.sim, isOffsetScan=False, subViewCount=1, enableQuantumNoise=0, eNoise=0.0)
+    vars(cfg.scanner).update(scanner)
+    vars(cfg.physics).update(dict.fromkeys(samples, 1), scatterCallback="")
+    vars(cfg.protocol).update(flatFilter=[], bowtie="")
+    vars(cfg.sim).update(isOffsetScan=False, subViewCount=1, enableQuantumNoise=0, eNoise=0.0)
     cfg.time = 0.0  # the gantry stands at startAngle
-
-
-def _assign(target: Any, **values: object) -> None:
-    for name, value in values.items():
-        setattr(target, name, value)
 
 
 def _write_phantom(folder: Path, geometry: Geometry, volumes: Sequence[NDArray[np.float32]]) -> str:
     """Write volumes as XCIST's voxelised phantom, rows from +y down; return the path of its JSON file."""
-    names = [f"{k}.raw" for k in range(len(volumes))]
-    for name, volume in zip(names, volumes, strict=True):
-        np.ascontiguousarray(volume[:, ::-1], np.float32).tofile(folder / name)
-    phantom: dict[str, object] = {
-        "n_materials": len(volumes),
-        "mat_name": ["water"] * len(volumes),  # any that it knows, since the attenuation is replaced
-        "volumefractionmap_filename": names,
-        "volumefractionmap_datatype": ["float"] * len(volumes),
-    }
+    for k, volume in enumerate(volumes):
+        np.ascontiguousarray(volume[:, ::-1], np.float32).tofile(folder / f"{k}.raw")
+    # any material that it knows will do, since the attenuation is replaced
+    each: dict[str, object] = {"mat_name": "water", "volumefractionmap_datatype": "float"}
     axes = zip("zyx", ("slices", "rows", "cols"), geometry.n_voxel, geometry.d_voxel, geometry.off_origin, strict=True)
     for axis, count, n, d, offset in axes:
-        phantom[count] = [n] * len(volumes)
-        phantom[f"{axis}_size"] = [d] * len(volumes)
-        phantom[f"{axis}_offset"] = [(n + 1) / 2 - offset / d] * len(volumes)  # of the isocentre, counted from 1
+        # the offset is that of the isocentre, counted from 1
+        each |= {count: n, f"{axis}_size": d, f"{axis}_offset": (n + 1) / 2 - offset / d}
+    phantom = {name: [value] * len(volumes) for name, value in each.items()} | {
+        "n_materials": len(volumes),
+        "volumefractionmap_filename": [f"{k}.raw" for k in range(len(volumes))],
+    }
     path = folder / "phantom.json"
     path.write_text(json.dumps(phantom), encoding="utf-8")
     return str(path)
