@@ -127,8 +127,7 @@ def exact(setup: Setup, metal: str) -> list[Measurement]:
         one = np.ones(1)
         integrals[XCIST] = Xcist(geometry, [scene.volume], one[:, None], KEV, one).project()
     notes = {RTK: "Joseph", XCIST: "distance-driven, which averages over the pixel"}
-    truth, kind = scene.closed_form(), "relative RMS of line integrals"
-    shared = {"views": setup.views, "error_kind": kind}
+    truth, shared = scene.closed_form(), {"views": setup.views, "error_kind": "relative RMS of line integrals"}
     return [
         Measurement(contender=name, error=relative(p, truth), note=notes.get(name, ""), **shared)
         for name, p in integrals.items()
@@ -184,9 +183,9 @@ CASES: dict[str, Callable[[Setup, str], list[Measurement]]] = {f.__name__: f for
 def measure(task: Task, given: Flags) -> list[Measurement]:
     """Measure a case on all of its scenes."""
     host.use_threads(task.settings["threads"])
-    case, threads = catalogue.case(task.case), host.host().threads
-    side, installed = SIDES[task.part], versions(task)
-    setup = Setup(case=case, side=side, repeats=given.repeats, threads=threads, versions=installed)
+    case = catalogue.case(task.case)
+    runs = {"repeats": given.repeats, "threads": host.host().threads}  # which may be fewer than asked for
+    setup = Setup(case=case, side=SIDES[task.part], versions=versions(task), **runs)
     out: list[Measurement] = []
     for name in case.scenes or case.metals:
         scene = name if case.scenes else f"{name} rods in water"

@@ -40,7 +40,7 @@ class Peers(study.Study[Measurement, Flags]):
 
     name = file = "peers"
     unit = "case"
-    kind, flags = Measurement, Flags
+    kind, record, flags = Measurement, Record[Measurement], Flags
     work = "ctsim.benchmarks.studies.peers.cases:measure"
     estimate = "with what is prepared and checked, next to both peers"
 
@@ -53,15 +53,14 @@ class Peers(study.Study[Measurement, Flags]):
     def tasks(self, given: Flags) -> list[Task]:
         """Return a task for each case asked for, all that have grids of this size where none is named."""
         asked = {catalogue.case(name) for name in given.case}
-        code, machine, versions = host.commit(), host.machine(), catalogue.installed()
         return [
             Task(
                 study=self.name,
                 part=given.part,
                 case=case.name,
-                settings={"threads": given.threads, **versions},
-                code=code,
-                machine=machine,
+                settings={"threads": given.threads, **catalogue.installed()},
+                code=host.commit(),
+                machine=host.machine(),
                 place=(place,),
             )
             for place, case in enumerate(catalogue.load().case)

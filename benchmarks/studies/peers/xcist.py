@@ -25,6 +25,7 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 
 _MODELS = ("detector", "source", "gantry", "ray_angles", "filters", "flux", "phantom")
+_STAGES = ("RunModels", "C_Projector_Voxelized", "Detection_EI")
 _NEVER = -1  # a view number that no view has: XCIST prepares at its first view and frees its memory at its last
 
 
@@ -55,11 +56,8 @@ class Xcist:
             Xcist._loaded.close()
         self.geometry = geometry
         with _undisturbed(), tempfile.TemporaryDirectory(prefix="ctsim-xcist-") as folder:
-            package: Any = import_module("gecatsim")
-            self._run_models: Any = import_module("gecatsim.pyfiles.RunModels").RunModels
-            self._project: Any = import_module("gecatsim.pyfiles.C_Projector_Voxelized").C_Projector_Voxelized
-            self._detect: Any = import_module("gecatsim.pyfiles.Detection_EI").Detection_EI
-            self._cfg = package.CatSim().get_current_cfg()
+            self._cfg: Any = import_module("gecatsim").CatSim().get_current_cfg()
+            self._run_models, self._project, self._detect = (_theirs(name) for name in _STAGES)
             ctypes.c_int.in_dll(self._cfg.clib, "PrintReportOutput").value = 0
             _configure(self._cfg, geometry)
             self._spectrum(energies, weights)
@@ -121,6 +119,10 @@ class Xcist:
         return np.asarray(cfg.thisView, np.float32).reshape(n_u, n_v).T[:, ::-1]
 
 
+def _theirs(name: str) -> Any:
+    return getattr(import_module(f"gecatsim.pyfiles.{name}"), name)
+
+
 def _check(geometry: Geometry) -> None:
     if geometry.poses is not None:
         raise InputError("XCIST's geometry here is a circular orbit: give angles instead of poses")
@@ -142,15 +144,13 @@ def _undisturbed() -> Iterator[None]:
 def _configure(cfg: Any, geometry: Geometry) -> None:
     """Set the scanner, the physics and the scan in XCIST's terms."""
     (n_v, n_u), (d_v, d_u) = geometry.n_detector, geometry.d_detector
-    scanner = {
-        "detectorCallback": "Detector_ThirdgenCurved",  # flat where it is a single module
-        **{"detectorRowCount": n_v, "detectorRowsPerMod": n_v, "detectorColCount": n_u, "detectorColsPerMod": n_u},
-        **{"detectorRowSize": d_v, "detectorRowOffset": geometry.off_detector[0] / d_v},
-        **{"detectorColSize": d_u, "detectorColOffset": 0.0},
-        **{"detectorPrefilter": [], "detectorDepth": 1e9},  # absorbs everything, at every energy
-        **{"detectionCallback": "Detection_EI", "detectionGain": 1.0, "focalspotShape": "Uniform"},
-        **{"sid": geometry.dso, "sdd": geometry.dsd},
-    }
+    scanner = vars(cfg.scanner)
+    scanner.update(detectorRowCount=n_v, detectorRowsPerMod=n_v, detectorColCount=n_u, detectorColsPerMod=n_u)
+    scanner.update(detectorRowSize=d_v, detectorRowOffset=geometry.off_detector[0] / d_v)
+    scanner.update(detectorColSize=d_u, detectorColOffset=0.0, sid=geometry.dso, sdd=geometry.dsd)
+    # a third-generation detector of a single module is flat; one this deep absorbs everything, at every energy
+    scanner.update(detectorCallback="Detector_ThirdgenCurved", detectorPrefilter=[], detectorDepth=1e9)
+    scanner.update(detectionCallback="Detection_EI", detectionGain=1.0, focalspotShape="Uniform")
     samples = ("colSampleCount", "rowSampleCount", "srcXSampleCount", "srcYSampleCount", "viewSampleCount")
     vars(cfg.scanner).update(scanner)
     vars(cfg.physics).update(dict.fromkeys(samples, 1), scatterCallback="")
