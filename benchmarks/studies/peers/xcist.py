@@ -59,8 +59,7 @@ class Xcist:
             self._cfg: Any = import_module("gecatsim").CatSim().get_current_cfg()
             self._run_models, self._project, self._detect = (_theirs(name) for name in _STAGES)
             ctypes.c_int.in_dll(self._cfg.clib, "PrintReportOutput").value = 0
-            _configure(self._cfg, geometry)
-            self._spectrum(energies, weights)
+            _configure(self._cfg, geometry, energies, weights)
             self._cfg.phantom.filename = _write_phantom(Path(folder), geometry, volumes)
             self._open = self._first_views()
         Xcist._loaded = self
@@ -80,43 +79,26 @@ class Xcist:
             self._view(0)
             Xcist._loaded = None
 
-    def _spectrum(self, energies: NDArray[np.float64], weights: NDArray[np.float64]) -> None:
-        """Put in photons a bin in such numbers that times energy they are the weights."""
-        cfg, n_pixels = self._cfg, int(np.prod(self.geometry.n_detector))
-        cfg.spec.nEbin = len(energies)
-        cfg.spec.Evec = cfg.sim.Evec = np.asarray(energies, np.float32)
-        cfg.spec.Ivec = np.tile(np.asarray(weights / energies, np.float32), (n_pixels, 1))
-
     def _first_views(self) -> NDArray[np.float32]:
         """Run what XCIST does once, with a view of the open beam, which is returned [v, u]; load the phantom."""
-        cfg = self._cfg
-        cfg.sim.startViewId, cfg.sim.stopViewId = 0, _NEVER
-        cfg.sim.isPhantomScan = False
-        cfg.protocol.startAngle = self._angle(0)
-        self._run_models(cfg, 0, 0, _MODELS)
-        cfg.thisSubView = copy.copy(cfg.detFlux)
-        opened = self._image(self._detect(cfg, 0, 0))
-        cfg.sim.isPhantomScan = True
-        self._run_models(cfg, 0, 0, ("phantom",))
-        cfg.sim.startViewId = _NEVER
+        sim = self._cfg.sim
+        sim.startViewId, sim.stopViewId, sim.isPhantomScan = 0, _NEVER, False
+        opened = self._view(0)
+        sim.isPhantomScan = True
+        self._run_models(self._cfg, 0, 0, ("phantom",))
+        sim.startViewId = _NEVER
         return opened
 
     def _view(self, k: int) -> NDArray[np.float32]:
         """Return the signal of one view, [v, u]: the body of XCIST's loop over views, less its files."""
-        cfg = self._cfg
-        cfg.protocol.startAngle = self._angle(k)
-        self._run_models(cfg, k, 0, _MODELS)  # the gantry alone, all else stays
+        cfg, (n_v, n_u) = self._cfg, self.geometry.n_detector
+        # theirs is in degrees from +y counter-clockwise, seen from +z
+        cfg.protocol.startAngle = float(np.degrees(self.geometry.angles[k])) - 90.0
+        self._run_models(cfg, k, 0, _MODELS)  # after the first view the gantry alone, all else stays
         cfg.thisSubView = copy.copy(cfg.detFlux)
-        return self._image(self._detect(self._project(cfg, k, 0), k, 0))
-
-    def _angle(self, k: int) -> float:
-        """Return a view's angle in degrees as theirs, from +y counter-clockwise seen from +z."""
-        return float(np.degrees(self.geometry.angles[k])) - 90.0
-
-    def _image(self, cfg: Any) -> NDArray[np.float32]:
-        """Return the view that was detected, [v, u]: theirs runs down columns, and along −u."""
-        n_v, n_u = self.geometry.n_detector
-        return np.asarray(cfg.thisView, np.float32).reshape(n_u, n_v).T[:, ::-1]
+        lit = self._project(cfg, k, 0) if cfg.sim.isPhantomScan else cfg
+        # theirs runs down columns, and along −u
+        return np.asarray(self._detect(lit, k, 0).thisView, np.float32).reshape(n_u, n_v).T[:, ::-1]
 
 
 def _theirs(name: str) -> Any:
@@ -141,9 +123,12 @@ def _undisturbed() -> Iterator[None]:
         yield
 
 
-def _configure(cfg: Any, geometry: Geometry) -> None:
-    """Set the scanner, the physics and the scan in XCIST's terms."""
+def _configure(cfg: Any, geometry: Geometry, energies: NDArray[np.float64], weights: NDArray[np.float64]) -> None:
+    """Set the scanner, the physics and the scan in XCIST's terms, with photons that times energy are the weights."""
     (n_v, n_u), (d_v, d_u) = geometry.n_detector, geometry.d_detector
+    cfg.spec.nEbin = len(energies)
+    cfg.spec.Evec = cfg.sim.Evec = np.asarray(energies, np.float32)
+    cfg.spec.Ivec = np.tile(np.asarray(weights / energies, np.float32), (n_v * n_u, 1))
     scanner = vars(cfg.scanner)
     scanner.update(detectorRowCount=n_v, detectorRowsPerMod=n_v, detectorColCount=n_u, detectorColsPerMod=n_u)
     scanner.update(detectorRowSize=d_v, detectorRowOffset=geometry.off_detector[0] / d_v)
