@@ -17,7 +17,7 @@ import tyro
 from ctsim.benchmarks.engine import host
 from ctsim.benchmarks.engine.dask import check_workers, open_jobs
 from ctsim.benchmarks.engine.process import Jobs, Lost, Process, Stopped, check_limit
-from ctsim.benchmarks.engine.record import OK, Found, Record, Store, Task, done, latest, provenance
+from ctsim.benchmarks.engine.record import OK, Found, Record, Store, Task, by_row, done, latest, provenance
 from ctsim.benchmarks.engine.table import Table
 from ctsim.durable import write_synced
 from ctsim.errors import InputError
@@ -99,6 +99,9 @@ class Study(Generic[F, G]):
         what = f"a record of run-benchmark {self.name}".rstrip()
         return Store(self.folder(given), self.file, self.record, what)
 
+    def prepare(self, given: G) -> None:
+        """Make what tasks depend on, such as data; called before `tasks`, and not with --dry-run."""
+
     def tasks(self, given: G) -> list[Task]:
         """Return the tasks that the flags ask for, in the order of the table. Simulates and reconstructs nothing."""
         raise NotImplementedError
@@ -110,6 +113,11 @@ class Study(Generic[F, G]):
     def runs(self, task: Task, given: G) -> int:
         """Return how many timed runs this task needs, 1 where it is not timed."""
         return self.repeats(given)
+
+    def machine(self, given: G) -> str:
+        """Return what times depend on: the processor, threads, and who shares them."""
+        shared = f", {given.workers} tasks at once" if given.workers > 1 else ""
+        return host.machine() + (f", by {given.scheduler}" if given.scheduler else shared)
 
     def shows(self, task: Task, given: G) -> bool:
         """Whether the tables of these flags show a recorded task."""
@@ -157,15 +165,26 @@ class Study(Generic[F, G]):
         return self.kind(ok=False, status=status, reason=reason)
 
     def tables(self, records: Sequence[Record[F]], given: G) -> list[Table]:
-        """Return the tables of records, one of each row, in order."""
+        """Return the tables of records: one of each row, with `rounds` those of all rounds, in order."""
         raise NotImplementedError
+
+    def details(self, records: Sequence[Record[F]], given: G) -> list[Table]:
+        """Return the tables that stand in the file only, below the others."""
+        return []
+
+    def shown(self, records: Sequence[Record[F]]) -> list[Record[F]]:
+        """Return the records that tables show, in order."""
+        if not self.rounds:
+            return latest(records)
+        return sorted((r for rounds in by_row(records).values() for r in rounds), key=lambda r: r.task.place)
 
     def write(self, records: Sequence[Record[F]], given: G) -> str:
         """Write the tables into the results folder; return what the command prints."""
-        shown = latest(records)
+        shown = self.shown(records)
         text = f"{provenance(shown)}\n\n" + "\n".join(table.markdown() for table in self.tables(shown, given))
+        more = "".join(f"\n{table.markdown()}" for table in self.details(shown, given))
         path = self.folder(given) / f"{self.file}.md"
-        write_synced(path, text.encode())
+        write_synced(path, (text + more).encode())
         return f"{text}\nWritten: {path}; records in {self.file}.jsonl\n"
 
     def code(self, tasks: Sequence[Task], records: Sequence[Record[F]], given: G) -> int:
@@ -179,7 +198,10 @@ def main(study: Study[Any, Any], arguments: list[str]) -> int:
     given = tyro.cli(study.flags, prog=f"run-benchmark {study.name}".rstrip(), args=arguments)
     _check(study, given)
     store = study.store(given)
-    tasks = [] if given.table or given.collect else study.tasks(given)
+    measures = not (given.table or given.collect)
+    if measures and not given.dry_run:
+        study.prepare(given)
+    tasks = study.tasks(given) if measures else []
     for other, count in store.collect(given.collect).items() if given.collect else ():
         sys.stderr.write(f"{other}: {count} records taken over\n")
     records = store.read()

@@ -49,7 +49,7 @@ class Skipping(study.Study[Skip, Flags]):
 
     def tasks(self, given: Flags) -> list[Task]:
         """Return a task for each case."""
-        code, machine = host.commit(), host.machine()
+        code, machine = host.commit(), self.machine(given)
         cases = dict.fromkeys(given.case) or get_args(Case)
         return [
             Task(study=self.name, part=given.size, case=case, code=code, machine=machine, place=(place,))
