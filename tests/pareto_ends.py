@@ -1,10 +1,9 @@
-"""Methods and a scene that end in every way, for the tests of pareto; imports little, since processes load it anew."""
+"""Methods and a scene that end in every way, for the tests of pareto; imports little, since processes load it again."""
 
 import time
 from dataclasses import dataclass
 
-from ctsim.benchmarks.studies.pareto.jobs import Ended
-from ctsim.benchmarks.studies.pareto.records import Mark, Setting
+from ctsim.benchmarks.studies.pareto.finding import Ended, Mark
 
 CALLS = []
 
@@ -28,11 +27,6 @@ class Scene:
 
     def __init__(self, name):
         CALLS.append(f"open {name}")
-
-    def setting(self, choice, machine):
-        return Setting(
-            part="methods", scene="s", data="d", group="g", curve="x", label=choice.label, params={}, machine=machine
-        )
 
     def warm_up(self, choice):
         CALLS.append(f"warm {choice.kind}")

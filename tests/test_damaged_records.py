@@ -6,15 +6,15 @@ import random
 import msgspec
 import pytest
 from test_paper_tables import record
-from test_pareto_points import setting, timed
+from test_pareto_points import task, timed
 
 from ctsim import locks, manifest
 from ctsim.benchmarks.engine import lines
 from ctsim.benchmarks.engine.host import host
 from ctsim.benchmarks.methods import parse_overrides
 from ctsim.benchmarks.studies.methods import records, tables
-from ctsim.benchmarks.studies.pareto.records import latest, points
-from ctsim.benchmarks.studies.pareto.records import read as read_pareto
+from ctsim.benchmarks.studies.pareto.finding import points
+from ctsim.benchmarks.studies.pareto.study import Flags, Pareto
 from ctsim.benchmarks.studies.peers import cases as peer_cases
 from ctsim.benchmarks.studies.peers import tables as peer_tables
 from ctsim.benchmarks.studies.stress import tables as stress_records
@@ -25,7 +25,7 @@ from ctsim.scaninfo import read_info
 BY = {"host": host(), "commit": "a" * 40, "time": "2026-01-01T00:00:00+00:00"}
 KINDS = {
     "records": (records.NAME, record(params={"a": [1, {"b": 2.5}]}, time=BY["time"])),
-    "pareto": ("pareto.jsonl", timed(setting(params={"a": [1]}), ("1", 1.0, 2.0))),
+    "pareto": ("pareto.jsonl", timed(task(hints={"a": [1]}), ("1", 1.0, 2.0))),
     "stress": (
         stress_records.NAME,
         stress_records.StressRecord(
@@ -111,9 +111,16 @@ def read_records(path):
         tables.write(found, path.parent)
 
 
+def read_pareto(folder):
+    study, given = Pareto(), Flags(results=folder)
+    records = study.shown(study.store(given).read())
+    points(records)
+    study.tables(records, given)
+
+
 READERS = {
     "records": read_records,
-    "pareto": lambda path: points(latest(read_pareto(path))),
+    "pareto": lambda path: read_pareto(path.parent),
     "stress": stress_records.read,
     "peers": peer_tables.read,
 }
@@ -149,6 +156,8 @@ def taken(kind, ours, theirs):
     name, whole = KINDS[kind]
     if kind == "records":
         records.collect(ours, [theirs])
+    elif kind == "pareto":
+        Pareto().store(Flags(results=ours)).collect([theirs])
     else:
         lines.collect(ours / name, [theirs], type(whole), "a record")
 

@@ -2,34 +2,19 @@
 
 import math
 import re
-from collections import Counter
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctsim.benchmarks.engine import lines
 from ctsim.benchmarks.engine.host import host
+from ctsim.benchmarks.engine.record import Task
 from ctsim.benchmarks.studies.pareto import figure as pareto_figure
-from ctsim.benchmarks.studies.pareto import study as pareto
-from ctsim.benchmarks.studies.pareto import tables as pareto_table
+from ctsim.benchmarks.studies.pareto import tables as pareto_tables
+from ctsim.benchmarks.studies.pareto.finding import Mark, Run, Timed, at_knee, enough, points, recommended
 from ctsim.benchmarks.studies.pareto.front import beaten_by, faster, front, knee
-from ctsim.benchmarks.studies.pareto.records import (
-    VERSION,
-    Mark,
-    Setting,
-    Timed,
-    at_knee,
-    enough,
-    failures,
-    latest,
-    points,
-    read,
-    recommended,
-    runs,
-)
+from ctsim.benchmarks.studies.pareto.study import VERSION, Flags, Pareto
 from ctsim.errors import InputError
 
 # few values, so that ties in one coordinate and in both occur
@@ -101,57 +86,79 @@ def test_without_a_point_below_the_chord_there_is_no_knee():
 # --- records -----------------------------------------------------------------------------------------
 
 
-def setting(label="a", curve="fdk", part="methods", **more):
-    fields = {"scene": "s", "data": "d", "group": "counts only", "params": {}, "machine": "m"}
-    return Setting(part=part, curve=curve, label=label, **{**fields, **more})
+def task(label="a", curve="fdk", part="methods", case="s", **more):
+    settings = {"group": "counts only", "curve": curve, "label": label}
+    fields = {"data": "d", "machine": "m", "version": VERSION, **more}
+    return Task(study="pareto", part=part, case=case, subject=f"{curve}, {label}", settings=settings, **fields)
 
 
-def timed(of, *marks, status="ok", time="t"):
-    """A run whose marks are (label, seconds, error)."""
-    name = {"simulator": "rms", "methods": "rmse"}[of.part]
-    found = tuple(Mark(label=label, seconds=s, values={name: e}) for label, s, e in marks)
-    return Timed(setting=of, marks=found, status=status, reason="", host=host(), commit="c", time=time)
+def timed(of, *marks, status="ok", reason=""):
+    """A record of a run whose marks are (label, seconds, error)."""
+    names = {"simulator": ("rms", "worst", "off_edges"), "methods": ("rmse",)}[of.part]
+    found = tuple(Mark(label=label, seconds=s, values=dict.fromkeys(names, e)) for label, s, e in marks)
+    return record(of, Run(ok=status == "ok", marks=found, status=status, reason=reason))
 
 
-def test_seconds_are_medians_over_the_runs_of_a_mark():
-    found = [timed(setting(), ("1", s, 0.5), ("2", 2 * s, 0.25)) for s in (3.0, 1.0, 9.0)]
-    assert [(p.label, p.pair) for p in points(found)] == [("1", (3.0, 0.5)), ("2", (6.0, 0.25))]
+def record(of, run):
+    return Timed(task=of, found=(run,), host=host(), commit="c", time="2026-01-01T00:00:00+00:00")
 
 
-def test_a_torn_last_line_costs_one_run_and_nothing_after_it(tmp_path):
-    path = tmp_path / "pareto.jsonl"
-    lines.append(path, *(timed(setting(label), (label, 1.0, 1.0)) for label in "ab"))
-    path.write_bytes(path.read_bytes()[:-20])
-    assert [t.setting.label for t in read(path)] == ["a"]
-    lines.append(path, timed(setting("c"), ("c", 1.0, 1.0)))
-    assert [t.setting.label for t in read(path)] == ["a", "c"]
-    path.write_text('{"setting": 1}\n')
-    with pytest.raises(InputError, match="line 1: expected a record of run-benchmark pareto"):
-        read(path)
+def shown(records, tmp_path):
+    """What a table shows of these records."""
+    given = Flags(results=tmp_path)
+    return Pareto().shown([r for r in records if Pareto().shows(r.task, given)])
 
 
-def test_a_table_shows_the_newest_code_on_the_last_machine():
-    old, new, other = setting(code="1"), setting(code="2"), setting("b", machine="another")
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('"curve":"fdk",', "", "expected a known part, and settings with group, curve and label"),
+        ('"part":"methods"', '"part":"peers"', "expected a known part"),
+        ('"rmse"', '"rms"', "expected values rmse"),
+        ('"marks"', '"mark"', "unknown field"),
+    ],
+)
+def test_a_record_without_what_a_point_needs_is_refused_in_one_sentence(old, new, says, tmp_path):
+    store = Pareto().store(Flags(results=tmp_path))
+    store.append([timed(task(), ("1", 1.0, 2.0))])
+    assert store.read() == [timed(task(), ("1", 1.0, 2.0))]
+    text = store.path.read_text("utf-8")
+    assert old in text
+    store.path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(InputError, match=f"line 1: expected a record of run-benchmark pareto: .*{says}"):
+        store.read()
+
+
+def test_seconds_are_medians_over_the_runs_of_a_mark(tmp_path):
+    found = [timed(task(), ("1", s, 0.5), ("2", 2 * s, 0.25)) for s in (3.0, 1.0, 9.0)]
+    assert [(p.label, p.pair) for p in points(shown(found, tmp_path))] == [("1", (3.0, 0.5)), ("2", (6.0, 0.25))]
+    # a run ends with its last mark
+    assert Pareto().took(found[0], Flags(results=tmp_path)) == 6.0
+
+
+def test_a_table_shows_the_newest_code_on_the_last_machine(tmp_path):
+    old, new, other = task(code="1"), task(code="2"), task("b", machine="another")
     found = [timed(other, ("b", 1, 1)), timed(old, ("a", 1, 1)), timed(new, ("a", 2, 1)), timed(new, ("a", 4, 1))]
-    assert [p.seconds for p in points(latest(found))] == [(2.0, 4.0)]
+    now = points(shown(found, tmp_path))
+    assert [p.seconds for p in now] == [(2.0, 4.0)]
     # what an older version measured says nothing, not even where
-    older = setting(machine="elsewhere", version=VERSION - 1)
-    assert points(latest([*found, timed(older, ("a", 9, 1))])) == points(latest(found))
+    older = task(machine="elsewhere", version=VERSION - 1)
+    assert points(shown([*found, timed(older, ("a", 9, 1))], tmp_path)) == now
     # another scene may have been measured elsewhere
-    elsewhere = setting("c", scene="t", machine="another")
-    assert len(latest([timed(elsewhere, ("c", 1, 1)), *found])) == 3
-    assert runs(found) == Counter({old.identity: 1, new.identity: 2, other.identity: 1})
+    elsewhere = task("c", case="t", machine="another")
+    assert len(shown([timed(elsewhere, ("c", 1, 1)), *found], tmp_path)) == 3
 
 
-def test_only_what_never_ended_well_is_a_failure():
-    bad, good = setting("bad"), setting("good")
-    found = [timed(bad, status="error"), timed(good, status="error"), timed(good, ("good", 1, 1))]
-    assert [t.setting.label for t in failures(found)] == ["bad"]
+def test_only_what_never_ended_well_is_a_failure(tmp_path):
+    bad, good = task("bad"), task("good")
+    found = [timed(bad, status="error", reason="so"), timed(good, status="error"), timed(good, ("good", 1, 1))]
+    assert pareto_tables.summary(shown(found, tmp_path))[-1].csv().splitlines()[1:] == ["fdk,bad,error,so"]
+    assert "not measured" not in said(found[1:], tmp_path)
 
 
 def test_recommended_are_near_the_least_error_for_methods_and_the_knee_for_the_simulator():
     marks = [(str(k), 2.0**k, e) for k, e in enumerate((1.0, 0.1, 0.052, 0.0505, 0.05))]
-    method, simulator = (points([timed(setting(part=part), *marks)]) for part in ("methods", "simulator"))
+    method, simulator = (points([timed(task(part=part), *marks)]) for part in ("methods", "simulator"))
     assert (recommended(method).label, enough(method).label) == ("2", "2")  # 0.052 is within 5 % of 0.05
     assert recommended(simulator) is at_knee(simulator)
     assert recommended(simulator).label == "1"
@@ -160,18 +167,33 @@ def test_recommended_are_near_the_least_error_for_methods_and_the_knee_for_the_s
 # --- the table ---------------------------------------------------------------------------------------
 
 
-def verdicts(*rows):
-    """The verdicts on defaults whose rows are (label, seconds of the rounds, rms, worst)."""
+def said(records, tmp_path):
+    """The tables that are printed, as Markdown."""
+    return "\n".join(table.markdown() for table in Pareto().tables(shown(records, tmp_path), Flags(results=tmp_path)))
+
+
+def simulated(*rows):
+    """Records of defaults whose rows are (label, seconds of the rounds, rms, worst)."""
     found = []
     for label, rounds, rms, worst in rows:
         values = {"rms": rms, "worst": worst, "off_edges": 1.0}
-        for seconds in rounds:
-            mark = Mark(label=label, seconds=seconds, default=True, values=values)
-            of = timed(setting(label, part="simulator", curve="x"))
-            found.append(msgspec.structs.replace(of, marks=(mark,)))
+        marks = [Mark(label=label, seconds=seconds, default=True, values=values) for seconds in rounds]
+        found += [record(task(label, part="simulator", curve="x"), Run(marks=(mark,))) for mark in marks]
+    return found
+
+
+def verdicts(*rows):
+    """The verdicts on such defaults."""
+    found = simulated(*rows)
     assert pareto_figure.draw(points(found)).axes
-    said = [line for line in pareto_table.summary(found).splitlines() if line.startswith("- Default")]
-    return [re.fullmatch("- Default x, .: in relative RMS of P (.*); in all errors at once (.*).", s) for s in said]
+    notes = [note for table in pareto_tables.summary(found) for note in table.notes if note.startswith("Default")]
+    return [re.fullmatch("Default x, .: in relative RMS of P (.*); in all errors at once (.*).", s) for s in notes]
+
+
+def test_a_bar_in_a_title_ends_no_cell(tmp_path):
+    rows = [line for line in said(simulated(("a", [1], 0.5, 0.5)), tmp_path).splitlines() if line.startswith("| curve")]
+    # curve, setting, s, three errors, knee: eight bars around seven cells
+    assert len(re.findall(r"(?<!\\)\|", rows[0])) == 8 and "worst \\|ΔP\\| off" in rows[0]
 
 
 def test_verdicts_name_what_beats_a_default():
@@ -197,19 +219,3 @@ def test_a_default_is_off_the_front_only_beyond_the_spread_of_its_rounds():
     assert verdict([0.9, 0.98, 1.0, 1.01, 1.05], 0.096).startswith(within)
     assert verdict([0.9, 0.98, 1.0, 1.01, 1.05], 0.095).startswith("off the front")
     assert verdict([0.9, 0.95, 0.97, 0.98, 0.99], 0.11) == "on the front"
-
-
-def test_records_of_other_machines_are_taken_over_and_the_table_shows_the_last(tmp_path, capsys):
-    here, there = tmp_path / "here", tmp_path / "there"
-    for folder, machine, seconds, day in ((here, "m", 1.0, 1), (there, "n", 7.0, 2)):
-        folder.mkdir()
-        record = timed(setting(machine=machine), ("a", seconds, 1.0), time=f"2026-01-0{day}T00:00:00+00:00")
-        lines.append(folder / "pareto.jsonl", record)
-    both = [*read(here / "pareto.jsonl"), *read(there / "pareto.jsonl")]
-    for taken in (1, 0):
-        assert pareto.main([str(here), "--collect", str(there)]) == 0
-        said = capsys.readouterr()
-        assert f"{there}: {taken} records taken over" in said.err
-        assert "| fdk | a | 7 |" in said.out and "| fdk | a | 1 |" not in said.out
-    assert read(here / "pareto.jsonl") == both
-    assert sorted(path.name for path in here.iterdir()) == ["pareto.jsonl", "pareto.md", "pareto.png"]

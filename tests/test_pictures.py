@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from test_paper_tables import record
-from test_pareto_points import setting, timed
+from test_pareto_points import task, timed
 from test_run import GEOMETRY, Double, double, once
 
 from ctsim.benchmarks.scores.protocol import truth_of
@@ -20,7 +20,7 @@ from ctsim.benchmarks.studies.methods import panels
 from ctsim.benchmarks.studies.methods.panels import Row, draw
 from ctsim.benchmarks.studies.methods.volumes import write_volume
 from ctsim.benchmarks.studies.pareto import figure as pareto_figure
-from ctsim.benchmarks.studies.pareto.records import points
+from ctsim.benchmarks.studies.pareto.finding import points
 from ctsim.reports import figures, view
 
 # what matplotlib cannot parse as mathematics, what it would draw as such, and an escape of its own
@@ -109,7 +109,7 @@ def test_figures_of_the_report_draw_the_very_text(text):
 
 @pytest.mark.parametrize("text", TEXTS)
 def test_the_figure_of_pareto_draws_the_very_text(text):
-    found = [timed(setting(part="methods", scene=f"s {text}", curve=text), ("1", 1.0, 2.0), ("2", 2.0, 1.0))]
+    found = [timed(task(case=f"s {text}", curve=text), ("1", 1.0, 2.0), ("2", 2.0, 1.0))]
     shown = text_of(pareto_figure.draw(points(found)))
     assert f"s {text}" in shown and f"\n{text}\n" in shown
 

@@ -21,9 +21,9 @@ from dataclasses import dataclass
 from multiprocessing import connection
 from typing import Any, Protocol, Self
 
-from ctsim.benchmarks.engine.host import THREADS
 from ctsim.errors import InputError
 
+THREADS = {"numba": "NUMBA_NUM_THREADS", "torch": "OMP_NUM_THREADS"}  # a library and its variable
 TRIES = 3  # how often a job is started whose process dies
 TICK = 1.0  # seconds between two looks at jobs that run
 GRACE = 10.0  # seconds that a job has to write down where it stopped

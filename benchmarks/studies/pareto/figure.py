@@ -1,6 +1,7 @@
 """The figure of `run-benchmark pareto`: a row of axes for each scene, error against time, with the Pareto front."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -10,9 +11,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator
 
 from ctsim.benchmarks.engine.texts import pictured
+from ctsim.benchmarks.studies.pareto.finding import Part, Point, at_knee, curves, groups
 from ctsim.benchmarks.studies.pareto.front import front
-from ctsim.benchmarks.studies.pareto.records import Part, Point, at_knee
-from ctsim.benchmarks.studies.pareto.tables import curves, groups
+from ctsim.durable import replacing
 
 DPI, WIDE, HIGH = 150, 9.0, 4.6
 MARKERS, STYLES = ("o", "^", "s", "D"), ("-", "--", ":", "-.")  # by group
@@ -24,11 +25,17 @@ AXES: dict[Part, tuple[str, str]] = {
 }
 
 
+def save(every: Sequence[Point], path: Path) -> None:
+    """Draw all points into a PNG file, which is replaced at once."""
+    with replacing(path) as new:
+        draw(every).savefig(new, format="png", dpi=DPI)
+
+
 def draw(every: Sequence[Point]) -> Figure:
     """Draw each scene's points: time and error on log axes, defaults, and the front and knee of each group."""
     scenes: dict[tuple[str, str], list[Point]] = {}
     for p in every:
-        scenes.setdefault((p.setting.part, p.setting.scene), []).append(p)
+        scenes.setdefault((p.part, p.task.case), []).append(p)
     figure = Figure(figsize=(WIDE, HIGH * len(scenes)), layout="constrained")
     for axes, mine in zip(figure.subplots(len(scenes), 1, squeeze=False)[:, 0], scenes.values(), strict=True):
         _scene(axes, mine)
@@ -37,7 +44,7 @@ def draw(every: Sequence[Point]) -> Figure:
 
 def _scene(axes: Axes, every: Sequence[Point]) -> None:
     handles: list[Any] = []
-    known = list(dict.fromkeys(p.setting.curve for p in every))
+    known = list(dict.fromkeys(p.curve for p in every))
     for k, group in enumerate(groups(every)):
         for curve, mine in curves(group).items():
             x, y = zip(*sorted(p.pair for p in mine), strict=True)  # a default may stand anywhere on its curve
@@ -46,7 +53,7 @@ def _scene(axes: Axes, every: Sequence[Point]) -> None:
             handles += axes.plot(x, y, marker=marker, markersize=5, linewidth=0.8, color=colour, label=pictured(curve))
         pairs = [p.pair for p in group]
         x, y = zip(*(pairs[i] for i in front(pairs)), strict=True)
-        label = pictured(f"front: {group[0].setting.group}")
+        label = pictured(f"front: {group[0].group}")
         handles += axes.step(
             x, y, where="post", color=FRONT, linewidth=1.0, linestyle=STYLES[k % len(STYLES)], zorder=1, label=label
         )
@@ -59,9 +66,9 @@ def _scene(axes: Axes, every: Sequence[Point]) -> None:
         Line2D([], [], color=KNEE, marker="o", markersize=11, markerfacecolor="none", linestyle="", label="knee"),
         Line2D([], [], color=FRONT, marker="x", markersize=8, linestyle="", label="default"),
     ]
-    setting = every[0].setting
-    x, y = AXES[setting.part]
-    axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y, title=pictured(f"{setting.part}, {setting.scene}"))
+    part, scene = every[0].part, every[0].task.case
+    x, y = AXES[part]
+    axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y, title=pictured(f"{part}, {scene}"))
     axes.grid(which="both", alpha=0.2)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter("{x:g}")

@@ -62,8 +62,10 @@ FEWEST = 5
 
 
 def _interval(runs: Sequence[float]) -> Pair:
-    from scipy.stats import binom
-
-    at = max(int(binom.ppf(0.025, len(runs), 0.5)) - 1, 0)
+    n, at, below = len(runs), 0, 1  # below: of 2ⁿ equally likely cases, those with at most `at` runs under the median
+    while below < 0.025 * 2**n:
+        at += 1
+        below += math.comb(n, at)
+    at = max(at - 1, 0)
     ordered = sorted(runs)
     return ordered[at], ordered[-1 - at]

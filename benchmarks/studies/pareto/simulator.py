@@ -1,4 +1,4 @@
-"""The simulator's choices, each timed and held against a converged scan of the same scene.
+"""The simulator's choices, each timed and compared with a converged scan of the same scene.
 
 The scene is analytic: a water cylinder with a bone rod and two iron rods. The reference has the finest of every choice:
 closed-form chords, 16² finer pixels a pixel of up to 64 rays each averaged in intensity, and the whole fine spectrum.
@@ -8,100 +8,30 @@ where the reference has level 1's signal added: a constant, whose own error is n
 
 import functools
 import time
-from dataclasses import dataclass, field
-from typing import get_args
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.benchmarks.methods import code_version
 from ctsim.benchmarks.oracles import SIZE, poly_scene, relative, voxelised
-from ctsim.benchmarks.studies.pareto.records import Mark, Setting
-from ctsim.benchmarks.studies.pareto.suite import Choices, Level
+from ctsim.benchmarks.studies.pareto.choices import EXACT, SCATTER, Choice
+from ctsim.benchmarks.studies.pareto.finding import Mark
+from ctsim.benchmarks.studies.pareto.suite import HIGHEST
 from ctsim.noise import Noise
 from ctsim.phantoms.scanners import preset
 from ctsim.plan import Plan, make_plan
 from ctsim.project import Response, Tracer, transmit
 from ctsim.quadrature import full_rule
 from ctsim.scatter import Scatter, open_fraction
-from ctsim.settings import Simulation, Truth
+from ctsim.settings import Truth
 from ctsim.simulate import simulate_views
 from ctsim.spectrum import spectrum
 from ctsim.types import Phantom, Scanner
 
-SCENE = "rods"
-CHECKED = 2  # views that are held against the reference
-USUAL = 1.0  # label voxels along an axis for each pixel along one; the bundled suites have 0.5 to 1.2
+CHECKED = 2  # views that are compared with the reference
 FINER, FINEST = 16, 64
 """Of the reference: finer pixels along a side of a pixel, and rays in each."""
 CALM = 1e-4  # |ΔP| of the central ray alone, below which a pixel has no edge
-HIGHEST = max(get_args(Level))  # of scatter, which the reference has
-EXACT, BODY, VOXELS, SCATTER = "exact solids", "body in voxels, metal exact", "all in voxels", "scatter"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Choice:
-    """One way to simulate the scene; `grid` (None: analytic) and `metal` say what is turned into voxels."""
-
-    curve: str
-    label: str
-    simulation: Simulation = field(default_factory=Simulation)
-    grid: float | None = None
-    metal: bool = False
-    level: Level = 0
-    default: bool = False
-
-    @property
-    def group(self) -> str:
-        """What is compared: whether there is a closed form is the scene's matter, so voxels do not rival solids."""
-        return SCATTER if self.curve == SCATTER else EXACT if self.grid is None else "voxels"
-
-    @property
-    def kind(self) -> str:
-        """The part's name: one warm-up does for all."""
-        return "simulator"
-
-
-def choices(asked: Choices) -> list[Choice]:
-    """List every choice that is asked for: tolerances with sub-rays, voxels instead of solids, and scatter levels."""
-    usual = Simulation()
-    found = [
-        Choice(
-            curve=f"tolerance {_short(tolerance)}",
-            label=f"{subrays} sub-ray{'s' * (subrays > 1)}",
-            simulation=Simulation(tolerance=tolerance, subrays=subrays),
-            default=(tolerance, subrays) == (usual.tolerance, usual.subrays),
-        )
-        for tolerance in sorted({*asked.tolerances, usual.tolerance}, reverse=True)
-        for subrays in sorted({*asked.subrays, usual.subrays})
-    ]
-    whole = Simulation(skip=False)
-    found.append(Choice(curve="nothing skipped", label=f"{usual.subrays} sub-rays", simulation=whole))
-    found += [
-        Choice(curve=curve, label=f"{round(grid * asked.side)}³ labels", grid=grid, metal=metal, default=default)
-        for curve, metal in ((BODY, False), (VOXELS, True))
-        for grid in _different(asked.grids, asked.side)
-        for default in (grid == USUAL and not metal,)
-    ]
-    # whether there is scatter is the scanner's matter: here there is, and then the highest level is what is computed
-    return found + [Choice(curve=SCATTER, label=f"level {k}", level=k, default=k == HIGHEST) for k in asked.levels]
-
-
-def _short(tolerance: float) -> str:
-    """Return a tolerance as briefly as it is told from others: 1e-04, 1.2e-04."""
-    mantissa, exponent = f"{tolerance:e}".split("e")
-    return f"{mantissa.rstrip('0').rstrip('.')}e{exponent}"
-
-
-def _different(grids: tuple[float, ...], side: int) -> list[float]:
-    """Return the grids, one of those that have the same number of labels: the default, or else the first."""
-    found: dict[int, float] = {}
-    for grid in (*(g for g in grids if g == USUAL), *grids):
-        found.setdefault(round(grid * side), grid)
-    return [grid for grid in grids if grid in found.values()]
-
-
 USUALLY = Choice(curve=EXACT, label="default")
 
 
@@ -114,36 +44,16 @@ class Bench:
         self.scanner = msgspec.structs.replace(scanner, noise=Noise(model="none"))
         self.phantom = poly_scene(side)
         self.checked = tuple(sorted({round((k + 0.5) * views / CHECKED) % views for k in range(CHECKED)}))
-        self._plans: dict[str, tuple[Plan, Phantom, Scanner]] = {}
-
-    def setting(self, choice: Choice, machine: str) -> Setting:
-        """Return what determines a choice's runs."""
-        return Setting(
-            part="simulator",
-            scene=SCENE,
-            data=f"{self.side}² pixels, {self.scanner.geometry.n_views} views",
-            group=choice.group,
-            curve=choice.curve,
-            label=choice.label,
-            params=msgspec.to_builtins(choice.simulation)
-            | {"grid": choice.grid, "metal": choice.metal, "level": choice.level},
-            code=code_version("ctsim.simulate"),
-            machine=machine,
-        )
+        self._plans: dict[Choice, tuple[Plan, Phantom, Scanner]] = {}
 
     def plan(self, choice: Choice) -> tuple[Plan, Phantom, Scanner]:
         """Plan a choice, once; no clock runs yet."""
-        key = f"{choice.curve}: {choice.label}"
-        if key not in self._plans:
+        if choice not in self._plans:
             scanner = msgspec.structs.replace(self.scanner, scatter=Scatter(level=choice.level))
             phantom = self._phantom(choice.grid, choice.metal)
             plan = make_plan(phantom, scanner, choice.simulation, Truth(twin=False, noise_free=True), "pareto")
-            self._plans[key] = plan, phantom, scanner
-        return self._plans[key]
-
-    def estimate(self) -> float:
-        """Return how long a run of the defaults should take, in seconds; choices together take about as much each."""
-        return self.plan(USUALLY)[0].seconds
+            self._plans[choice] = plan, phantom, scanner
+        return self._plans[choice]
 
     def warm_up(self, _: Choice) -> float:
         """Run the defaults, so that compiling and the reference are not timed with a choice; return the seconds."""
@@ -161,7 +71,7 @@ class Bench:
         return (Mark(label=label, seconds=seconds, values=self.errors(found, s), default=choice.default),)
 
     def errors(self, p: NDArray[np.float32], scatter: float = 0.0) -> dict[str, float]:
-        """Hold P of the checked views against the reference with `scatter` (S/I0) added.
+        """Compare P of the checked views with the reference, to which `scatter` (S/I0) is added.
 
         `rms` is relative, `worst` and `off_edges` are the greatest |ΔP|, the latter where a pixel has no edge.
         """

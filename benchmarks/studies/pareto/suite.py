@@ -1,19 +1,19 @@
-"""What `run-benchmark pareto` measures, as data: `benchmarks/suites/pareto.toml`, or tables of one's own over it."""
+"""What `run-benchmark pareto` measures, as data: `benchmarks/suites/pareto.toml`, or tables of your own over it."""
 
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 
 from ctsim.errors import InputError
-from ctsim.phantoms.messages import explain
-from ctsim.phantoms.suites import parse_toml, read_toml
+from ctsim.phantoms.suites import decode, parse_toml, read_toml
 from ctsim.settings import Simulation
 
 NAME = "pareto.toml"
 Count = Annotated[int, msgspec.Meta(ge=1)]
-Level = Literal[0, 1]
+Level = Literal[0, 1]  # of scatter
+HIGHEST = max(get_args(Level))
 
 
 class Dataset(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -100,11 +100,7 @@ def load(path: Path | None) -> Suite:
     bundled = parse_toml((resources.files("ctsim.benchmarks.suites") / NAME).read_text(encoding="utf-8"), NAME)
     if path is None:
         return msgspec.convert(bundled, Suite)
-    tables = bundled | read_toml(path, f"like {NAME}")
-    try:
-        suite = msgspec.convert(tables, Suite)
-    except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {explain(error, tables, Suite)}") from error
+    suite = decode(bundled | read_toml(path, f"like {NAME}"), Suite, str(path))
     if not suite.dataset.suite.endswith(".toml"):
         return suite
     dataset = msgspec.structs.replace(suite.dataset, suite=str(path.parent / suite.dataset.suite))
