@@ -132,13 +132,13 @@ def choices(asked: Choices) -> list[Choice]:
 
 
 def _short(tolerance: float) -> str:
-    """Return a tolerance as briefly as it is told from others: 1e-04, 1.2e-04."""
+    """Return a tolerance in its shortest form that is exact: 1e-04, 1.2e-04."""
     mantissa, exponent = f"{tolerance:e}".split("e")
     return f"{mantissa.rstrip('0').rstrip('.')}e{exponent}"
 
 
 def _different(grids: tuple[float, ...], side: int) -> list[float]:
-    """Return the grids, one of those that have the same number of labels: the default, or else the first."""
+    """Return the grids that differ in the number of labels; of equal ones the default, or else the first."""
     found: dict[int, float] = {}
     for grid in (*(g for g in grids if g == USUAL), *grids):
         found.setdefault(round(grid * side), grid)

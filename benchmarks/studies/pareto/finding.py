@@ -96,7 +96,7 @@ def points(records: Sequence[Record[Run]]) -> list[Point]:
 
 
 def groups(every: Sequence[Point]) -> list[list[Point]]:
-    """Part the points into those that may be compared: one part, scene and group."""
+    """Part the points into comparable ones: of one part, scene and group."""
     found: dict[tuple[str, str, str], list[Point]] = {}
     for p in every:
         found.setdefault((p.part, p.task.case, p.group), []).append(p)

@@ -51,7 +51,7 @@ def beaten_by(pairs: Sequence[Pair], k: int) -> tuple[int, float]:
 def faster(a: Sequence[float], b: Sequence[float]) -> bool:
     """Return whether runs of `a` seconds are faster than those of `b` beyond the spread of both.
 
-    The 95 % intervals of their medians do not meet: between order statistics, whatever the distribution is. Fewer than
+    The 95 % intervals of their medians do not meet: between order statistics, for any distribution. Fewer than
     `FEWEST` runs tell nothing.
     """
     return min(len(a), len(b)) >= FEWEST and _interval(a)[1] < _interval(b)[0]

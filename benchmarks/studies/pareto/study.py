@@ -20,7 +20,6 @@ from ctsim.benchmarks.engine import host, study
 from ctsim.benchmarks.engine.record import Record, Task
 from ctsim.benchmarks.engine.table import Table
 from ctsim.benchmarks.methods import code_version, find
-from ctsim.benchmarks.scores import protocol
 from ctsim.benchmarks.studies.pareto import suite, tables
 from ctsim.benchmarks.studies.pareto.choices import Choice, Effort, choices, efforts
 from ctsim.benchmarks.studies.pareto.finding import Part, Run, Timed, points
@@ -77,19 +76,20 @@ class Pareto(study.Study[Run, Flags]):
 
     def prepare(self, given: Flags) -> None:
         """Make the scans that are missing, if all that is asked for is there."""
-        _, _, scenes = asked(given)
-        pkgutil.resolve_name(f"{HERE}.worker:make_scans")(scenes, given.results / "data")
+        if scenes := asked(given)[2]:
+            pkgutil.resolve_name(f"{HERE}.worker:make_scans")(scenes, given.results / "data")
 
     def tasks(self, given: Flags) -> list[Task]:
         """Return a task for each choice of the simulator, and for each run of a method on each scene."""
         simulated, runs, scenes = asked(given)
         size = suite.load(given.suite).simulator
+        protocol = pkgutil.resolve_name("ctsim.benchmarks.scores.protocol:VERSION")
         found = [(RODS, f"{size.side}² pixels, {size.views} views", choice) for choice in simulated]
         for scene in scenes:
             folder = given.results / "data" / scene.name
-            known = f"{read_manifest(folder).content_hash}, protocol {protocol.VERSION}" if folder.exists() else ""
+            known = f"{read_manifest(folder).content_hash}, protocol {protocol}" if folder.exists() else ""
             found += [(scene.name, known, effort) for effort in runs]
-        machine, cases = self.machine(given), list(dict.fromkeys(case for case, _, _ in found))
+        machine, cases = self.machine(given), [RODS, *(scene.name for scene in scenes)]
         return [
             Task(
                 study=self.name,
@@ -125,7 +125,7 @@ class Pareto(study.Study[Run, Flags]):
 
     def took(self, record: Record[Run], given: Flags) -> float:
         """Return the seconds of a run, which ended with its last mark."""
-        return max(mark.seconds for run in record.found for mark in run.marks)
+        return max((mark.seconds for run in record.found for mark in run.marks), default=0.0)
 
     def line(self, task: Task) -> tuple[str, str]:
         """Return a scene and a curve."""

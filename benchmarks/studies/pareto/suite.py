@@ -51,7 +51,7 @@ class Listed(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         if bool(self.parameter) != bool(self.values):
             raise InputError("parameter and values: expected both or neither")
         if self.parameter and self.times is not None:
-            raise InputError("times: expected none beside a parameter and its values")
+            raise InputError("times: expected none with a parameter and its values")
 
 
 class Choices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
