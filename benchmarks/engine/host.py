@@ -41,7 +41,7 @@ def _cpu_name() -> str:
     return platform.processor() or platform.machine()
 
 
-def _threads() -> int:
+def threads() -> int:
     """Return the threads that the kernels use."""
     numba = sys.modules.get("numba")
     cores = len(os.sched_getaffinity(0))
@@ -70,7 +70,7 @@ def host() -> Host:
     return Host(
         cpu=_cpu_name(),
         cores=len(os.sched_getaffinity(0)),
-        threads=_threads(),
+        threads=threads(),
         ram=os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
         system=f"{platform.system()} {platform.release()}",
         python=platform.python_version(),
