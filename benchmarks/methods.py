@@ -188,10 +188,11 @@ def code_version(module: str) -> str:
 def _sources(module: str, roots: set[str]) -> dict[str, bytes]:
     """Collect the sources that are reachable from `module` through import statements within `roots`."""
     found: dict[str, bytes] = {}
-    waiting = [module]
+    waiting, plain = [module], set[str]()
     while waiting:
         name = waiting.pop()
-        if name in found or name.partition(".")[0] not in roots:
+        # what a module defines is no module: to look for one there would load it
+        if name in found or name.partition(".")[0] not in roots or name.rpartition(".")[0] in plain:
             continue
         try:
             spec = importlib.util.find_spec(name)
@@ -201,6 +202,8 @@ def _sources(module: str, roots: set[str]) -> dict[str, bytes]:
             continue
         with open(spec.origin, "rb") as file:
             found[name] = file.read()
+        if not spec.submodule_search_locations:
+            plain.add(name)
         package = name if spec.submodule_search_locations else name.rpartition(".")[0]
         for node in ast.walk(ast.parse(found[name])):
             if isinstance(node, ast.Import):
@@ -208,5 +211,5 @@ def _sources(module: str, roots: set[str]) -> dict[str, bytes]:
             elif isinstance(node, ast.ImportFrom):
                 origin = package.rsplit(".", node.level - 1)[0] + "." if node.level else ""
                 base = (origin + (node.module or "")).strip(".")
-                waiting += [base, *(f"{base}.{alias.name}" for alias in node.names)]
+                waiting += [*(f"{base}.{alias.name}" for alias in node.names), base]  # the last is the next one
     return found
