@@ -1,12 +1,15 @@
-"""Cases that end in every way, for the tests of the stress suite; imports little, since processes load it anew."""
+"""Rows that end in every way, for the tests of the stress suite; imports little, since its process loads it, too."""
 
 import os
 import time
 import warnings
 
+import numba
 import numpy as np
 
-from ctsim.benchmarks.studies.stress.cases import Case
+from ctsim.benchmarks.studies.stress import worker
+from ctsim.benchmarks.studies.stress.rows import Row
+from ctsim.benchmarks.studies.stress.study import Outcome, Stress
 
 
 def fine(side, found):
@@ -49,5 +52,29 @@ ENDS = {
 }
 
 
-def catalogue(subject="test"):
-    return [Case(name=f.__name__, subject=subject, what="w", expected="e", run=f) for f in ENDS]
+def catalogue(*names, code="code"):
+    rows = [Row(f.__name__, "test", "w", "e", f"stress_ends:{f.__name__}", (), code) for f in ENDS]
+    return {(row.case, row.subject): row for row in rows if not names or row.case in names}
+
+
+def judge(task, given, threads):
+    worker.catalogue = lambda *_: catalogue()
+    return worker.judge(task, given, threads)
+
+
+def threads(task, given, n):
+    most = numba.config.NUMBA_NUM_THREADS
+    numba.set_num_threads(n)
+    return [Outcome(found=f"{numba.get_num_threads()} of {most} threads")]
+
+
+class Ends(Stress):
+    """The command on these rows."""
+
+    work = "stress_ends:judge"
+
+    def rows(self, given):
+        return catalogue()
+
+    def limit(self, task, given):
+        return 1.0 if task.case == "hanging" else given.seconds

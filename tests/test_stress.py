@@ -1,25 +1,26 @@
 """The stress suite: every case on the smallest grids, and that a case whose remedy is taken out is reported."""
 
 import dataclasses
+import functools
+import pkgutil
 import sys
 
+import msgspec
+import numba
 import numpy as np
 import pytest
-from stress_ends import ENDS, catalogue
+from stress_ends import ENDS, Ends, catalogue, judge
 
 from ctsim import plan
 from ctsim.baselines.known_spectrum import Beam
+from ctsim.benchmarks.engine import study as engine
 from ctsim.benchmarks.methods import TABLE, find
-from ctsim.benchmarks.studies.stress import chain as stress_chain
+from ctsim.benchmarks.studies.peers.cases import upright_chord
 from ctsim.benchmarks.studies.stress import methods as stress_methods
-from ctsim.benchmarks.studies.stress import simulator as stress_simulator
-from ctsim.benchmarks.studies.stress import splats as stress_splats
-from ctsim.benchmarks.studies.stress import study as stress
-from ctsim.benchmarks.studies.stress import tables as stress_records
-from ctsim.benchmarks.studies.stress.cases import Findings, carry_out
-from ctsim.benchmarks.studies.stress.scans import BONE, USUAL, WATER, example, geometry, in_air, rod
-from ctsim.benchmarks.studies.stress.suite import load
-from ctsim.benchmarks.studies.stress.worker import Worker
+from ctsim.benchmarks.studies.stress import rows, simulator, study
+from ctsim.benchmarks.studies.stress.findings import Findings, carry_out
+from ctsim.benchmarks.studies.stress.scans import example, few_views, lengths
+from ctsim.benchmarks.studies.stress.suite import Machine, Rod, Scene, load
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.noise import Noise
@@ -34,72 +35,114 @@ from ctsim.reconstruct.splat.objective import Objective
 from ctsim.reconstruct.splat.project import Projector
 from ctsim.reconstruct.splat.published_settings import Settings
 from ctsim.spectrum import Tube
-from ctsim.types import Scanner
 
 SMALLEST = 12
-SUBJECTS = [method.label for method in stress_methods.subjects()]
+SUBJECTS = [rows.label(*method) for method in rows.subjects()]
+ROWS = rows.catalogue()
+METHODS = [row for row in ROWS.values() if row.run.startswith(rows.MODULES["methods"]) and row.case != "float64"]
 # every scene meets a third of the methods here and every method a third of the scenes; the command runs all
-METHODS = [c for k, c in enumerate(stress_methods.cases()) if (k // len(SUBJECTS) + k % len(SUBJECTS)) % 3 == 0]
-CASES = [*stress_simulator.cases(), *stress_splats.cases(), *stress_chain.cases(), *METHODS]
+SOME = [row for k, row in enumerate(METHODS) if (k // len(SUBJECTS) + k % len(SUBJECTS)) % 3 == 0]
+CASES = [*(row for row in ROWS.values() if row not in METHODS), *SOME]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c.name}-{c.subject}")
-def test_a_case_is_as_expected(case):
-    outcome = carry_out(case, SMALLEST)
-    assert outcome.ok, outcome.found
+def judged(row, side=SMALLEST):
+    return carry_out(functools.partial(pkgutil.resolve_name(row.run), *row.given, side))[0]
+
+
+@pytest.mark.parametrize("row", CASES, ids=lambda row: f"{row.case}-{row.subject}")
+def test_a_case_is_as_expected(row):
+    found = judged(row)
+    assert found.said and not found.wrong, str(found)
 
 
 def test_every_method_and_kernel_has_its_cases():
-    by_subject = {}
-    for case in stress.catalogue():
-        by_subject.setdefault(case.subject, []).append(case.name)
-    assert set(by_subject) == {"simulator", "splat kernels", *SUBJECTS} and {*TABLE} < {*SUBJECTS}
-    assert all(len(names) == len(set(names)) for names in by_subject.values())
-    assert {case.subject for case in METHODS} == set(SUBJECTS)
-    assert {case.name for case in METHODS} == {*(scene.name for scene in load()), "threads"}
+    assert {subject for _, subject in ROWS} == {"simulator", "splat kernels", *SUBJECTS}
+    assert [find(*method).label for method in rows.subjects()] == SUBJECTS and {*TABLE} < {*SUBJECTS}
+    assert {row.subject for row in SOME} == set(SUBJECTS)
+    assert {row.case for row in SOME} == {*(scene.name for scene in load() if scene.methods), "threads"}
+
+
+def test_a_case_is_the_same_for_all_its_subjects():
+    """Scenes of one name must be one scan: the table says what it is once."""
+    scenes, whats = {scene.name: scene for scene in load()}, {}
+    for row in ROWS.values():
+        whats.setdefault(row.case, set()).add(row.what)
+        assert all(scene == scenes[row.case] for scene in row.given if isinstance(scene, Scene))
+    assert [case for case, what in whats.items() if len(what) > 1] == []
+    assert {case for case, subject in ROWS if subject == "simulator"} == {
+        *(name for name, scene in scenes.items() if scene.simulated), "flat-solids", "float64", "threads",
+    }  # fmt: skip
+    assert {*simulator.CHECKS} == {*rows.CHECKS} < {*scenes}
+
+
+# --- closed forms ------------------------------------------------------------------------------------
+
+
+def test_rods_that_lie_in_each_other_share_the_rays_by_paint_order():
+    """Later rods take what they cross; within each other that is a difference of their own chords."""
+    (scene,) = [scene for scene in load() if scene.name == "nested-solids"]
+    of = few_views(scene, SMALLEST).geometry
+    found = lengths(scene, of)
+    alone = [np.stack([upright_chord(of, view, rod.solid()) for view in range(of.n_views)]) for rod in scene.all_rods]
+    for outer, inner, rod in zip(alone, [*alone[1:], 0 * alone[0]], scene.all_rods, strict=True):
+        assert np.allclose(found[rod.material], outer - inner, rtol=0, atol=1e-11)  # mm, of rays of 600 mm
+    assert all(chord.max() > 3.9 for chord in alone)
+
+
+def test_crossing_rods_belong_to_the_later_one():
+    """A rod of 40 mm through a disc of 10 mm: along the horizontal central ray the disc is what the rod leaves."""
+    disc, thin = Rod(material="Ti", radius=9.0, height=10.0), Rod(material="Fe", radius=4.0, height=40.0)
+    of = Machine(geometry=msgspec.structs.replace(Machine().geometry, n_detector=(3, 3), n_views=1)).resolve(8).geometry
+    for order, chords in (((disc, thin), (10.0, 8.0)), ((thin, disc), (18.0, 0.0))):
+        found = lengths(Scene(name="own", what="own", rods=order), of)
+        assert [found[m][0, 1, 1] for m in ("Ti", "Fe")] == pytest.approx(chords, abs=1e-11)
 
 
 # --- a case whose remedy is taken out ----------------------------------------------------------------
 
 
-def case_of(name, subject):
-    (found,) = [c for c in stress.catalogue() if (c.name, c.subject) == (name, subject)]
-    return found
-
-
 def test_without_a_floor_under_the_counts_the_dark_scan_is_reported(monkeypatch):
     monkeypatch.setattr(log, "count_floor", lambda scan: 0.0)
     for subject in ("fdk", "sirt"):
-        outcome = carry_out(case_of("all-zero-counts", subject), SMALLEST)
-        assert not outcome.ok and "NOT EXPECTED" in outcome.found
+        assert "NOT EXPECTED" in str(judged(ROWS["all-zero-counts", subject]))
 
 
 def test_without_as_many_energies_as_it_takes_the_scan_is_reported(monkeypatch):
     monkeypatch.setattr(plan, "energy_rule", lambda spectrum, detector, *_: gauss_rule(spectrum, detector, 2))
-    outcome = carry_out(case_of("k-edge", "simulator"), SMALLEST)
-    assert not outcome.ok and "|ΔP|" in outcome.found and "limit" in outcome.found
+    (wrong,) = judged(ROWS["k-edge", "simulator"]).wrong
+    assert "|ΔP|" in wrong and "limit" in wrong
 
 
 def test_a_volume_that_depends_on_the_number_of_threads_is_reported(monkeypatch):
     results = iter([np.zeros(3), np.ones(3)])
     monkeypatch.setattr(stress_methods, "on_threads", lambda n, call: next(results))
     monkeypatch.setattr(stress_methods, "thread_counts", lambda: [1, 2])
-    outcome = carry_out(case_of("threads", "fdk"), SMALLEST)
-    assert not outcome.ok and "differ" in outcome.found
+    (wrong,) = judged(ROWS["threads", "fdk"]).wrong
+    assert "differ" in wrong
 
 
 # --- how rows end ------------------------------------------------------------------------------------
 
 
-def test_a_hang_a_crash_and_a_warning_are_failed_rows_and_the_rest_goes_on():
-    ends = {run.__name__: end for run, end in ENDS.items()}
-    with Worker("stress_ends", 60.0, "asked") as worker:
-        for case in catalogue("asked"):
-            worker.seconds = 1.0 if case.name == "hanging" else 60.0
-            outcome = worker.run(case, 12)
-            ok, words = ends[case.name]
-            assert outcome.ok is ok and words in outcome.found, outcome
-            assert ok or "NOT EXPECTED" in outcome.found
+def test_a_hang_a_crash_and_a_warning_are_failed_rows_and_the_rest_goes_on(tmp_path, capsys):
+    assert engine.main(Ends(), [str(tmp_path), "--short"]) == 1
+    records = {r.task.case: r.found[0] for r in Ends().store(study.Flags(results=tmp_path)).read()}
+    assert {*records} == {run.__name__ for run in ENDS}
+    for run, (ok, words) in ENDS.items():
+        outcome = records[run.__name__]
+        assert outcome.ok is ok and words.replace("12", "16") in outcome.words, outcome
+        assert ok or "NOT EXPECTED" in outcome.words
+    assert records["hanging"].status == "timeout" and "1 of 7 rows are as expected" in capsys.readouterr().out
+
+
+def test_the_process_can_have_two_threads_and_a_row_has_those_that_there_are(monkeypatch, tmp_path):
+    monkeypatch.setattr(study.host, "threads", lambda: 1)
+    given = study.Flags(results=tmp_path)
+    stress = Ends()
+    monkeypatch.setattr(Ends, "work", "stress_ends:threads")
+    with engine._Here(stress, given) as here:
+        (task,) = [t for t in stress.tasks(given) if t.case == "fine"]
+        assert here.record(task).found[0].found == "1 of 2 threads"
 
 
 def test_an_infinite_value_and_a_missing_refusal_are_found():
@@ -110,60 +153,51 @@ def test_an_infinite_value_and_a_missing_refusal_are_found():
     assert [bool(w) for w in found.wrong] == [True] * 3 and "1 of 2" in found.wrong[0]
 
 
-class Here:
-    """Carries out cases in this process, and counts them."""
+class Here(Ends):
+    """Three rows, carried out in this process and counted."""
 
-    ran = 0
+    apart, ran, code = False, 0, "code"
 
-    def __init__(self, *_):
-        pass
+    def rows(self, given):
+        return catalogue("fine", "wrong", "raising", code=Here.code)
 
-    def __enter__(self):
-        return self
+    def limit(self, task, given):
+        return None
 
-    def __exit__(self, *_):
-        pass
-
-    def run(self, case, side):
+    def measure(self, task, given):
         Here.ran += 1
-        return carry_out(case, side)
+        return judge(task, given, numba.get_num_threads())
 
 
 @pytest.fixture
-def command(monkeypatch, tmp_path):
-    monkeypatch.setattr("ctsim.benchmarks.studies.stress.worker.Worker", Here)
-    monkeypatch.setattr(stress, "catalogue", lambda *_: catalogue()[:3])
-    Here.ran = 0
-    return lambda *words: stress.main([str(tmp_path / "out"), "--short", *words])
+def command(tmp_path):
+    Here.ran, Here.code = 0, "code"
+    return lambda *words: engine.main(Here(), [str(tmp_path / "out"), "--short", *words])
 
 
-def test_the_command_says_what_is_wrong_and_runs_only_what_is_missing(command, tmp_path, capsys):
-    assert command("--dry-run") == 0 and "3 of 3 rows" in capsys.readouterr().out
-    assert not (tmp_path / "out").exists()
+def test_the_command_says_what_is_wrong_and_runs_again_what_failed(command, tmp_path, capsys):
+    assert command("--dry-run") == 0
+    assert [line.split()[:2] for line in capsys.readouterr().out.splitlines()[:3]] == [
+        ["fine", "w"], ["wrong", "w"], ["raising", "w"],
+    ]  # fmt: skip
     assert command() == 1 and Here.ran == 3
     assert "NOT AS EXPECTED: raising, test: NOT EXPECTED: ValueError" in capsys.readouterr().out
     text = (tmp_path / "out" / "stress.md").read_text(encoding="utf-8")
-    assert "1 of 3 rows are as expected" in text and "| wrong | test | w | e | NOT EXPECTED: a number nan" in text
-    with (tmp_path / "out" / "stress.jsonl").open("ab") as file:
-        file.write(b'{"identity": "torn')  # as a power cut leaves it
-    assert command() == 1 and Here.ran == 5  # what failed is tried again
+    assert "1 of 3 rows are as expected" in text and "| wrong | test | e | NOT EXPECTED: a number nan" in text
+    assert command() == 1 and Here.ran == 5
     assert command("--case", "fine") == 0 and Here.ran == 5
     assert command("--case", "fine", "--force") == 0 and Here.ran == 6
-    assert len(stress_records.read(tmp_path / "out" / "stress.jsonl")) == 6
-    with pytest.raises(InputError, match="did you mean fine"):
+    with pytest.raises(InputError, match="--case 'fina': expected one of fine, wrong, raising"):
         command("--case", "fina")
-    with pytest.raises(InputError, match="seconds must be positive"):
-        command("--seconds", "0")
-    (tmp_path / "out" / "stress.jsonl").write_bytes(b"{}\n")
-    with pytest.raises(InputError, match="line 1: expected a row"):
-        command()
+    Here.code = "other"
+    assert command() == 1 and Here.ran == 9
 
 
-def test_changed_code_or_expectations_are_run_anew():
-    case = catalogue()[0]
-    known = stress_records.identity_of(case, 12)
-    others = [dataclasses.replace(case, code="new"), dataclasses.replace(case, expected="better")]
-    assert len({known, stress_records.identity_of(case, 13), *(stress_records.identity_of(c, 12) for c in others)}) == 4
+def test_a_row_that_crashes_after_it_was_as_expected_is_shown_so(command, monkeypatch):
+    assert command("--case", "fine") == 0
+    lost = study.Outcome(ok=False, status="error", reason="the process died")
+    monkeypatch.setattr(Here, "measure", lambda self, task, given: [lost])
+    assert command("--case", "fine", "--force") == 1
 
 
 @pytest.mark.parametrize("kvp", [20.0, 33.3, 90.0, 300.0])
@@ -175,8 +209,8 @@ def test_a_scan_finds_the_table_of_its_tube(kvp):
 # --- hazards of splats that other tests do not show --------------------------------------------------
 
 
-def scan_of(*solids, side=SMALLEST, **scanner):
-    return example(Scanner(geometry=geometry(side), **scanner), in_air(solids or USUAL))
+def scan_of(*rods, side=SMALLEST, **scanner):
+    return example(Scene(name="own", what="own", rods=rods or None, scanner=Machine(**scanner)), side)
 
 
 def error(given):
@@ -203,7 +237,7 @@ def test_dead_pixels_are_left_out_by_weight_0(monkeypatch):
 
 def test_starved_rays_count_for_little(monkeypatch):
     """Iron at a thousand photons: rays behind it say nothing but noise, at unit weight as loudly as the others."""
-    given = scan_of(WATER, BONE, rod("Fe", 5.0, at=(9.0, 2.0)), i0=1e3)
+    given = scan_of("water", "bone", Rod(material="Fe", radius=5.0, at=(9.0, 2.0)), i0=1e3)
     weighted, weighed = error(given), level.weighted
 
     def unweighted(g, p, valid, *scatter):
@@ -215,7 +249,7 @@ def test_starved_rays_count_for_little(monkeypatch):
 
 def test_ssim_has_one_range_for_all_views():
     """With a range of its own a view of air and noise would weigh as much as one of iron."""
-    given = scan_of(WATER, rod("Fe", 5.0))
+    given = scan_of("water", Rod(material="Fe", radius=5.0))
     objective = Objective.of(given.scan, Settings())
     assert objective.data_range == objective.p[objective.valid].max() > 4
     noise = np.random.Generator(np.random.Philox(key=1)).normal(0, 0.01, (24, 24))
@@ -225,7 +259,7 @@ def test_ssim_has_one_range_for_all_views():
 
 def test_seeds_lie_in_the_middle_of_voxels(monkeypatch):
     """A shift by half a voxel, as R²-Gaussian's seeding has it, moves their mean off a centred object's axis."""
-    given = scan_of(WATER)
+    given = scan_of("water")
     p, _ = line_integrals(given.scan, slice(None))
     settings = Settings()
     response = settings.make_response(90.0)
@@ -247,7 +281,7 @@ def test_the_step_is_that_of_a_majoriser(monkeypatch):
     """The Hessian's own diagonal is none: a ray's splats all make up for what it lacks, each on its own."""
     monkeypatch.setattr(ordered, "LEAST_SUBSETS", 1)  # one subset of all views: plain descent
     monkeypatch.setattr(ordered, "SUBSET", 16)
-    given, move, diagonals = scan_of(WATER, side=8).scan, ordered.Fit._move, {}
+    given, move, diagonals = scan_of("water", side=8).scan, ordered.Fit._move, {}
 
     def misfit():
         return find("splat", {"passes": (6, 6), "tv": 0.0}).reconstruct(given, "cpu").details["misfit"]
@@ -281,42 +315,21 @@ def test_a_fit_begins_on_one_side_of_waters_kink(monkeypatch):
 
     monkeypatch.setattr(course.Course, "_fit", spied)
     for kvp in (60.0, 70.0, 80.0, 90.0, 100.0, 110.0):
-        find("splat", {"passes": (1, 0)}).reconstruct(scan_of(WATER, side=8, tube=Tube(kvp=kvp)).scan, "cpu")
+        find("splat", {"passes": (1, 0)}).reconstruct(scan_of("water", side=8, tube=Tube(kvp=kvp)).scan, "cpu")
     assert began == [True] * 6
 
 
-def test_the_table_is_rendered_from_the_newest_records_alone(command, tmp_path, monkeypatch, capsys):
-    with pytest.raises(InputError, match="there are no such records; run without --table first"):
-        command("--table")
-    assert not (tmp_path / "out").exists()
+# --- tables from records ------------------------------------------------------------------------------
+
+
+def test_the_table_names_rows_of_other_sources_and_shows_one_size_of_grids(command, tmp_path, capsys):
     command()
-    (tmp_path / "out" / "stress.md").rename(tmp_path / "first.md")
+    first = (tmp_path / "out" / "stress.md").read_bytes()
     capsys.readouterr()
-    assert command("--table") == 1 and Here.ran == 3 and not capsys.readouterr().err
-    assert (tmp_path / "out" / "stress.md").read_bytes() == (tmp_path / "first.md").read_bytes()
-    assert command("--table", "--case", "fine") == 0
-    # other sources change nothing of what was found, and are named
-    others = [dataclasses.replace(case, code="other") for case in catalogue()[:3]]
-    monkeypatch.setattr(stress, "catalogue", lambda *_: others)
-    capsys.readouterr()
+    assert command("--table") == 1 and not capsys.readouterr().err
+    Here.code = "other"
     assert command("--table") == 1 and Here.ran == 3
-    assert (tmp_path / "out" / "stress.md").read_bytes() == (tmp_path / "first.md").read_bytes()
+    assert (tmp_path / "out" / "stress.md").read_bytes() == first
     assert "3 of 3 rows are of other sources" in capsys.readouterr().err
-    with pytest.raises(InputError, match="no such records"):
-        stress.main([str(tmp_path / "out"), "--table"])  # of the larger grids
-
-
-def test_rows_of_other_machines_are_taken_over_and_shown(command, tmp_path, capsys):
-    command()
-    here, there = tmp_path / "out", tmp_path / "there"
-    here.rename(there)
-    capsys.readouterr()
-    with pytest.raises(InputError, match="--dry-run writes nothing"):
-        command("--collect", str(there), "--dry-run")
-    assert not here.exists()
-    assert command("--collect", str(there)) == 1 and Here.ran == 3
-    assert f"{there}: 3 records taken over" in capsys.readouterr().err
-    assert (here / "stress.md").read_bytes() == (there / "stress.md").read_bytes()
-    assert command("--case", "fine") == 0 and Here.ran == 3  # it is here now
-    with pytest.raises(InputError, match=r"there are no records, expected a folder with stress\.jsonl"):
-        command("--collect", str(tmp_path))
+    with pytest.raises(InputError, match="there are no records to show"):
+        engine.main(Here(), [str(tmp_path / "out"), "--table"])  # of the larger grids

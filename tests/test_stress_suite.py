@@ -8,14 +8,14 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from test_imports import loaded
 
 from ctsim.benchmarks.studies.stress import methods as stress_methods
-from ctsim.benchmarks.studies.stress import study as stress
-from ctsim.benchmarks.studies.stress import tables as stress_records
-from ctsim.benchmarks.studies.stress.cases import Findings, carry_out
+from ctsim.benchmarks.studies.stress import rows, study
 from ctsim.benchmarks.studies.stress.changes import Filled, Magnified, Rounded, Turned, Twice
-from ctsim.benchmarks.studies.stress.scans import BODY, USUAL, Circle, OfSide, geometry
-from ctsim.benchmarks.studies.stress.suite import Scene, load
+from ctsim.benchmarks.studies.stress.findings import Findings
+from ctsim.benchmarks.studies.stress.scans import example, other_example
+from ctsim.benchmarks.studies.stress.suite import RODS, Circle, OfSide, Scene, load
 from ctsim.errors import InputError
 
 SIDE = 8
@@ -59,14 +59,14 @@ def read(tmp_path, text):
 
 def test_what_a_scene_leaves_out_is_usual(tmp_path):
     (scene,) = read(tmp_path, HEAD)
-    assert scene.near and scene.other(SIDE) is None
-    assert scene.scanner.resolve(SIDE).geometry == geometry(SIDE) == Circle().resolve(SIDE)
-    assert geometry(SIDE).d_voxel == (7.5,) * 3 and geometry(SIDE).s_detector == (150.0, 150.0)
-    water = scene.scan(SIDE).scan
-    (named,) = read(tmp_path, HEAD + 'rods = ["water", "bone", "titanium"]')
-    assert len(USUAL) == 3 and np.array_equal(named.scan(SIDE).scan.counts, water.counts)
-    (said,) = read(tmp_path, HEAD + f'rods = [{{ material = "water", radius = {BODY} }}, "bone", "titanium"]')
-    assert np.array_equal(said.scan(SIDE).scan.counts, water.counts)
+    where = scene.scanner.resolve(SIDE).geometry
+    assert scene.near and scene.methods and other_example(scene, SIDE) is None
+    assert where == Circle().resolve(SIDE) and where.d_voxel == (7.5,) * 3 and where.s_detector == (150.0, 150.0)
+    usual = example(scene, SIDE).scan
+    assert len(RODS) == 3
+    for rods in ('"water"', '{ material = "water", radius = 24.0 }'):
+        (named,) = read(tmp_path, HEAD + f'rods = [{rods}, "bone", "titanium"]')
+        assert np.array_equal(example(named, SIDE).scan.counts, usual.counts)
 
 
 def test_counts_follow_the_side_and_pixels_the_detector():
@@ -82,13 +82,13 @@ def test_counts_follow_the_side_and_pixels_the_detector():
 def test_metal_is_what_is_known_as_metal_or_said_to_be(tmp_path):
     rods = '{ material = "Ti", radius = 9 }, { material = "Al", radius = 9, at = [20, 0], metal = true }'
     (scene,) = read(tmp_path, HEAD + f"rods = [{rods}]")
-    metal = scene.scan(SIDE).scan.metal
+    metal = example(scene, SIDE).scan.metal
     (plain,) = read(tmp_path, HEAD + f"rods = [{rods.replace('true', 'false')}]")
-    assert 0 < int(plain.scan(SIDE).scan.metal.sum()) < int(metal.sum())
+    assert 0 < int(example(plain, SIDE).scan.metal.sum()) < int(metal.sum())
 
 
 def test_a_change_is_of_the_counts_or_of_what_is_said_of_them():
-    given = Scene(name="usual", what="usual").scan(SIDE)
+    given = example(Scene(name="usual", what="usual"), SIDE)
     counts, where = given.scan.counts, given.scan.geometry
     twice = Twice().of(given).scan
     assert twice.counts.shape[0] == 2 * where.n_views and np.array_equal(twice.counts[1::2], counts)
@@ -110,7 +110,7 @@ def test_a_change_is_of_the_counts_or_of_what_is_said_of_them():
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("rod = []", "scene[0].rod: unknown key; expected one of name, what, near, rods"),
+        ("rod = []", "scene[0].rod: unknown key; expected one of name, what, near, methods, rods"),
         ("rods = []", "scene[0].rods: Expected `array` of length >= 1"),
         ('rods = ["watr"]', "scene[0].rods[0]: 'watr' is unknown; expected one of bone, titanium, water"),
         ('rods = [{ material = "Xx", radius = 1 }]', "scene[0].rods[0]: unknown material 'Xx'"),
@@ -138,7 +138,7 @@ def test_what_is_wrong_is_said_with_file_and_path(line, words, tmp_path):
 def test_names_of_other_cases_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"scene\[0\]\.name must not be 'threads', which is a case of its own"):
         read(tmp_path, HEAD.replace("own", "threads"))
-    taken = {c.name for c in stress.catalogue() if c.subject in stress_methods.TABLE} - {s.name for s in load()}
+    taken = {case for case, subject in rows.catalogue() if subject in rows.TABLE} - {s.name for s in load()}
     assert taken == {"threads", "float64"}
 
 
@@ -148,9 +148,8 @@ def test_names_of_other_cases_are_refused(tmp_path):
 def test_only_methods_that_are_like_each_other_are_held_against_the_other_form(tmp_path, own):
     text = 'change = { kind = "twice" }\nlike = { kind = "unchanged" }\nunlike = ["ordered", "sirt", "my_lab:half"]'
     (scene,) = read(tmp_path, HEAD + text)
-    others = {m.label: scene.has_other(m.name) for m in stress_methods.subjects(("fdk", "sirt", "splat", own))}
-    like = {name for name, has in others.items() if has}
-    assert like == {"fdk"} and len(others) == 3 + 1 + len(stress_methods.VARIANTS["splat"])
+    others = {name: scene.has_other(name) for name in ("fdk", "sirt", "splat", own)}
+    assert [name for name, has in others.items() if has] == ["fdk"]
 
 
 def test_methods_of_the_users_own_run_on_scenes_of_their_own(tmp_path, own, capsys):
@@ -158,48 +157,54 @@ def test_methods_of_the_users_own_run_on_scenes_of_their_own(tmp_path, own, caps
     (tmp_path / "own.toml").write_text(text, encoding="utf-8")
     out = tmp_path / "out"
     words = [str(out), "--short", "--suite", str(tmp_path / "own.toml"), "--method", own, "--method", "fdk"]
-    assert stress.main([*words, "--case", "own", "--case", "bare"]) == 1
-    found = {(r.case, r.subject): r for r in stress_records.read(out / stress_records.NAME)}
+    assert study.main([*words, "--case", "own", "--case", "bare"]) == 1
+    found = {r.task.row[1:]: r.found[0] for r in study.Stress().store(study.Flags(results=out)).read()}
     assert set(found) == {(case, subject) for case in ("own", "bare") for subject in (own, "fdk")}
     assert found["own", own].ok and found["bare", own].ok and "skipped: one view" in found["bare", own].found
     assert not found["bare", "fdk"].ok  # one view does not determine the object, which the file claims
     assert "3 of 4 rows are as expected" in capsys.readouterr().out
     with pytest.raises(InputError, match="there is no method 'fdc': did you mean fdk"):
-        stress.main([*words, "--method", "fdc"])
+        study.main([*words, "--method", "fdc"])
     with pytest.raises(InputError, match=r"nowhere\.toml: cannot be read"):
-        stress.main([str(out), "--suite", "nowhere.toml"])
+        study.main([str(out), "--suite", "nowhere.toml"])
+
+
+def test_a_scene_for_the_simulator_alone_is_none_for_methods(tmp_path):
+    (tmp_path / "own.toml").write_text(HEAD + "methods = false\n", encoding="utf-8")
+    assert {case for case, _ in rows.catalogue(tmp_path / "own.toml", ("sirt",))} == {"threads"}
 
 
 def test_the_rows_of_a_method_are_those_of_its_variants_and_of_nothing_else():
-    subjects = {c.subject for c in stress.catalogue(None, ("splat",))}
-    assert subjects == {m.label for m in stress_methods.subjects(("splat",))} and "splat[response=known]" in subjects
-    assert {c.name for c in stress.catalogue(None, ("fdk",))} > {"float64", "threads"}
+    subjects = {subject for _, subject in rows.catalogue(None, ("splat",))}
+    assert subjects == {rows.label(*m) for m in rows.subjects(("splat",))} and "splat[response=known]" in subjects
+    assert {case for case, _ in rows.catalogue(None, ("fdk",))} > {"float64", "threads"}
+    assert "float64" not in {case for case, _ in rows.catalogue(None, ("sirt",))}
 
 
 def test_the_true_mask_is_for_methods_that_declare_to_be_given_it(own):
     scene = Scene(name="own", what="own", near=False)
     for name in (own, "my_lab:given_the_mask"):
-        (method,) = stress_methods.subjects((name,))
-        stress_methods.under_stress(method, scene, SIDE, Findings())
+        stress_methods.on_scene(name, {}, scene, SIDE, Findings())
     seen = sys.modules["my_lab"].seen
     assert [scan.metal is None for scan in seen] == [True, False]
 
 
-def test_a_scene_that_says_something_else_is_run_anew(tmp_path):
-    def code(text):
-        (tmp_path / "own.toml").write_text(HEAD + text, encoding="utf-8")
-        return {c.code for c in stress_methods.cases(tmp_path / "own.toml", ("fdk",)) if c.name == "own"}
+def test_a_scene_that_says_something_else_is_run_again(tmp_path):
+    def code(n, text):
+        path = tmp_path / f"own-{n}.toml"
+        path.write_text(HEAD + text, encoding="utf-8")
+        return rows.catalogue(path, ("fdk",))["own", "fdk"].code
 
-    assert code("") == code("near = true") != code("scanner.i0 = 1e4")
+    assert code(0, "") == code(1, "near = true") != code(2, "scanner.i0 = 1e4")
 
 
 def test_the_example_in_the_docs_is_read_and_runs(tmp_path):
     page = (Path(__file__).parents[1] / "docs" / "stability.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"^    \[\[scene\]\]\n(?:    .*\n|\n)*", page, re.M)
-    (tmp_path / "own.toml").write_text(re.sub(r"^    ", "", text, flags=re.M), encoding="utf-8")
-    for case in stress_methods.cases(tmp_path / "own.toml", ("fdk",)):
-        outcome = carry_out(case, 12)
-        assert outcome.ok, outcome.found
+    for scene in read(tmp_path, re.sub(r"^    ", "", text, flags=re.M)):
+        found = Findings()
+        stress_methods.on_scene("fdk", {}, scene, 12, found)
+        assert found.said and not found.wrong, str(found)
 
 
 def test_the_page_names_every_key():
@@ -207,3 +212,7 @@ def test_the_page_names_every_key():
     for kind in (Scene, Circle):
         for key in msgspec.structs.fields(kind):
             assert f"`{key.name}`" in page, key.name
+
+
+def test_the_rows_are_listed_without_torch():
+    assert "torch" not in loaded("from ctsim.benchmarks.studies.stress.rows import catalogue\ncatalogue()")

@@ -1,16 +1,12 @@
-"""Stress cases of the splat kernels: odd splats beside a fair one, which they must neither spoil nor move.
+"""Stress rows of the splat kernels: odd splats together with a fair one, which they must neither spoil nor move."""
 
-Limits: a projection is within 1e-5 of its peak of the float64 reference, a voxel within 1e-5 of the greatest one, the
-response within 2e-6 of its value.
-"""
-
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.benchmarks.methods import code_version
-from ctsim.benchmarks.studies.stress.cases import SPLATS, Case, Findings
+from ctsim.benchmarks.studies.stress.findings import Findings
+from ctsim.benchmarks.studies.stress.limits import PROJECTED, RESPONDED, VOXELISED
 from ctsim.benchmarks.studies.stress.scans import on_threads, thread_counts
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.splat.densify import Schedule, densify
@@ -20,7 +16,6 @@ from ctsim.reconstruct.splat.project import Projector
 from ctsim.reconstruct.splat.response import evaluate, make_response
 from ctsim.reconstruct.splat.volume import voxelise
 
-PROJECTED, VOXELISED, RESPONDED = 1e-5, 1e-5, 2e-6
 CUTOFF = 6.0  # beyond it lies 2e-8 of a peak, so that it does not matter which pixels a cutoff takes in
 GEOMETRY = Geometry(
     dso=100.0,
@@ -61,7 +56,7 @@ def _arrays(given: Splats) -> Arrays:
 
 
 def _near_float64(found: Findings, given: Splats) -> None:
-    """Hold projections, exact and EWA, and the volume against the float64 reference."""
+    """Compare projections, exact and EWA, and the volume with the float64 reference."""
     shapes, values = given.shapes(), given.densities
     for tolerance in (0.0, np.inf):
         seen = Projector(geometry=GEOMETRY, tolerance=tolerance, cutoff=CUTOFF)
@@ -123,9 +118,9 @@ def sub_pixel(_: int, found: Findings) -> None:
 
 
 def behind(_: int, found: Findings) -> None:
-    """Put splats behind, at and beside the source of a view."""
+    """Put splats behind, at and next to the source of a view."""
     source = GEOMETRY.pose(0)[:3]
-    one = {"behind the source": 2 * source, "at the source": source, "beside it": source + np.array([0.0, 0.0, 5.0])}
+    one = {"behind the source": 2 * source, "at the source": source, "next to it": source + np.array([0.0, 0.0, 5.0])}
     view = Projector(geometry=GEOMETRY)
     for what, place in one.items():
         odd = splat(place.tolist(), [2, 2, 2])
@@ -189,7 +184,7 @@ def many(n: int) -> Splats:
 
 
 def beside_float64(side: int, found: Findings) -> None:
-    """Hold sums over many splats against float64: no more than a few meet in a pixel."""
+    """Compare sums over many splats with float64: no more than a few meet in a pixel."""
     _near_float64(found, many(min(side, 8)))
 
 
@@ -217,26 +212,3 @@ def same_bits(side: int, found: Findings) -> None:
     images = [view.forward(shapes, given.densities, [k])[0] for k in range(3)]
     again = view.forward(shapes, given.densities, order)
     found.same("views alone and in another order are", np.stack([images[k] for k in order]), again)
-
-
-ODD = "finite, and the other splats keep their bits"
-CASES: dict[str, tuple[str, str, Callable[[int, Findings], None]]] = {
-    "needles": ("needles and discs of 20000:1", f"within {PROJECTED:g} of float64's peak; finite gradient", needles),
-    "sub-pixel": ("splats far smaller than a pixel", f"within {PROJECTED:g} of float64's peak", sub_pixel),
-    "behind-source": ("splats behind, at and beside the source", f"{ODD}; not seen in that view", behind),
-    "outside": ("splats that no ray meets", f"{ODD}; not seen", outside),
-    "empty-set": ("no splats", "zeros of the right shapes", empty),
-    "nan-seed": ("a splat of NaN or infinity", f"{ODD}; not seen, and dropped", not_finite),
-    "opaque": ("the response behind path values up to 1e4", f"within {RESPONDED:g} of float64", opaque),
-    "float64": ("many splats of all shapes", f"within {PROJECTED:g} of float64's peak", beside_float64),
-    "threads": ("1, 2 and all threads; views in another order", "equal to the last bit", same_bits),
-}
-
-
-def cases() -> list[Case]:
-    """Return the cases of the splat kernels."""
-    code = code_version(__name__)
-    return [
-        Case(name=name, subject=SPLATS, what=what, expected=expected, run=run, code=code)
-        for name, (what, expected, run) in CASES.items()
-    ]

@@ -1,34 +1,54 @@
-"""`run-benchmark stress OUT`: what is hard on the numbers, each case with an expected outcome.
+"""`run-benchmark stress OUT`: what is hard on the numbers, each case with an expected outcome."""
 
-Rows go to OUT/stress.jsonl as they end, the table to OUT/stress.md. A row that was as expected is not run again while
-its sources stay as they are.
-"""
-
-import dataclasses
-import difflib
+import pkgutil
 import sys
-from collections.abc import Sequence
-from datetime import UTC, datetime
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import tyro
 
+from ctsim.benchmarks.engine import host, study
+from ctsim.benchmarks.engine.record import Found, Record, Task, latest
+from ctsim.benchmarks.engine.table import Table, simple
 from ctsim.errors import InputError
+from ctsim.human import human_choice
 
-if TYPE_CHECKING:
-    from ctsim.benchmarks.studies.stress.cases import Case
-    from ctsim.benchmarks.studies.stress.tables import StressRecord
-
-# estimates of a row on one idle core, short and full, from runs beside other work
+CATALOGUE = "ctsim.benchmarks.studies.stress.rows:catalogue"
+FULL, SHORT = 24, 16  # voxels along a side
+# seconds of a row on one idle core, short and full, from runs on a busy machine
 SECONDS = {"simulator": (0.3, 0.6), "splat kernels": (0.1, 0.1)}
 SECONDS_OF_METHOD = (0.2, 0.5)
-CATALOGUE = "ctsim.benchmarks.studies.stress.study"
-"""The module whose `catalogue` the process that carries out the cases asks, with suite and methods."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Arguments:
+class Outcome(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How a row ended: `found` says in words what was found; the seconds are those of "row"."""
+
+    found: str = ""
+
+    @property
+    def words(self) -> str:
+        """What was found, or how the row ended that found nothing."""
+        return self.found or f"NOT EXPECTED: {self.reason}"
+
+    @property
+    def took(self) -> float:
+        """The seconds that it took, 0 where it did not end."""
+        return sum(self.seconds.get("row", ()))
+
+
+class StressRecord(Record[Outcome], frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The record of a row: one outcome."""
+
+    @property
+    def finished(self) -> bool:
+        """Always true: that a row crashes or does not end is a finding, too, and the last one counts."""
+        return True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flags(study.Options):
     """Put simulator, methods and splat kernels under numerical stress; exit code 1 if anything is not as expected.
 
     A row fails where it misses its oracle, is not finite, raises, warns, crashes or does not end.
@@ -45,126 +65,131 @@ class Arguments:
     method: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
     """Only the rows of this method, such as fdk, or of module:function of your own; may be given several times
     (default: all methods, simulator and splat kernels)."""
-    seconds: float = 120.0
-    """Time limit of one row, compilation included."""
-    force: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Run again what was as expected."""
-    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
-    """List the rows and what they are expected to cost, running nothing."""
-    table: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Only render the table from the newest record of each row, running nothing."""
-    collect: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="OTHER [OTHER ...]")] = ()
-    """Take over what these results folders of other machines have and RESULTS lacks, then only render the table."""
+    seconds: float | None = 120.0
+    """Time limit of one row, compilation and the start of its process included."""
 
 
-def main(argv: list[str]) -> int:
-    """Run the command; 0 if every row is as expected, 1 if one is not."""
-    from ctsim.benchmarks.engine.limited import refuse_unless_positive
+class Stress(study.Study[Outcome, Flags]):
+    """The study."""
 
-    given = tyro.cli(Arguments, prog="run-benchmark stress", args=argv)
-    refuse_unless_positive(given.seconds)
-    from ctsim.benchmarks.engine import lines
-    from ctsim.benchmarks.studies.stress import tables as stress_records
-    from ctsim.benchmarks.studies.stress.cases import FULL, SHORT
+    name = file = "stress"
+    unit = "row"
+    kind, record, flags = Outcome, StressRecord, Flags
+    work = "ctsim.benchmarks.studies.stress.worker:judge"
+    apart = True
+    estimate = "on one idle core, without compiling (a minute)"
 
-    side = SHORT if given.short else FULL
-    cases = _chosen(catalogue(given.suite, given.method), given.case)
-    wanted = [stress_records.identity_of(c, side) for c in cases]
-    path = given.results / stress_records.NAME
-    lines.take_over(path, given.collect, stress_records.StressRecord, stress_records.A_ROW, dry_run=given.dry_run)
-    stored = stress_records.read(path)
-    found = stress_records.latest(stored, wanted)
-    done = set() if given.force else {r.identity for r in found if r.ok}
-    left = [c for c, identity in zip(cases, wanted, strict=True) if identity not in done]
-    if given.dry_run:
-        _list(left, len(cases), short=given.short)
-        return 0
-    if given.table or given.collect:
-        shown = stress_records.newest(stored, [(c.name, c.subject) for c in cases], side)
-        if old := sum(r.identity not in wanted for r in shown):
+    def __init__(self) -> None:
+        self.threads = host.threads()  # a row has them; the process can have two, to compare them with one
+
+    def environment(self, given: Flags) -> Mapping[str, str]:
+        """Let the process have two threads at least."""
+        return {"NUMBA_NUM_THREADS": str(max(2, self.threads))}
+
+    def measure(self, task: Task, given: Flags) -> Sequence[Outcome]:
+        """Judge a row on the threads that there are."""
+        return pkgutil.resolve_name(self.work)(task, given, self.threads)
+
+    def check(self, given: Flags) -> None:
+        """Refuse names of cases that are none."""
+        known = list(dict.fromkeys(case for case, _ in self.rows(given)))
+        for name in given.case:
+            if name not in known:
+                raise InputError(f"--case {name!r}: expected one of {human_choice(known, name)}")
+
+    def rows(self, given: Flags) -> dict[tuple[str, str], Any]:
+        """Return the rows by (case, subject); what lists them is loaded here, so that --help does without."""
+        return pkgutil.resolve_name(CATALOGUE)(given.suite, given.method)
+
+    def tasks(self, given: Flags) -> list[Task]:
+        """Return a task for each row."""
+        side = SHORT if given.short else FULL
+        rows = [row for row in self.rows(given).values() if not given.case or row.case in given.case]
+        return [
+            Task(
+                study=self.name, part=part(given), case=row.case, subject=row.subject, code=row.code, place=(place,),
+                settings={"side": side, "expected": row.expected}, hints={"what": row.what},
+            )
+            for place, row in enumerate(rows)
+        ]  # fmt: skip
+
+    def shows(self, task: Task, given: Flags) -> bool:
+        """Whether a row is among those that were asked for."""
+        asked = not given.case or task.case in given.case
+        return asked and task.part == part(given) and (task.case, task.subject) in self.rows(given)
+
+    def pending(self, tasks: Sequence[Task], records: Sequence[Record[Outcome]], given: Flags) -> list[Task]:
+        """Return the rows that were not as expected when they last ran, or never ran."""
+        last = {} if given.force else {r.task.identity: r.found[0].ok for r in records}
+        return [task for task in tasks if not last.get(task.identity)]
+
+    def expected(self, task: Task, given: Flags) -> float:
+        """Return the seconds that rows of a subject take."""
+        return SECONDS.get(task.subject, SECONDS_OF_METHOD)[0 if given.short else 1]
+
+    def took(self, record: Record[Outcome], given: Flags) -> float | None:
+        """Return the seconds that the row took, if it ended."""
+        return record.found[0].took or None
+
+    def line(self, task: Task) -> tuple[str, str]:
+        """Return a line for each case."""
+        return task.case, task.hints["what"]
+
+    def tables(self, records: Sequence[Record[Outcome]], given: Flags) -> list[Table]:
+        """Return what is not as expected, the cases, and every row."""
+        wrong = [r for r in records if not r.found[0].ok]
+        side = records[0].task.settings["side"]
+        caption = f"{side} voxels a side; {_how_many(records)}; {_seconds(records):.0f} s in all."
+        rows = [[r.task.case, r.task.subject, r.found[0].words] for r in wrong]
+        named = [simple(["case", "subject", "found"], rows, title="Not as expected", caption=caption)] * bool(wrong)
+        return [*named, by_case(records, "" if wrong else caption), _every_row(records)]
+
+    def write(self, records: Sequence[Record[Outcome]], given: Flags) -> str:
+        """Write the tables; return what is not as expected. Warns of rows that other sources gave."""
+        super().write(records, given)
+        shown, path = latest(records), self.folder(given) / f"{self.file}.md"
+        here = {task.identity for task in self.tasks(given)}
+        if old := sum(r.task.identity not in here for r in shown):
             sys.stderr.write(f"{path}: {old} of {len(shown)} rows are of other sources than those that are here\n")
-        return _report(shown, given)
-    given.results.mkdir(parents=True, exist_ok=True)
-    _work(left, side, given)
-    return _report(stress_records.latest(stress_records.read(path), wanted), given)
+        wrong = (r for r in shown if not r.found[0].ok)
+        named = "".join(f"NOT AS EXPECTED: {r.task.case}, {r.task.subject}: {r.found[0].words}\n" for r in wrong)
+        return f"{named}{_how_many(shown)}. Written: {path}\n"
 
 
-def catalogue(suite: Path | None = None, methods: tuple[str, ...] = ()) -> "list[Case]":
-    """Return all cases, those of methods with the scenes of a file; only those of `methods` where any are named.
-
-    Raises InputError for a file that is wrong and a method that does not exist.
-    """
-    from ctsim.benchmarks.studies.stress import chain as stress_chain
-    from ctsim.benchmarks.studies.stress import methods as stress_methods
-    from ctsim.benchmarks.studies.stress import simulator as stress_simulator
-    from ctsim.benchmarks.studies.stress import splats as stress_splats
-
-    own, of_methods = stress_simulator.cases() + stress_splats.cases(), stress_methods.cases(suite, methods)
-    subjects = {c.subject for c in of_methods}
-    chain = [c for c in stress_chain.cases() if c.subject in subjects]
-    return chain + of_methods if methods else own + chain + of_methods
+def part(given: Flags) -> str:
+    """Return the name of the grids' size."""
+    return "short" if given.short else "full"
 
 
-def _chosen(cases: "list[Case]", names: Sequence[str]) -> "list[Case]":
-    known = list(dict.fromkeys(c.name for c in cases))
-    for name in names:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=3)
-            hint = f"did you mean {' or '.join(near)}?" if near else f"expected one of {', '.join(known)}"
-            raise InputError(f"--case {name!r}: {hint}")
-    return [c for c in cases if not names or c.name in names]
+def by_case(records: Sequence[Record[Outcome]], caption: str = "") -> Table:
+    """Return a table of the cases, with how many of their rows are as expected."""
+    cases: dict[str, list[Record[Outcome]]] = {}
+    for record in records:
+        cases.setdefault(record.task.case, []).append(record)
+    rows = [
+        [name, rows[-1].task.hints["what"], len(rows), sum(r.found[0].ok for r in rows), f"{_seconds(rows):.1f}"]
+        for name, rows in cases.items()
+    ]
+    numbers = ("rows", "as expected", "s")
+    return simple(["case", "what", *numbers], rows, numbers=numbers, title="Cases", caption=caption)
 
 
-def _work(left: "list[Case]", side: int, given: Arguments) -> None:
-    """Carry out the rows that are left; each is stored as it ends."""
-    from tqdm import tqdm
-
-    from ctsim.benchmarks.engine import host, lines
-    from ctsim.benchmarks.studies.stress import tables as stress_records
-    from ctsim.benchmarks.studies.stress.worker import Worker
-
-    commit, machine = host.commit(), host.host()  # of the code that is loaded, whatever is committed meanwhile
-    asked = (given.suite, given.method)
-    with Worker(CATALOGUE, given.seconds, *asked) as worker, tqdm(left, unit="row", disable=not left) as bar:
-        for case in bar:
-            bar.set_postfix_str(f"{case.name}, {case.subject}")
-            outcome = worker.run(case, side)
-            by = (machine, commit, datetime.now(UTC).isoformat(timespec="seconds"))
-            lines.append(given.results / stress_records.NAME, stress_records.record_of(case, side, outcome, by))
-            if not outcome.ok:
-                tqdm.write(f"{case.name}, {case.subject}: {outcome.found}", file=sys.stderr)
+def _every_row(records: Sequence[Record[Outcome]]) -> Table:
+    rows = [
+        [r.task.case, r.task.subject, r.task.settings["expected"], r.found[0].words, "yes" if r.found[0].ok else "NO"]
+        for r in records
+    ]
+    return simple(["case", "subject", "expected", "found", "ok"], rows, title="Rows")
 
 
-def _report(found: "list[StressRecord]", given: Arguments) -> int:
-    """Write the table and say what is not as expected; return the exit code."""
-    from ctsim.benchmarks.studies.stress import tables as stress_records
-
-    path = given.results / stress_records.TABLE_NAME
-    if not found:
-        raise InputError(f"{path.with_name(stress_records.NAME)}: there are no such records; run without --table first")
-    path.write_text(stress_records.render(found), encoding="utf-8")
-    wrong = [r for r in found if not r.ok]
-    for r in wrong:
-        sys.stdout.write(f"NOT AS EXPECTED: {r.case}, {r.subject}: {r.found}\n")
-    sys.stdout.write(f"{len(found) - len(wrong)} of {len(found)} rows are as expected. Written: {path}\n")
-    return 1 if wrong else 0
+def _seconds(records: Sequence[Record[Outcome]]) -> float:
+    return sum(r.found[0].took for r in records)
 
 
-def _list(left: "list[Case]", n_all: int, *, short: bool) -> None:
-    """Print the rows that would run, case by case, and their cost."""
-    by_case: dict[str, list[Case]] = {}
-    for case in left:
-        by_case.setdefault(case.name, []).append(case)
-    for name, rows in by_case.items():
-        seconds = _cost(rows, short=short)
-        subjects = ", ".join(c.subject for c in rows)
-        sys.stdout.write(f"{name:20s} {len(rows):3d} rows {seconds:6.1f} s  {rows[-1].what}: {subjects}\n")
-    total = _cost(left, short=short)
-    sys.stdout.write(
-        f"{len(left)} of {n_all} rows to run, about {total:.0f} s on one idle core; compiling takes a minute, once\n"
-    )
+def _how_many(records: Sequence[Record[Outcome]]) -> str:
+    return f"{sum(r.found[0].ok for r in records)} of {len(records)} rows are as expected"
 
 
-def _cost(rows: "list[Case]", *, short: bool) -> float:
-    """Return the seconds that rows took on one idle core, compilation apart."""
-    return sum(SECONDS.get(c.subject, SECONDS_OF_METHOD)[0 if short else 1] for c in rows)
+def main(arguments: list[str]) -> int:
+    """Run the command; 0 if every row is as expected, 1 if one is not."""
+    return study.main(Stress(), arguments)
