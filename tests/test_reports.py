@@ -18,11 +18,12 @@ import pytest
 from PIL import Image
 
 from ctsim.benchmarks import cli, make_dataset
-from ctsim.benchmarks.engine import host, lines
+from ctsim.benchmarks.engine import host
+from ctsim.benchmarks.engine.record import Task
 from ctsim.benchmarks.studies.methods import study as cli_run
 from ctsim.benchmarks.studies.methods import tables
 from ctsim.benchmarks.studies.methods.volumes import at_50kev_of, write_volume
-from ctsim.benchmarks.studies.stress import tables as stress_records
+from ctsim.benchmarks.studies.stress import study as stress
 from ctsim.errors import InputError
 from ctsim.reports import figures, kept, markdown, report, slices, view
 
@@ -458,13 +459,15 @@ def test_a_notebook_runs_as_a_script(name, n_figures, words, quick, tmp_path):
 
 
 def test_the_stability_notebook_shows_what_the_stress_suite_recorded(smallest, tmp_path):
-    common = {"what": "no photons", "expected": "finite", "side": 16, "seconds": 0.5, "time": "2026-01-01T00:00:00"}
+    store = stress.Stress().store(stress.Flags(results=tmp_path))
     for ok, found in ((False, "an older row"), (True, "finite"), (False, "3 values are not finite")):
-        record = stress_records.StressRecord(
-            identity=found, case="starved", subject="fdk" if "older" in found or ok else "nmar", ok=ok, found=found,
-            host=host.host(), commit="0" * 40, **common,
+        task = Task(
+            study="stress", part="short", case="starved", subject="fdk" if "older" in found or ok else "nmar",
+            settings={"side": 16, "expected": "finite"}, hints={"what": "no photons"},
         )  # fmt: skip
-        lines.append(tmp_path / stress_records.NAME, record)
+        outcome = stress.Outcome(ok=ok, found=found, seconds={"row": (0.5,)})
+        time = "2026-01-01T00:00:00"
+        store.append([stress.StressRecord(task=task, found=(outcome,), host=host.host(), commit="0" * 40, time=time)])
     said = notebook("stability", smallest, tmp_path, tmp_path)
     assert "1 of 2 rows are as expected" in said and "- starved, nmar: 3 values are not finite" in said
     assert "older" not in said and (tmp_path / "stability-stress.png").exists()

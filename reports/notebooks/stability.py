@@ -26,8 +26,9 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
+from ctsim.benchmarks.engine.record import latest
 from ctsim.benchmarks.engine.texts import pictured
-from ctsim.benchmarks.studies.stress import tables as stress_records
+from ctsim.benchmarks.studies.stress.study import Flags, Stress, by_case
 from ctsim.detector import Detector
 from ctsim.geometry import Geometry
 from ctsim.kernels import joseph_reference
@@ -123,18 +124,17 @@ show.text(f"Threads {', '.join(map(str, volumes))}: {'bitwise equal' if same els
 # it ended as expected. What did not is named with what was found.
 
 # %%
-last = {(r.case, r.subject, r.side): r for r in stress_records.read(RESULTS / stress_records.NAME)}
-rows = list(last.values())
+rows = latest(Stress().store(Flags(results=RESULTS)).read())
 if rows:
-    wrong = [r for r in rows if not r.ok]
-    named = "".join(f"- {r.case}, {r.subject}: {r.found}\n" for r in wrong)
+    wrong = [r for r in rows if not r.found[0].ok]
+    named = "".join(f"- {r.task.case}, {r.task.subject}: {r.found[0].words}\n" for r in wrong)
     show.text(f"{len(rows) - len(wrong)} of {len(rows)} rows are as expected.\n\n{named}")
-    show.text("\n".join(stress_records.by_case(rows)))
-    cases, subjects = (list(dict.fromkeys(getattr(r, name) for r in rows)) for name in ("case", "subject"))
+    show.text(by_case(rows).markdown())
+    cases, subjects = (list(dict.fromkeys(getattr(r.task, name) for r in rows)) for name in ("case", "subject"))
     drawing = Figure(figsize=(2.5 + 0.3 * len(subjects), 1.8 + 0.22 * len(cases)), layout="constrained")
     axes = drawing.subplots()
     for ok, colour in ((True, COLOURS[0]), (False, COLOURS[5])):
-        at = [(subjects.index(r.subject), cases.index(r.case)) for r in rows if r.ok == ok]
+        at = [(subjects.index(r.task.subject), cases.index(r.task.case)) for r in rows if r.found[0].ok == ok]
         axes.scatter([x for x, _ in at], [y for _, y in at], s=28, marker="s", color=colour)
     axes.set_xticks(range(len(subjects)), labels=[pictured(s) for s in subjects], rotation=90, fontsize=8)
     axes.set_yticks(range(len(cases)), labels=[pictured(c) for c in cases], fontsize=8)
