@@ -280,7 +280,8 @@ def _follow(study: Study[F, G], store: Store[F], given: G) -> None:
 
 
 def _status(record: Record[Any]) -> str:
-    return next((one.status for one in record.found if one.status != OK), OK)
+    good = OK if all(one.ok for one in record.found) else "not as expected"
+    return next((one.status for one in record.found if one.status != OK), good)
 
 
 def _records(

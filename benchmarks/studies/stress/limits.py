@@ -1,5 +1,6 @@
 """What the rows of the stress suite are allowed, and which methods have something in common. Loads nothing."""
 
+FULL, SHORT = 24, 16  # voxels along a side
 P_SURE = 1.2e-4  # |ΔP|: 1e-4 of the energies where P ≤ 14.6, a tenth more between the paths tried, float32's 1e-5
 CLAMP = 81.0  # of P: exponents end at 80, and the weight of one node
 MASS = 0.01  # of a rod on the grid: 1/250 of every voxel that its surface crosses, of 216 cm³ for its 94 at worst

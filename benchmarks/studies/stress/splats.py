@@ -46,13 +46,7 @@ def joined(one: Splats, other: Splats) -> Splats:
 
 
 def _arrays(given: Splats) -> Arrays:
-    assert given.rotations is not None
-    return {
-        "positions": given.positions,
-        "scales": given.scales,
-        "densities": given.densities,
-        "rotations": given.rotations,
-    }
+    return {name: getattr(given, name) for name in ("positions", "scales", "densities", "rotations")}
 
 
 def _near_float64(found: Findings, given: Splats) -> None:
@@ -68,10 +62,8 @@ def _near_float64(found: Findings, given: Splats) -> None:
         off = np.abs(images - exact.reshape(images.shape))[..., : GEOMETRY.n_detector[1]].max()
         found.at_most(f"{'EWA' if tolerance else 'exact'} off by, of the peak", float(off) / peak, PROJECTED)
     grid = np.array([*GEOMETRY.d_voxel, *(axis[0] for axis in GEOMETRY.voxel_centres()), CUTOFF, 1 / 12])
-    volume, true = (
-        voxelise(given, GEOMETRY, cutoff=CUTOFF),
-        splat_reference.voxelise(shapes, values, grid, GEOMETRY.n_voxel),
-    )
+    volume = voxelise(given, GEOMETRY, cutoff=CUTOFF)
+    true = splat_reference.voxelise(shapes, values, grid, GEOMETRY.n_voxel)
     # of what the splat would be in the middle of a voxel: a thin one between voxel centres is next to nothing
     greatest = max(float(true.max()), float(np.prod(given.scales[0] / (given.scales[0] + 1))))
     found.at_most("volume off by, of the greatest", float(np.abs(volume - true).max()) / greatest, VOXELISED)
@@ -91,10 +83,8 @@ def _beside_fair(found: Findings, what: str, odd: Splats, *, seen: bool) -> None
     volume, volume_alone = (voxelise(s, GEOMETRY) for s in (both, FAIR))
     for name, values in (("images", image), ("the volume", volume)):
         found.finite(f"{what}: {name}", values)
-    sums = projector.adjoint(both.shapes(), np.ones_like(image))
-    found.same(
-        f"{what}: the other's sums alone and together are", sums[1:], projector.adjoint(FAIR.shapes(), 0 * image + 1)
-    )
+    sums, sums_alone = (projector.adjoint(s.shapes(), np.ones_like(image)) for s in (both, FAIR))
+    found.same(f"{what}: the other's sums alone and together are", sums[1:], sums_alone)
     if not seen:
         found.same(f"{what}: the images without and with it are", alone, image)
         found.say(f"{what}: no sums", holds=not sums[0].any())
@@ -195,14 +185,9 @@ def same_bits(side: int, found: Findings) -> None:
 
     def everything() -> NDArray[np.float32]:
         images = view.forward(shapes, given.densities)
-        parts = (
-            images,
-            view.forward(shapes, given.densities, [1]),
-            view.adjoint(shapes, images),
-            voxelise(given, GEOMETRY),
-        )
-        gradient = view.gradient(given, images[0], 0)
-        return np.concatenate([p.ravel() for p in (*parts, gradient.positions, gradient.log_scales)])
+        one, gradient = view.forward(shapes, given.densities, [1]), view.gradient(given, images[0], 0)
+        parts = (images, one, view.adjoint(shapes, images), voxelise(given, GEOMETRY), gradient.positions)
+        return np.concatenate([p.ravel() for p in (*parts, gradient.log_scales)])
 
     first, *others = thread_counts()
     bits = on_threads(first, everything)

@@ -12,11 +12,11 @@ import tyro
 from ctsim.benchmarks.engine import host, study
 from ctsim.benchmarks.engine.record import Found, Record, Task, latest
 from ctsim.benchmarks.engine.table import Table, simple
+from ctsim.benchmarks.studies.stress.limits import FULL, SHORT
 from ctsim.errors import InputError
 from ctsim.human import human_choice
 
 CATALOGUE = "ctsim.benchmarks.studies.stress.rows:catalogue"
-FULL, SHORT = 24, 16  # voxels along a side
 # seconds of a row on one idle core, short and full, from runs on a busy machine
 SECONDS = {"simulator": (0.3, 0.6), "splat kernels": (0.1, 0.1)}
 SECONDS_OF_METHOD = (0.2, 0.5)

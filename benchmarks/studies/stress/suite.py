@@ -14,7 +14,7 @@ import numpy as np
 
 from ctsim.benchmarks.methods import TABLE
 from ctsim.benchmarks.studies.stress.changes import AnyChange, Filled, Positive, Twice, Unchanged
-from ctsim.benchmarks.studies.stress.limits import GROUPS
+from ctsim.benchmarks.studies.stress.limits import FULL, GROUPS, SHORT
 from ctsim.detector import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Count, Geometry, Pair, Triple
@@ -27,7 +27,6 @@ from ctsim.solids import Solid
 from ctsim.spectrum import Tube
 from ctsim.types import Phantom, Scanner
 
-FULL, SHORT = 24, 16  # voxels along a side
 METALS = ("Ti", "Fe", "Sn", "W", "Au")
 TAKEN = ("threads", "float64")  # names of cases of methods that are no scenes
 AIR = np.zeros((2, 2, 2), np.uint8)
@@ -75,19 +74,15 @@ class Circle(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         (z, y, x), (v, u) = rest[:3], rest[3:]
         high, wide = self.detector_mm
         crowded = self.start_deg + self.arc_deg * (np.arange(n_views) / n_views) ** self.crowding
+        alike = ("dso", "dsd", "off_origin", "off_detector", "start_deg", "arc_deg")
         return Geometry(
-            dso=self.dso,
-            dsd=self.dsd,
             n_voxel=(z, y, x),
             d_voxel=(self.field_mm / z, self.field_mm / y, self.field_mm / x),
             n_detector=(v, u),
             d_detector=(high / v, wide / u),
             n_views=n_views,
-            off_origin=self.off_origin,
-            off_detector=self.off_detector,
-            start_deg=self.start_deg,
-            arc_deg=self.arc_deg,
             angles_deg=None if self.crowding == 1 else tuple(crowded.tolist()),
+            **{name: getattr(self, name) for name in alike},
         )
 
 
@@ -139,13 +134,9 @@ class Block(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     def phantom(self) -> Phantom:
         """Return the block as it is simulated, with a map of its density or without one."""
-        n = 8
-        return Phantom(
-            labels=np.ones((n, n, n), np.uint8),
-            materials=("air", "water"),
-            d_voxel=(self.edge / n, self.edge / n, self.edge / n),
-            density=None if self.density is None else np.full((n, n, n), self.density, np.float32),
-        )
+        labels, d = np.ones((8, 8, 8), np.uint8), self.edge / 8
+        density = None if self.density is None else np.full(labels.shape, self.density, np.float32)
+        return Phantom(labels=labels, materials=("air", "water"), d_voxel=(d, d, d), density=density)
 
 
 class Machine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
