@@ -78,3 +78,9 @@ class Ends(Stress):
 
     def limit(self, task, given):
         return 1.0 if task.case == "hanging" else given.seconds
+
+
+class Threads(Ends):
+    """The command on rows that say how many threads they have."""
+
+    work = "stress_ends:threads"

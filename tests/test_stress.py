@@ -9,7 +9,7 @@ import msgspec
 import numba
 import numpy as np
 import pytest
-from stress_ends import ENDS, Ends, catalogue, judge
+from stress_ends import ENDS, Ends, Threads, catalogue, judge
 
 from ctsim import plan
 from ctsim.baselines.known_spectrum import Beam
@@ -84,9 +84,10 @@ def test_rods_that_lie_in_each_other_share_the_rays_by_paint_order():
     of = few_views(scene, SMALLEST).geometry
     found = lengths(scene, of)
     alone = [np.stack([upright_chord(of, view, rod.solid()) for view in range(of.n_views)]) for rod in scene.all_rods]
+    # the discriminant is off by a few roundings of (250 mm)², 6e-11 mm², so its root, here 0.5 mm and more, by as much
     for outer, inner, rod in zip(alone, [*alone[1:], 0 * alone[0]], scene.all_rods, strict=True):
-        assert np.allclose(found[rod.material], outer - inner, rtol=0, atol=1e-11)  # mm, of rays of 600 mm
-    assert all(chord.max() > 3.9 for chord in alone)
+        assert np.allclose(found[rod.material], outer - inner, rtol=0, atol=1e-9), rod.material
+    assert all(chord.max() > 1 for chord in alone)
 
 
 def test_crossing_rods_belong_to_the_later_one():
@@ -95,7 +96,7 @@ def test_crossing_rods_belong_to_the_later_one():
     of = Machine(geometry=msgspec.structs.replace(Machine().geometry, n_detector=(3, 3), n_views=1)).resolve(8).geometry
     for order, chords in (((disc, thin), (10.0, 8.0)), ((thin, disc), (18.0, 0.0))):
         found = lengths(Scene(name="own", what="own", rods=order), of)
-        assert [found[m][0, 1, 1] for m in ("Ti", "Fe")] == pytest.approx(chords, abs=1e-11)
+        assert [found[m][0, 1, 1] for m in ("Ti", "Fe")] == pytest.approx(chords, abs=1e-9)
 
 
 # --- a case whose remedy is taken out ----------------------------------------------------------------
@@ -138,8 +139,7 @@ def test_a_hang_a_crash_and_a_warning_are_failed_rows_and_the_rest_goes_on(tmp_p
 def test_the_process_can_have_two_threads_and_a_row_has_those_that_there_are(monkeypatch, tmp_path):
     monkeypatch.setattr(study.host, "threads", lambda: 1)
     given = study.Flags(results=tmp_path)
-    stress = Ends()
-    monkeypatch.setattr(Ends, "work", "stress_ends:threads")
+    stress = Threads()
     with engine._Here(stress, given) as here:
         (task,) = [t for t in stress.tasks(given) if t.case == "fine"]
         assert here.record(task).found[0].found == "1 of 2 threads"
@@ -156,10 +156,10 @@ def test_an_infinite_value_and_a_missing_refusal_are_found():
 class Here(Ends):
     """Three rows, carried out in this process and counted."""
 
-    apart, ran, code = False, 0, "code"
+    apart, ran, sources = False, 0, "these"
 
     def rows(self, given):
-        return catalogue("fine", "wrong", "raising", code=Here.code)
+        return catalogue("fine", "wrong", "raising", code=Here.sources)
 
     def limit(self, task, given):
         return None
@@ -171,7 +171,7 @@ class Here(Ends):
 
 @pytest.fixture
 def command(tmp_path):
-    Here.ran, Here.code = 0, "code"
+    Here.ran, Here.sources = 0, "these"
     return lambda *words: engine.main(Here(), [str(tmp_path / "out"), "--short", *words])
 
 
@@ -189,7 +189,7 @@ def test_the_command_says_what_is_wrong_and_runs_again_what_failed(command, tmp_
     assert command("--case", "fine", "--force") == 0 and Here.ran == 6
     with pytest.raises(InputError, match="--case 'fina': expected one of fine, wrong, raising"):
         command("--case", "fina")
-    Here.code = "other"
+    Here.sources = "other"
     assert command() == 1 and Here.ran == 9
 
 
@@ -327,7 +327,7 @@ def test_the_table_names_rows_of_other_sources_and_shows_one_size_of_grids(comma
     first = (tmp_path / "out" / "stress.md").read_bytes()
     capsys.readouterr()
     assert command("--table") == 1 and not capsys.readouterr().err
-    Here.code = "other"
+    Here.sources = "other"
     assert command("--table") == 1 and Here.ran == 3
     assert (tmp_path / "out" / "stress.md").read_bytes() == first
     assert "3 of 3 rows are of other sources" in capsys.readouterr().err
