@@ -8,19 +8,16 @@ direction ahead of a ray, so that it leaves a large uniform region in a few step
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ctsim.kernels.bricks_cpu import MIXED, SIDE, reach
 from ctsim.types import Phantom
-
-SIDE = 4  # voxels along a brick: one brick of labels is one cache line
-MIXED = 255  # code of a brick that holds more than one label or density
 
 
 class Bricks(NamedTuple):
     """A label volume for the ray tracer (flat arrays only, for numba).
 
-    `code` [octant, bz, by, bx] holds label | reach << 8, reach ≥ 1 in bricks (see `_reach`);
+    `code` [octant, bz, by, bx] holds label | reach << 8, reach ≥ 1 in bricks (see `reach`);
     `slot` [bz, by, bx] is a mixed brick's place in `pool`, SIDE³ labels each (and in `density`, which is
     empty without a density map).
     `grid` holds voxel counts, voxels per mm and the grid's low corner (mm), each in x, y, z order;
@@ -52,7 +49,7 @@ def make_bricks(phantom: Phantom) -> Bricks:
     d = np.array(phantom.d_voxel[::-1], np.float64)
     low = np.array(phantom.off_origin[::-1], np.float64) - n * d / 2
     return Bricks(
-        code=_reach(kind),
+        code=reach(kind),
         slot=slot,
         pool=labels[mixed].ravel(),
         density=dense.ravel(),
@@ -68,33 +65,6 @@ def _cut(volume: NDArray) -> NDArray:
     z, y, x = (s // SIDE for s in padded.shape)
     cut = padded.reshape(z, SIDE, y, SIDE, x, SIDE).transpose(0, 2, 4, 1, 3, 5)
     return np.ascontiguousarray(cut).reshape(z * y * x, SIDE**3)
-
-
-@njit(cache=True)
-def _reach(kind):
-    """Edge, in bricks, of the largest cube of one label ahead of each brick: [octant, bz, by, bx].
-
-    Octant bit 0, 1, 2 is set where the ray runs towards larger x, y, z. Beyond the grid nothing
-    differs. A cube of edge r + 1 fits where the seven neighbours ahead hold cubes of edge r.
-    """
-    mz, my, mx = kind.shape
-    code = np.empty((8, mz, my, mx), np.uint16)
-    for octant in range(8):
-        sx, sy, sz = 2 * (octant & 1) - 1, (octant & 2) - 1, (octant & 4) // 2 - 1
-        for i in range(mz):
-            z = mz - 1 - i if sz > 0 else i
-            for j in range(my):
-                y = my - 1 - j if sy > 0 else j
-                for k in range(mx):
-                    x = mx - 1 - k if sx > 0 else k
-                    reach = 255
-                    for n in range(1, 8):
-                        zn, yn, xn = z + sz * (n >> 2), y + sy * ((n >> 1) & 1), x + sx * (n & 1)
-                        if 0 <= zn < mz and 0 <= yn < my and 0 <= xn < mx:
-                            same = kind[zn, yn, xn] == kind[z, y, x]
-                            reach = min(reach, 1 + (code[octant, zn, yn, xn] >> 8) if same else 1)
-                    code[octant, z, y, x] = kind[z, y, x] | (reach << 8)
-    return code
 
 
 def _bounding_box(kind: NDArray, n: NDArray, d: NDArray, low: NDArray) -> NDArray[np.float64]:

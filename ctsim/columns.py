@@ -9,9 +9,9 @@ thorax of 256 voxels. A density map varies from voxel to voxel and is left to `c
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ctsim.kernels.columns_cpu import count_boundaries, list_boundaries
 from ctsim.types import Phantom
 
 
@@ -32,35 +32,11 @@ def make_columns(phantom: Phantom) -> Columns | None:
         return None
     n_y, n_x = phantom.labels.shape[1:]
     count = np.zeros((n_y, n_x), np.int64)
-    _count(phantom.labels, count)
+    count_boundaries(phantom.labels, count)
     ends = np.cumsum(count.ravel())
     first = np.zeros((n_y, n_x + 1), np.int32)
     first[:, 1:] = ends.reshape(n_y, n_x)
     first[1:, 0] = first[:-1, -1]
     change = np.empty(int(ends[-1]), np.uint32)
-    _fill(phantom.labels, first[:, :-1].astype(np.int64), change)
+    list_boundaries(phantom.labels, first[:, :-1].astype(np.int64), change)
     return Columns(first=first, change=change)
-
-
-@njit(cache=True)
-def _count(labels, count):
-    n_z, n_y, n_x = labels.shape
-    for z in range(n_z + 1):
-        for y in range(n_y):
-            for x in range(n_x):
-                below = labels[z - 1, y, x] if z > 0 else 0
-                above = labels[z, y, x] if z < n_z else 0
-                count[y, x] += below != above
-
-
-@njit(cache=True)
-def _fill(labels, at, change):
-    n_z, n_y, n_x = labels.shape
-    for z in range(n_z + 1):
-        for y in range(n_y):
-            for x in range(n_x):
-                below = np.uint32(labels[z - 1, y, x] if z > 0 else 0)
-                above = np.uint32(labels[z, y, x] if z < n_z else 0)
-                if below != above:
-                    change[at[y, x]] = np.uint32(z) | below << np.uint32(16) | above << np.uint32(24)
-                    at[y, x] += 1

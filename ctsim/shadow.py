@@ -1,10 +1,10 @@
 """Where a shadow falls on the detector: in every row, the columns that a part of the object can darken."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ctsim.geometry import crosswise
+from ctsim.kernels.shadow_cpu import cast_hulls
 from ctsim.solids import BOUND, BOX, CAPSULE, ELLIPSOID, FRUSTUM, KIND, MATERIAL, MATRIX, PARAMS, TORUS
 
 THIN = 1.5  # primitives thinner than this many pixels can hide between the corners of a pixel
@@ -47,42 +47,13 @@ def cast(pose: NDArray[np.float64], shape: tuple[int, int], corners: NDArray[np.
     u = hit @ p_u / (p_u @ p_u) + (shape[1] - 1) / 2
     v = hit @ p_v / (p_v @ p_v) + (shape[0] - 1) / 2
     out = np.empty((shape[0], len(corners), 2), np.int64)
-    _fill(u, v, behind, float(margin[0]), int(margin[1]), shape[1], out)
+    cast_hulls(u, v, behind, float(margin[0]), int(margin[1]), shape[1], out)
     return out
 
 
 def _diagonal(e_u: NDArray[np.float64], e_v: NDArray[np.float64]) -> float:
     """Length of a pixel's longer diagonal in mm."""
     return float(np.sqrt(np.hypot(np.linalg.norm(e_u), np.linalg.norm(e_v)) ** 2 + 2 * abs(e_u @ e_v)))
-
-
-@njit(cache=True)
-def _fill(us, vs, behind, margin_v, margin_u, n_u, out):
-    """Join the shadows' corners in pairs: the outermost of these lines in a row are the hull's border."""
-    n_v = out.shape[0]
-    for p in range(us.shape[0]):
-        out[:, p, 0], out[:, p, 1] = n_u, -1
-        if behind[p]:
-            out[:, p, 0], out[:, p, 1] = -1, n_u
-            continue
-        for i in range(us.shape[1]):
-            for j in range(us.shape[1]):
-                u0, v0, u1, v1 = us[p, i], vs[p, i], us[p, j], vs[p, j]
-                if v0 > v1 or i == j:
-                    continue
-                slope = (u1 - u0) / (v1 - v0) if v1 > v0 else 0.0
-                for v in range(int(min(max(v0 - margin_v, 0.0), n_v)), int(min(max(v1 + margin_v + 1.0, 0.0), n_v))):
-                    # the part of the line within the margin
-                    low, high = min(max(v - margin_v, v0), v1), max(min(v + margin_v, v1), v0)
-                    a, b = u0 + slope * (low - v0), u0 + slope * (high - v0)
-                    if v1 == v0:
-                        b = u1
-                    left, right = min(max(min(a, b), -1e6), n_u + 1e6), min(max(max(a, b), -1e6), n_u + 1e6)
-                    out[v, p, 0] = min(out[v, p, 0], max(int(np.floor(left)) - margin_u, -1))
-                    out[v, p, 1] = max(out[v, p, 1], min(int(np.ceil(right)) + margin_u, n_u))
-        for v in range(n_v):
-            if out[v, p, 1] < 0 or out[v, p, 0] > n_u - 1:  # beside the detector
-                out[v, p, 0], out[v, p, 1] = n_u, -1
 
 
 def everywhere(shape: tuple[int, int], n_parts: int) -> NDArray[np.int64]:

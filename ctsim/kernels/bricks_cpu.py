@@ -9,14 +9,41 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from ctsim.bricks import MIXED, SIDE
-
+SIDE = 4  # voxels along a brick: one brick of labels is one cache line
+MIXED = 255  # code of a brick that holds more than one label or density
 CODE_BITS = np.uint16(255)
 CELLS = SIDE**3
 SHIFT = SIDE.bit_length() - 1
 FIXED = 2.0**40  # ray parameter as an integer in 2⁻⁴⁰ mm inside a mixed brick
 FARTHEST = 1e6  # mm; no ray is longer, and crossings of a parallel plane lie beyond
 TINY = 1e-12  # a direction cosine below this counts as parallel to the axis
+
+
+@njit(cache=True)
+def reach(kind):
+    """Edge, in bricks, of the largest cube of one label ahead of each brick: [octant, bz, by, bx].
+
+    Octant bit 0, 1, 2 is set where the ray runs towards larger x, y, z. Beyond the grid nothing
+    differs. A cube of edge r + 1 fits where the seven neighbours ahead hold cubes of edge r.
+    """
+    mz, my, mx = kind.shape
+    code = np.empty((8, mz, my, mx), np.uint16)
+    for octant in range(8):
+        sx, sy, sz = 2 * (octant & 1) - 1, (octant & 2) - 1, (octant & 4) // 2 - 1
+        for i in range(mz):
+            z = mz - 1 - i if sz > 0 else i
+            for j in range(my):
+                y = my - 1 - j if sy > 0 else j
+                for k in range(mx):
+                    x = mx - 1 - k if sx > 0 else k
+                    cube = 255
+                    for n in range(1, 8):
+                        zn, yn, xn = z + sz * (n >> 2), y + sy * ((n >> 1) & 1), x + sx * (n & 1)
+                        if 0 <= zn < mz and 0 <= yn < my and 0 <= xn < mx:
+                            same = kind[zn, yn, xn] == kind[z, y, x]
+                            cube = min(cube, 1 + (code[octant, zn, yn, xn] >> 8) if same else 1)
+                    code[octant, z, y, x] = kind[z, y, x] | (cube << 8)
+    return code
 
 
 @njit(inline="always", error_model="numpy")

@@ -17,6 +17,32 @@ FIXED = 2.0**50
 TINY = 1e-12  # a horizontal direction (voxels) below this counts as parallel to the axis
 
 
+@njit(cache=True)
+def count_boundaries(labels, count):
+    """Add each voxel column's changes of label to `count` [y, x]; outside `labels` [z, y, x] the label is 0."""
+    n_z, n_y, n_x = labels.shape
+    for z in range(n_z + 1):
+        for y in range(n_y):
+            for x in range(n_x):
+                below = labels[z - 1, y, x] if z > 0 else 0
+                above = labels[z, y, x] if z < n_z else 0
+                count[y, x] += below != above
+
+
+@njit(cache=True)
+def list_boundaries(labels, at, change):
+    """Write each column's boundaries, upwards, into `change` from place `at` [y, x] on, which moves past them."""
+    n_z, n_y, n_x = labels.shape
+    for z in range(n_z + 1):
+        for y in range(n_y):
+            for x in range(n_x):
+                below = np.uint32(labels[z - 1, y, x] if z > 0 else 0)
+                above = np.uint32(labels[z, y, x] if z < n_z else 0)
+                if below != above:
+                    change[at[y, x]] = np.uint32(z) | below << np.uint32(16) | above << np.uint32(24)
+                    at[y, x] += 1
+
+
 @njit(inline="always", error_model="numpy")
 def _clip(o, d, n, t0, t1):
     """Cut [t0, t1] to where 0 ≤ o + d·t ≤ n; also 1/d."""
