@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 import torch
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from ctsim.reconstruct.kernels.log_cpu import look_up, take_log
 from ctsim.types import Scan, Status
 
 NO_SIGNAL = "no pixel has signal: every reading is at the floor of the logarithm or not finite"
@@ -56,10 +56,10 @@ class LineIntegrals:
         stack = counts[None] if counts.ndim == 2 else counts
         p, clamped = np.empty(stack.shape, np.float32), np.empty(stack.shape, np.bool_)
         if self._table is not None:
-            _look_up(stack, self._table, self._low, self._log_open, self._dead, p, clamped)
+            look_up(stack, self._table, self._low, self._log_open, self._dead, p, clamped)
         else:
             dark, floor = np.float32(self.scan.dark), np.float32(self.floor)
-            _take_log(np.asarray(stack, np.float32), dark, floor, self._log_open, self._dead, p, clamped)
+            take_log(np.asarray(stack, np.float32), dark, floor, self._log_open, self._dead, p, clamped)
         return p.reshape(counts.shape), clamped.reshape(counts.shape)
 
 
@@ -78,26 +78,3 @@ def _log_open(open_field: NDArray[np.float32], floor: float) -> tuple[NDArray[np
     usable = np.isfinite(open_field) & (open_field > floor)
     log_open = np.log(np.where(usable, open_field, floor).astype(np.float64)).astype(np.float32)
     return log_open, ~usable
-
-
-@njit(parallel=True, cache=True)
-def _look_up(counts, table, low, log_open, dead, p, clamped):
-    n_view, n_v, n_u = counts.shape
-    for row in prange(n_view * n_v):
-        view, v = row // n_v, row % n_v
-        for u in range(n_u):
-            c = counts[view, v, u]
-            p[view, v, u] = log_open[v, u] - table[c]
-            clamped[view, v, u] = low[c] | dead[v, u]
-
-
-@njit(parallel=True, cache=True)
-def _take_log(counts, dark, floor, log_open, dead, p, clamped):
-    n_view, n_v, n_u = counts.shape
-    for row in prange(n_view * n_v):
-        view, v = row // n_v, row % n_v
-        for u in range(n_u):
-            signal = counts[view, v, u] - dark
-            seen = floor < signal < np.float32(np.inf)
-            p[view, v, u] = log_open[v, u] - math.log(signal if seen else floor)
-            clamped[view, v, u] = (not seen) | dead[v, u]

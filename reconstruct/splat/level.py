@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from ctsim.geometry import Geometry
+from ctsim.reconstruct.splat.kernels import carve_cpu
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,41 +96,5 @@ def carve(data: Data, open_below: float) -> NDArray[np.bool_]:
     near = np.asarray(ndimage.maximum_filter(p, (1, 3, 3))) > open_below
     z, y, x = data.geometry.voxel_centres()
     state = np.zeros(data.geometry.n_voxel, np.int8)
-    _carve(data.geometry.pose_array(), near, z, y, x, state)
+    carve_cpu.carve(data.geometry.pose_array(), near, z, y, x, state)
     return state == 1
-
-
-@njit(cache=True, parallel=True)
-def _carve(poses, blocked, z, y, x, state):
-    for k in prange(z.size):
-        for view in range(poses.shape[0]):
-            _carve_slice(poses[view], blocked[view], z[k], y, x, state[k])
-
-
-@njit(cache=True)
-def _carve_slice(pose, blocked, z, y, x, state):
-    """Mark voxels as seen (1) or empty (−1): v_c from Cramer's rule on source + t·(p − source) = centre + a·u + b·v."""
-    n_v, n_u = blocked.shape
-    ax, ay, az = pose[3] - pose[0], pose[4] - pose[1], pose[5] - pose[2]
-    nx = pose[7] * pose[11] - pose[8] * pose[10]
-    ny = pose[8] * pose[9] - pose[6] * pose[11]
-    nz = pose[6] * pose[10] - pose[7] * pose[9]
-    height = ax * nx + ay * ny + az * nz
-    uu = pose[6] ** 2 + pose[7] ** 2 + pose[8] ** 2
-    vv = pose[9] ** 2 + pose[10] ** 2 + pose[11] ** 2
-    uv = pose[6] * pose[9] + pose[7] * pose[10] + pose[8] * pose[11]
-    for j in range(y.size):
-        for i in range(x.size):
-            if state[j, i] < 0:
-                continue
-            cx, cy, cz = x[i] - pose[0], y[j] - pose[1], z - pose[2]
-            depth = (cx * nx + cy * ny + cz * nz) / height
-            if depth <= 0:
-                continue
-            ox, oy, oz = cx / depth - ax, cy / depth - ay, cz / depth - az
-            a = ox * pose[6] + oy * pose[7] + oz * pose[8]
-            b = ox * pose[9] + oy * pose[10] + oz * pose[11]
-            u = (a * vv - b * uv) / (uu * vv - uv * uv) + 0.5 * (n_u - 1)
-            v = (b * uu - a * uv) / (uu * vv - uv * uv) + 0.5 * (n_v - 1)
-            if -0.5 <= u < n_u - 0.5 and -0.5 <= v < n_v - 0.5:
-                state[j, i] = 1 if blocked[int(v + 0.5), int(u + 0.5)] else -1
