@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
-from numba import njit
 from numpy.typing import NDArray
 
+from ctsim.baselines.kernels.fill_cpu import fill_rows
 from ctsim.errors import InputError
 
 
@@ -75,30 +75,9 @@ def fill(image: NDArray[np.float32], trace: NDArray[np.bool_], how: str, filled:
     if how == "harmonic":
         harmonic(image, trace)
         return
-    _rows(image, trace, rows)
+    fill_rows(image, trace, rows)
     if full.any():
         harmonic(image, np.repeat(full[:, None], image.shape[1], 1))
-
-
-@njit(cache=True)
-def _rows(image, trace, rows):
-    n_u = image.shape[1]
-    for v in rows:
-        u = 0
-        while u < n_u:
-            if not trace[v, u]:
-                u += 1
-                continue
-            end = u
-            while end < n_u and trace[v, end]:
-                end += 1
-            if u > 0 or end < n_u:
-                left = image[v, u - 1] if u > 0 else image[v, end]
-                right = image[v, end] if end < n_u else image[v, u - 1]
-                for k in range(u, end):
-                    w = np.float32(k - u + 1) / np.float32(end - u + 1)
-                    image[v, k] = left + w * (right - left)
-            u = end
 
 
 def harmonic(image: NDArray[np.float32], unknown: NDArray[np.bool_]) -> None:

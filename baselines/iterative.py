@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from ctsim.baselines.beyond import seen_beyond
+from ctsim.baselines.kernels.dot_cpu import dot_by_row
 from ctsim.baselines.metal import Trace, auto_mask
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -187,17 +187,8 @@ def weighted_norm(values: Array, weights: Array) -> float:
 def weighted_dot(a: Array, b: Array, weights: Array) -> float:
     """Return Σ w·a·b, summed in float64 in one order for any number of threads."""
     sums = np.zeros(len(a), np.float64)
-    _dot_by_row(a.reshape(len(a), -1), b.reshape(len(a), -1), weights.reshape(len(a), -1), sums)
+    dot_by_row(a.reshape(len(a), -1), b.reshape(len(a), -1), weights.reshape(len(a), -1), sums)
     return float(sums.sum())
-
-
-@njit(parallel=True, cache=True, fastmath={"reassoc", "contract"})
-def _dot_by_row(a, b, weights, sums):
-    for row in prange(a.shape[0]):
-        total = 0.0
-        for k in range(a.shape[1]):
-            total += np.float64(weights[row, k]) * a[row, k] * b[row, k]
-        sums[row] = total
 
 
 def _weights(given: Weights, scan: Scan, data: Array) -> tuple[Array, dict[str, object]]:

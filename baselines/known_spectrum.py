@@ -14,9 +14,9 @@ import msgspec
 import numpy as np
 import scipy.ndimage
 import torch
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from ctsim.baselines.kernels.excess_cpu import add_excess
 from ctsim.baselines.metal import auto_mask, water_value
 from ctsim.baselines.prior import BONE, LUNG
 from ctsim.detector import Detector
@@ -170,7 +170,7 @@ def ibhc(
 
         def change(p: Array, views: slice, columns: list[Array] = columns) -> Array:
             lengths = np.stack([forward_columns(c, scan.geometry, views) for c in columns])
-            _add_excess(p.reshape(-1), lengths.reshape(len(columns), -1), mu, rule.w1, mono)
+            add_excess(p.reshape(-1), lengths.reshape(len(columns), -1), mu, rule.w1, mono)
             return p
 
         values, clamped = _changed(scan, change)
@@ -195,36 +195,6 @@ def _classes(volume: Array, water: float, metal: NDArray[np.bool_] | None, mono:
         np.ascontiguousarray(np.where(part, positive, 0).transpose(1, 2, 0) / np.float32(m), np.float32)
         for part, m in zip(parts, mono, strict=True)
     ]
-
-
-@njit(parallel=True, cache=True, error_model="numpy")
-def _add_excess(p, lengths, mu, weights, mono):
-    """Add mono − poly of `lengths` [material, ray] (mm) to `p` [ray]; `mu` is [material, energy]."""
-    for i in prange(p.size):
-        _add_one(p, i, lengths, mu, weights, mono)
-
-
-@njit(cache=True, error_model="numpy")
-def _add_one(p, i, lengths, mu, weights, mono):
-    n, n_energies = mu.shape
-    straight = 0.0
-    for m in range(n):
-        straight += mono[m] * lengths[m, i]
-    if straight <= 0:
-        return
-    least = np.inf
-    for k in range(n_energies):
-        depth = 0.0
-        for m in range(n):
-            depth += mu[m, k] * lengths[m, i]
-        least = min(least, depth)
-    signal = 0.0
-    for k in range(n_energies):
-        depth = 0.0
-        for m in range(n):
-            depth += mu[m, k] * lengths[m, i]
-        signal += weights[k] * math.exp(least - depth)
-    p[i] += np.float32(straight - least + math.log(signal))
 
 
 def _material(key: str, which: str) -> None:

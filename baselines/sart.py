@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
 
 from ctsim.baselines.iterative import (
     Array,
@@ -23,6 +22,7 @@ from ctsim.baselines.iterative import (
     visiting_order,
     weighted_dot,
 )
+from ctsim.baselines.kernels.sart_cpu import move
 from ctsim.reconstruct.settings import keywords
 from ctsim.types import Scan, Volume
 
@@ -122,14 +122,3 @@ class Passes:
 
     def _sums(self, views: np.ndarray) -> Array:
         return self.system.adjoint(self.weights[views], views)
-
-
-@njit(parallel=True, cache=True, error_model="numpy")
-def move(x, change, sums, relaxation, positivity):
-    """Add relaxation · change / sums to `x` in place where sums are positive, and cut at zero where asked."""
-    for row in prange(x.shape[0]):
-        for k in range(x.shape[1]):
-            for z in range(x.shape[2]):
-                if sums[row, k, z] > 0:
-                    value = x[row, k, z] + relaxation * change[row, k, z] / sums[row, k, z]
-                    x[row, k, z] = np.float32(0.0) if positivity and value < 0 else value

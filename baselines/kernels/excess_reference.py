@@ -1,0 +1,12 @@
+"""Readable float64 twin of `excess_cpu`."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+
+
+def excess(lengths: Array, mu: Array, weights: Array, mono: Array) -> NDArray[np.float64]:
+    """Return mono − poly [ray] of `lengths` [material, ray] (mm); `mu` is [material, energy] in 1/mm."""
+    depth = mu.T.astype(np.float64) @ lengths.astype(np.float64)
+    return mono @ lengths.astype(np.float64) + np.log(weights @ np.exp(-depth))
