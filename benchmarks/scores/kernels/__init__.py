@@ -1,0 +1,1 @@
+"""Kernels of the scores on flat arrays: one reference and one fast twin for every operator."""
