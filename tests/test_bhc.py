@@ -171,16 +171,6 @@ def test_iterating_evens_out_water_between_rods_of_aluminium(rods):
     assert repeated.details["view_updates"] == 3 * GEOMETRY.n_views
 
 
-def test_the_excess_is_that_of_the_three_materials():
-    lengths = np.array([[10.0, 0.0, 40.0, 0.0], [0.0, 5.0, 3.0, 0.0]], np.float32)
-    mu, weights = np.array([[0.05, 0.03, 0.02], [0.4, 0.1, 0.05]]), np.array([0.3, 0.5, 0.2])
-    mono = np.array([0.028, 0.09])
-    p = np.arange(4, dtype=np.float32)
-    want = p + mono @ lengths + np.log(weights @ np.exp(-mu.T @ lengths))
-    known_spectrum._add_excess(p, lengths, mu, weights, mono)
-    np.testing.assert_allclose(p, want, rtol=1e-6)  # float32
-
-
 @pytest.mark.parametrize("mask", ["oracle", "auto"])
 def test_without_metal_the_polynomial_leaves_fdk_to_the_last_bit(water, mask, monkeypatch):
     monkeypatch.setattr("ctsim.baselines.metal.Tracer.background", None)

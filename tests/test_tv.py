@@ -8,6 +8,7 @@ from iterative_scans import GEOMETRY, MU, RADIUS, TINY, distance, matrix, one_th
 from ctsim.baselines.iterative import System, watch
 from ctsim.baselines.sart import sart
 from ctsim.baselines.tv_methods import asd_pocs, awpcsd, fista_tv
+from ctsim.reconstruct.kernels.tv_reference import primal, slopes
 from ctsim.reconstruct.projector import forward
 from ctsim.reconstruct.tv import Denoiser, axis_ratios, descend, total_variation
 
@@ -55,34 +56,7 @@ def test_step_bound_is_above_the_largest_eigenvalue_and_near():
     assert exact <= bound < 1.5 * exact
 
 
-def slopes(x, ratios):
-    found = np.zeros((3, *x.shape))
-    for axis in range(3):
-        inner = [slice(None)] * 3
-        inner[axis] = slice(0, -1)
-        found[(axis, *inner)] = np.diff(x, axis=axis) * ratios[axis]
-    return found
-
-
-def transposed(field, ratios):
-    found = np.zeros(field.shape[1:])
-    for axis in range(3):
-        n = field.shape[1 + axis]
-        for k in range(n - 1):
-            at = np.take(field[axis], k, axis) * ratios[axis]
-            for place, sign in ((k, -1), (k + 1, 1)):
-                where: list[int | slice] = [slice(None)] * 3
-                where[axis] = place
-                found[tuple(where)] += sign * at
-    return found
-
-
 RATIOS = np.array([0.5, 1.0, 0.8], np.float32)
-
-
-def volume_of(b, field, tau, support, positivity):
-    inner = b - tau * transposed(field, RATIOS)
-    return np.where(support, np.maximum(inner, 0) if positivity else inner, 0)
 
 
 @pytest.mark.parametrize("positivity", [True, False])
@@ -99,9 +73,9 @@ def test_denoiser_closes_the_duality_gap(positivity, tau):
         field = denoiser.dual.astype(float)
         assert np.sqrt((field**2).sum(0)).max() <= 1 + 1e-6
         # Primal minus dual value bounds how far either is from the optimum, by weak duality.
-        primal = 0.5 * ((x.astype(float) - b) ** 2).sum() + tau * np.sqrt((slopes(x, RATIOS) ** 2).sum(0)).sum()
-        inner = volume_of(b, field, tau, support, positivity)
-        gaps.append((primal - 0.5 * ((b.astype(float) ** 2).sum() - (inner**2).sum())) / primal)
+        value = 0.5 * ((x.astype(float) - b) ** 2).sum() + tau * np.sqrt((slopes(x, RATIOS) ** 2).sum(0)).sum()
+        inner = primal(b, field, tau, RATIOS, support, positivity)
+        gaps.append((value - 0.5 * ((b.astype(float) ** 2).sum() - (inner**2).sum())) / value)
     # FGP's gap falls like 1/k² (1/k without its momentum: 3e-3 and 5e-5 here); float32 holds sums to some 1e-6.
     assert gaps[0] > gaps[1] > -1e-6 and gaps[1] < 1e-3
     assert -1e-6 < gaps[2] < 5e-6
@@ -112,12 +86,12 @@ def fgp(b, tau, iterations, dual, support):
     step, ahead, t = 1 / (4 * float((RATIOS**2).sum()) * tau), dual, 1.0
     for _ in range(iterations):
         field, after = (
-            ahead + step * slopes(volume_of(b, ahead, tau, support, True), RATIOS),
+            ahead + step * slopes(primal(b, ahead, tau, RATIOS, support, True), RATIOS),
             (1 + np.sqrt(1 + 4 * t * t)) / 2,
         )
         field = field / np.maximum(np.sqrt((field**2).sum(0)), 1)
         ahead, dual, t = field + (t - 1) / after * (field - dual), field, after
-    return volume_of(b, dual, tau, support, True), dual
+    return primal(b, dual, tau, RATIOS, support, True), dual
 
 
 def test_a_second_denoising_starts_from_the_dual_field_of_the_first_and_nothing_else():
