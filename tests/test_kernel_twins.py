@@ -26,7 +26,7 @@ from ctsim.kernels import (
     shadow_reference,
 )
 from ctsim.reconstruct.kernels import log_cpu, log_reference, tv_cpu, tv_reference
-from ctsim.reconstruct.splat.kernels import carve_cpu, carve_reference
+from ctsim.reconstruct.splat.kernels import adam_cpu, adam_reference, carve_cpu, carve_reference
 
 SHAPE = (5, 7, 11)
 U = 2.0**-24  # of float32
@@ -244,3 +244,38 @@ def test_ssim_of_slices_is_that_of_the_definition(threads, mode, padding):
     # float64 throughout; variances are differences of means of squares, some 1, that c2 keeps above 9e-4
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
     assert found[2] == 0
+
+
+def test_a_step_of_adam_is_that_of_the_publication(threads):
+    """Pieces of 33 values, the last one shorter."""
+    values, gradient, first = (normal(77, 3, seed=k) for k in range(3))
+    second = np.random.default_rng(11).uniform(0.5, 2, (77, 3)).astype(np.float32)
+    rates = np.array([0.01, 0.1, 0.001], np.float32)
+    corrections = np.float32(1 / (1 - 0.9**7)), np.float32(1 / (1 - 0.999**7))
+    expected = adam_reference.step(values, gradient, first, second, rates, 7)
+    found = [a.reshape(-1).copy() for a in (values, first, second)]
+    adam_cpu.step(found[0], gradient.reshape(-1), *found[1:], np.tile(rates, 11), corrections)
+    # three roundings of terms up to 4 for the moments; a step is at most 0.1·2·4/√(0.5/0.007) and has ten roundings
+    for got, wanted in zip(found, expected, strict=True):
+        np.testing.assert_allclose(got.reshape(77, 3), wanted, rtol=0, atol=4 * 4 * U)
+
+
+def test_activations_and_their_gradients_are_those_of_the_definition(threads):
+    scales, by_scales = 3 * normal(7, 3), normal(7, 3, seed=1)
+    densities, by_densities = 5 * normal(7, 2, seed=2), normal(7, 2, seed=3)
+    low, span, per_unit = numbers = np.float32(0.1), np.float32(12), np.float32(1 / 16)
+    found = np.empty_like(scales), np.empty_like(densities)
+    adam_cpu.activate(scales, densities, numbers, *found)
+    expected = adam_reference.activate(scales, densities, low, span, per_unit)
+    for got, wanted in zip(found, expected, strict=True):
+        # exp has an ulp or two, and there are five roundings
+        np.testing.assert_allclose(got, wanted, rtol=10 * U)
+    given = found[0].copy(), densities, by_scales, by_densities
+    adam_cpu.through(given, numbers, *found)
+    expected = (
+        adam_reference.by_scales(scales, by_scales, low, span),
+        adam_reference.by_densities(densities, by_densities, per_unit),
+    )
+    # a share has some six roundings, and so has the rest; the gradient is at most 4 times the share
+    np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=12 * 4 * U)
+    np.testing.assert_allclose(found[1], expected[1], rtol=10 * U)

@@ -5,16 +5,15 @@ Positions stay mm, and P stays P: densities are learned per unit and divided by 
 """
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.reconstruct.splat.kernels import adam_cpu as kernels
 from ctsim.reconstruct.splat.model import Splats
 from ctsim.reconstruct.splat.project import Gradient
 
@@ -25,9 +24,8 @@ Parameters = Mapping[str, Array]
 RATES = {"positions": 2e-4, "scales": 5e-3, "rotations": 1e-3, "densities": 0.01}
 """Learning rates at the start, per unit of length for positions."""
 DECAY = 0.1  # of a rate over the whole run
-FIRST, SECOND, EPS = 0.9, 0.999, 1e-15
+ROWS = 256  # splats that a thread steps at once
 SCALES = (0.0005, 0.5)  # shares of the volume's widest side, R2-Gaussian's bounds
-ONE = np.float32(1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +41,7 @@ class Activation:
     def splats(self, parameters: Parameters) -> Splats:
         """Return the splats that `parameters` stand for."""
         scales, densities = np.empty_like(parameters["scales"]), np.empty_like(parameters["densities"])
-        _activate(parameters["scales"], parameters["densities"], self._numbers(), scales, densities)
+        kernels.activate(parameters["scales"], parameters["densities"], self._numbers(), scales, densities)
         return Splats(
             positions=parameters["positions"], scales=scales, densities=densities, rotations=parameters["rotations"]
         )
@@ -73,7 +71,7 @@ class Activation:
             raise InputError("the published methods learn rotations; expected a gradient in them")
         scales, densities = np.empty_like(parameters["scales"]), np.empty_like(parameters["densities"])
         given = (splats.scales, parameters["densities"], by_splats.log_scales, by_splats.densities)
-        _through(given, self._numbers(), scales, densities)
+        kernels.through(given, self._numbers(), scales, densities)
         return {
             "positions": by_splats.positions,
             "scales": scales,
@@ -124,46 +122,11 @@ def step(parameters: Parameters, gradient: Parameters, moments: Moments, rates: 
     `rates` are numbers, or one a channel (the last axis).
     """
     count = moments.steps + 1
-    corrections = np.float32(1 / (1 - FIRST**count)), np.float32(1 / (1 - SECOND**count))
+    corrections = np.float32(1 / (1 - kernels.FIRST**count)), np.float32(1 / (1 - kernels.SECOND**count))
     for name, value in parameters.items():
-        n = value.shape[-1]
-        rows = [a if a.ndim == 2 else a[None] for a in (gradient[name], moments.first[name], moments.second[name])]
-        of_channel = np.full(n, rates[name], np.float32)
-        _step(value if value.ndim == 2 else value[None], rows[0], rows[1], rows[2], of_channel, corrections)
+        changed = value, moments.first[name], moments.second[name]
+        assert all(array.flags.c_contiguous for array in changed)  # else reshaping would copy
+        x, first, second = (array.reshape(-1) for array in changed)
+        of_channel = np.full(value.shape[-1], rates[name], np.float32)
+        kernels.step(x, gradient[name].reshape(-1), first, second, np.tile(of_channel, ROWS), corrections)
     return dataclasses.replace(moments, steps=count)
-
-
-@njit(parallel=True, cache=True, error_model="numpy")
-def _step(values, gradient, first, second, rates, corrections):
-    of_first, of_second = corrections
-    for i in prange(values.shape[0]):
-        for c in range(values.shape[1]):
-            g = gradient[i, c]
-            m = np.float32(FIRST) * first[i, c] + np.float32(1 - FIRST) * g
-            v = np.float32(SECOND) * second[i, c] + np.float32(1 - SECOND) * g * g
-            first[i, c], second[i, c] = m, v
-            values[i, c] -= rates[c] * (m * of_first) / (math.sqrt(v * of_second) + np.float32(EPS))
-
-
-@njit(parallel=True, cache=True, error_model="numpy")
-def _activate(scales, densities, numbers, out_scales, out_densities):
-    low, span, per_unit = numbers
-    for i in prange(scales.shape[0]):
-        for k in range(scales.shape[1]):
-            out_scales[i, k] = low + span / (ONE + math.exp(-scales[i, k]))
-        for c in range(densities.shape[1]):
-            x = densities[i, c]
-            # log(1 + eˣ) without overflow
-            out_densities[i, c] = (max(x, np.float32(0)) + math.log1p(math.exp(-abs(x)))) * per_unit
-
-
-@njit(parallel=True, cache=True, error_model="numpy")
-def _through(given, numbers, out_scales, out_densities):
-    scales, densities, by_log_scales, by_densities = given
-    low, span, per_unit = numbers
-    for i in prange(scales.shape[0]):
-        for k in range(scales.shape[1]):
-            share = (scales[i, k] - low) / span
-            out_scales[i, k] = by_log_scales[i, k] * share * (ONE - share) * span / scales[i, k]  # d log s/dx
-        for c in range(densities.shape[1]):
-            out_densities[i, c] = by_densities[i, c] / (ONE + math.exp(-densities[i, c])) * per_unit

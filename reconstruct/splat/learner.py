@@ -130,7 +130,7 @@ class Learner:
         self._forget()
 
     def _take(self, parameters: Mapping[str, Array]) -> None:
-        self._parameters = {name: np.array(value) for name, value in parameters.items()}  # steps change them in place
+        self._parameters = {k: np.array(v, order="C") for k, v in parameters.items()}  # steps change them in place
 
     def _forget(self) -> None:
         n = len(self._parameters["positions"])
