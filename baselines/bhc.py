@@ -15,6 +15,7 @@ from ctsim.baselines.limar import check_insert, finished, mended, uncorrected
 from ctsim.baselines.metal import Trace, find_metal, reinsert
 from ctsim.baselines.morphology import dilate
 from ctsim.baselines.prior import NO_BODY, RING, check_prior, choose_prior
+from ctsim.geometry import few_views
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reconstruct.projector import forward_columns
@@ -107,8 +108,7 @@ class Fit:
 
 def _fit(scan: Scan, trace: Trace, columns: Array, water: float) -> Fit:
     """Fit what metal adds over the trace in some views; what tissue alone gives is fitted on a ring around it."""
-    n_views = scan.geometry.n_views
-    views = np.unique(np.linspace(0, n_views - 1, min(FIT_VIEWS, n_views)).round().astype(int)).tolist()
+    views = few_views(scan.geometry.n_views, FIT_VIEWS).tolist()
     around, within = Normal(2), Normal(len(TERMS) + 2)
     for k, held, metal, tissue in _along(columns, water, trace, views):
         p, clamped = (image.numpy() for image in line_integrals(scan, k))

@@ -21,6 +21,7 @@ from ctsim.baselines.metal import auto_mask, water_value
 from ctsim.baselines.prior import BONE, LUNG
 from ctsim.detector import Detector
 from ctsim.errors import InputError
+from ctsim.geometry import few_views
 from ctsim.materials import attenuation, material
 from ctsim.quadrature import effective_weights, energy_rule, full_rule
 from ctsim.reconstruct.beam import Given, known_detector, known_tube
@@ -105,8 +106,7 @@ class Beam:
 
 def _median_path(scan: Scan, table: Table) -> float:
     """Return the median length in water (mm) that P says, of the rays that meet anything, in a few views."""
-    n = scan.geometry.n_views
-    views = np.unique(np.linspace(0, n - 1, min(L0_VIEWS, n)).round().astype(int))
+    views = few_views(scan.geometry.n_views, L0_VIEWS)
     p = np.concatenate([line_integrals(scan, int(k))[0].numpy().ravel() for k in views])
     met = p[p > SEEN]
     return float(np.interp(np.median(met), table.poly, table.lengths)) if met.size else 0.0

@@ -16,6 +16,7 @@ from ctsim.baselines.metal import INSERTS, Metal, Trace, find_metal, reinsert
 from ctsim.errors import InputError
 from ctsim.reconstruct.fdk import add_fdk
 from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.log import finite_or_not
 from ctsim.reconstruct.settings import keywords
 from ctsim.types import Scan, Status, Volume
 
@@ -114,10 +115,10 @@ def uncorrected(first: Volume, metal: Metal, why: str = "") -> Volume:
 
 def finished(values: torch.Tensor, first: Volume, metal: Metal, details: dict[str, object]) -> Volume:
     """Wrap a corrected volume."""
-    finite = bool(torch.isfinite(values).all())
+    status, reason = finite_or_not(values.numpy())
     return Volume(
         values=values,
-        status=Status.OK if finite else Status.NONFINITE,
-        reason="" if finite else "the reconstruction holds values that are not finite",
+        status=status,
+        reason=reason,
         details=first.details | metal.details() | {"corrected": True} | details,
     )

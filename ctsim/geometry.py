@@ -156,6 +156,11 @@ class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         return self.dso * math.sin(math.atan(edge / self.dsd)) if edge > 0 else 0.0
 
 
+def few_views(n_views: int, most: int) -> NDArray[np.int64]:
+    """Return at most `most` of the views, evenly spaced from the first to the last."""
+    return np.unique(np.linspace(0, n_views - 1, min(most, n_views)).round().astype(np.int64))
+
+
 def crosswise(e_u: NDArray[np.float64], e_v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the part of each step [..., xyz] at right angles to the other: p_u and p_v, the steps if they are so.
 

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.geometry import Geometry
+from ctsim.geometry import Geometry, few_views
 from ctsim.materials import attenuation
 from ctsim.project import Response, Tracer, path_lengths, transmit
 from ctsim.settings import Simulation
@@ -41,7 +41,7 @@ def survey(tracer: Tracer, geometry: Geometry) -> Survey:
     """Trace a coarse detector in a few views spread over the scan."""
     n = tuple(min(PIXELS, k) for k in geometry.n_detector)
     v, u = (k / m for k, m in zip(geometry.n_detector, n, strict=True))
-    views = np.unique(np.linspace(0, geometry.n_views - 1, min(VIEWS, geometry.n_views)).round().astype(int))
+    views = few_views(geometry.n_views, VIEWS)
     poses = geometry.pose_array()[views]
     poses[:, 6:9] *= u
     poses[:, 9:] *= v

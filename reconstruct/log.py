@@ -33,7 +33,12 @@ def how_it_ended(values: torch.Tensor, scan: Scan, clamped: int) -> tuple[Status
     """Return the status of a reconstruction and its reason, by its values and by how many pixels were clamped."""
     if is_blind(scan, clamped):
         return Status.ERROR, NO_SIGNAL
-    if not bool(torch.isfinite(values).all()):
+    return finite_or_not(values.numpy())
+
+
+def finite_or_not(values: NDArray[np.floating]) -> tuple[Status, str]:
+    """Return the status of a volume and its reason: not OK where it holds values that are not finite."""
+    if not np.isfinite(values).all():
         return Status.NONFINITE, "the reconstruction holds values that are not finite"
     return Status.OK, ""
 

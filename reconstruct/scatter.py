@@ -4,6 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from ctsim.geometry import few_views
+
 NEAR = 5  # pixels a side over which noise is averaged
 SIGNIFICANT = 5.0  # standard deviations of that average
 NORMAL = 1.4826  # standard deviation over median deviation
@@ -20,7 +22,7 @@ def open_excess(p: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
     darkest readings hold, as scatter is.
     """
     total, count = np.zeros(p.shape[1:]), np.zeros(p.shape[1:], np.int64)
-    looked_at = set(np.linspace(0, len(p) - 1, min(VIEWS, len(p))).round().astype(int).tolist())
+    looked_at = set(few_views(len(p), VIEWS).tolist())
     dark: list[NDArray[np.float64]] = []
     for view, (reading, seen) in enumerate(zip(p, valid, strict=True)):
         signal = np.where(seen, np.exp(-reading.astype(np.float64)), 0)

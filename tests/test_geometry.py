@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ctsim.errors import InputError
-from ctsim.geometry import Geometry
+from ctsim.geometry import Geometry, few_views
 from ctsim.spectrum import Bowtie, Tube
 from ctsim.types import Scanner
 
@@ -92,3 +92,10 @@ def test_heel_and_bowtie_need_a_circular_orbit(tube: Tube) -> None:
     assert Scanner(geometry=GEOMETRY, tube=tube) and Scanner(geometry=with_(poses=posed({})))
     with pytest.raises(InputError, match=r"tube\.heel and tube\.bowtie need a circular orbit.*geometry\.poses"):
         Scanner(geometry=with_(poses=posed({})), tube=tube)
+
+
+def test_few_views_are_evenly_spaced_and_no_more_than_there_are():
+    assert few_views(9, 3).tolist() == [0, 4, 8]
+    assert few_views(11, 4).tolist() == [0, 3, 7, 10]
+    assert few_views(5, 12).tolist() == [0, 1, 2, 3, 4]
+    assert few_views(1, 8).tolist() == few_views(7, 1).tolist() == [0]

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from ctsim.detector import Detector
 from ctsim.errors import InputError
-from ctsim.geometry import Geometry
+from ctsim.geometry import Geometry, few_views
 from ctsim.reconstruct.beam import Given, detected, refuse_beam
-from ctsim.reconstruct.log import how_it_ended, line_integrals
+from ctsim.reconstruct.log import finite_or_not, how_it_ended, line_integrals
 from ctsim.reconstruct.scatter import open_excess
 from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
 from ctsim.reconstruct.splat.course import PASSES, Course, levels_of, passes_over
@@ -172,8 +172,9 @@ def _checkpoint(course: Course, scan: Scan, settings: Settings) -> Checkpoint:
 
 def _verdict(fit: Fit, values: Image) -> tuple[Status, str]:
     """Say how a fit ended, and why if not well."""
-    if not np.isfinite(values).all():
-        return Status.NONFINITE, "the reconstruction holds values that are not finite"
+    status, reason = finite_or_not(values)
+    if status is not Status.OK:
+        return status, reason
     runaway = int((fit.u >= AT_THE_END * fit.curve.knots[-1]).sum())
     if runaway <= max(FEW * len(fit.u), FEWEST):
         return Status.OK, ""
@@ -250,12 +251,8 @@ def _open_photons(data: Data) -> float:
 
 def _readings(data: Data) -> Image:
     """Return the line integrals of a few views' pixels that count."""
-    views = _few_views(data.geometry)
+    views = few_views(data.geometry.n_views, VIEWS)
     return data.p[views][data.weights[views] > 0]
-
-
-def _few_views(geometry: Geometry) -> NDArray[np.int64]:
-    return np.unique(np.linspace(0, geometry.n_views - 1, min(VIEWS, geometry.n_views)).round().astype(np.int64))
 
 
 def _rough_length(data: Data, response: Response, met: float) -> float:
@@ -276,6 +273,7 @@ def typical_length(fit: Fit) -> float:
     shares = np.where(fit.u < DENSEST * water, fit.u / water, 0).astype(np.float32)
     # the projector takes two channels: the second is not looked at
     both = np.stack([shares, shares], 1) / np.float32(fit.lattice.unit)
-    paths = fit.projector.pictures(fit.projector.forward(both, _few_views(geometry)))[:, 0]
+    views = few_views(geometry.n_views, VIEWS)
+    paths = fit.projector.pictures(fit.projector.forward(both, views))[:, 0]
     met = paths[paths > SHORTEST * max(geometry.d_voxel)]
     return float(np.median(met)) if met.size else 0.0

@@ -14,7 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 from ctsim.errors import InputError
-from ctsim.reconstruct.log import NO_SIGNAL, is_blind
+from ctsim.geometry import few_views
+from ctsim.reconstruct.log import NO_SIGNAL, finite_or_not, is_blind
 from ctsim.reconstruct.splat.adam import Array
 from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
 from ctsim.reconstruct.splat.learner import LEAST_VALUE, Learner, seed_splats, splats_of
@@ -158,7 +159,7 @@ class _Run:
         densities = voxelise(splats, self.learner.objective.projector.geometry, mean=False)
         values = np.einsum("c,czyx->zyx", weights, densities)
         sound = self.done == 0 or bool(self.best) or math.isfinite(self.loss)
-        finite = sound and bool(np.isfinite(values).all())
+        status, reason = finite_or_not(values) if sound else (Status.NONFINITE, "the last loss is not finite")
         details: dict[str, Any] = {
             "read-out": how,
             "splats": len(splats),
@@ -172,8 +173,8 @@ class _Run:
             details["held_out"] = {"views": self.held_out, "misfit": misfit, "step": self.best_step}
         return Volume(
             values=torch.from_numpy(values),
-            status=Status.OK if finite else Status.NONFINITE,
-            reason="" if finite else "the reconstruction or its loss holds values that are not finite",
+            status=status,
+            reason=reason,
             details=details,
         )
 
@@ -201,9 +202,8 @@ def read_out(splats: Splats, response: Response, objective: Objective) -> tuple[
 
 def _median_paths(splats: Splats, objective: Objective) -> tuple[float, float]:
     """Return the medians of La and Lb over rays that meet something, where P is above a hundredth of its greatest."""
-    n_views = objective.projector.geometry.n_views
     met: list[Array] = []
-    for view in np.unique(np.linspace(0, n_views - 1, min(VIEWS, n_views)).round().astype(int)):
+    for view in few_views(objective.projector.geometry.n_views, VIEWS):
         paths = objective.paths(splats, int(view))[..., : objective.p.shape[2]]
         both = np.stack([np.zeros_like(paths[0]), paths[0]]) if len(paths) == 1 else paths
         met.append(both[:, objective.p[view] > 0.01 * objective.data_range])
