@@ -35,3 +35,11 @@ def die_in_exact(task: Any, given: Any) -> list:
         Path(os.environ["CTSIM_TEST_MARK"]).write_text(tempfile.mkdtemp(), encoding="utf-8")
         os._exit(3)
     return [Measurement(scene="s", contender="ctsim", seconds={"run": (1.0,)}, note=f"{task.part} {os.getpid()}")]
+
+
+def make_two_megabytes(words: list[str]) -> int:
+    """Be make-dataset SUITE OUT: say something, write two megabytes."""
+    sys.stdout.write("made\n")
+    Path(words[1]).mkdir()
+    (Path(words[1]) / words[0]).write_bytes(bytes(2_000_000))
+    return 0

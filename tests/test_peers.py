@@ -2,6 +2,7 @@ import os
 import subprocess
 import sys
 
+import apart_jobs
 import msgspec
 import numpy as np
 import pytest
@@ -303,6 +304,16 @@ def test_a_dataset_that_is_not_made_is_a_row():
     (failed,) = cases.paper(setup("paper"), "no-such-scene")
     assert (failed.ok, failed.status, failed.contender) == (False, "error", OURS)
     assert failed.reason.startswith("make-dataset quick: exit code 2: make-dataset: ")
+
+
+def test_a_dataset_is_timed_in_a_process_of_its_own(monkeypatch, capfd):
+    monkeypatch.setattr(cases.make_dataset, "main", apart_jobs.make_two_megabytes)
+    (found,) = cases.paper(setup("paper"), "lung-Fe")
+    assert (found.ok, found.note, found.views) == (True, "2 MB written, one run", 720)
+    # the start of an interpreter is part of both times; it holds neither numba nor torch, as this process does
+    assert len(found.runs) == 1 and found.runs[0] > 0.01 and (found.warm_up or 0) > 0.01
+    assert 5e6 < (found.peak_bytes or 0) < 0.7 * host.peak_memory()
+    assert not capfd.readouterr().out  # which is for the table
 
 
 @pytest.fixture
