@@ -6,12 +6,15 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-OnUpdate = Callable[[int, float, torch.Tensor], None]
+if TYPE_CHECKING:
+    import torch
+
+OnUpdate = Callable[[int, float, "torch.Tensor"], None]
 
 
 class _Watcher:

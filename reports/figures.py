@@ -4,7 +4,7 @@ They are drawn from the records alone. A figure's text and axes are in one colou
 """
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import matplotlib
@@ -16,7 +16,7 @@ from matplotlib.transforms import Bbox
 
 from ctsim.benchmarks.engine.texts import pictured
 from ctsim.benchmarks.scores.columns import COLUMNS
-from ctsim.benchmarks.studies.methods.records import Record
+from ctsim.benchmarks.studies.methods.records import RunRecord
 from ctsim.benchmarks.studies.methods.tables import summary
 
 INK = "#4d4d4e"  # no other part of a figure has it
@@ -36,7 +36,7 @@ STYLE: dict[Any, Any] = {
 WIDTH, LINE = 4.6, 0.24  # inches: narrow enough to be read on a phone; a method's line
 
 
-def scores(records: list[Record], protocol: str, metric: str) -> pd.DataFrame:
+def scores(records: Sequence[RunRecord], protocol: str, metric: str) -> pd.DataFrame:
     """Return the mean over seeds of a metric, [method, scene]; NaN where a run has no such number."""
     table = summary(records)
     part = table[(table.protocol == protocol) & (table.metric == metric) & (table.variant == "metal")]
@@ -44,7 +44,7 @@ def scores(records: list[Record], protocol: str, metric: str) -> pd.DataFrame:
     return wide * COLUMNS[protocol][metric].scale
 
 
-def quality(records: list[Record], protocol: str = "tissue", metric: str = "psnr3d") -> Figure | None:
+def quality(records: Sequence[RunRecord], protocol: str = "tissue", metric: str = "psnr3d") -> Figure | None:
     """Draw a metric of every method, a dot a scene, best mean on top; None where no run has it."""
     wide = scores(records, protocol, metric)
     if wide.empty:
@@ -68,7 +68,7 @@ def quality(records: list[Record], protocol: str = "tissue", metric: str = "psnr
     return figure
 
 
-def worth(records: list[Record]) -> Figure | None:
+def worth(records: Sequence[RunRecord]) -> Figure | None:
     """Draw PSNR3D of the tissue against wall time, means over the scenes of methods that have all of them.
 
     None where there is no such method.
@@ -118,7 +118,7 @@ def svg(figure: Figure, label: str) -> str:
     return drawing.replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
 
 
-def drawn(records: list[Record]) -> Iterator[tuple[str, Figure]]:
+def drawn(records: Sequence[RunRecord]) -> Iterator[tuple[str, Figure]]:
     """Yield (what it shows, figure) of all that can be drawn from the records."""
     found = (
         ("PSNR3D of the tissue, a dot a scene", quality(records)),

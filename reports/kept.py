@@ -3,7 +3,7 @@
 Arrays are mapped; nothing is read before it is looked at.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from ctsim.benchmarks.scores.artefact import water_attenuation
 from ctsim.benchmarks.scores.protocol import Stored, Truth, truth_of
 from ctsim.benchmarks.studies.methods.panels import Look, cut, look_of
-from ctsim.benchmarks.studies.methods.records import Record, latest, read_all
-from ctsim.benchmarks.studies.methods.run import repetition
+from ctsim.benchmarks.studies.methods.plan import repetition
+from ctsim.benchmarks.studies.methods.records import RunRecord, latest, read
 from ctsim.benchmarks.studies.methods.volumes import identity_of, map_volume, own_at_50kev
 from ctsim.errors import InputError
 from ctsim.store import list_scans, open_scan
@@ -25,7 +25,7 @@ from ctsim.store import list_scans, open_scan
 class Kept:
     """One method's record and its volume [z, y, x] in 1/mm; that at 50 keV of a method that knows energies."""
 
-    record: Record
+    record: RunRecord
     values: NDArray[Any]
     at_50kev: NDArray[Any] | None = None
 
@@ -57,12 +57,12 @@ class Case:
         return None if water is None else 1000 * (value / water - 1)
 
 
-def case_of(stored: Stored, records: list[Record], results: Path) -> Case:
+def case_of(stored: Stored, records: Sequence[RunRecord], results: Path) -> Case:
     """Collect what `results` keeps of a scan; volumes of other data, parameters or code are left out."""
     kept = []
     for record in latest(records):
         path = results / record.volume if record.volume else None
-        mine = record.run.scan == stored.content_hash and record.run.variant == "metal" and record.scores
+        mine = record.task.data == stored.content_hash and record.run.variant == "metal" and record.scores
         if mine and path is not None and identity_of(path) == record.identity:
             own = own_at_50kev(path, record.identity)
             at_50kev = None if own is None else map_volume(own)
@@ -73,13 +73,13 @@ def case_of(stored: Stored, records: list[Record], results: Path) -> Case:
     return Case(stored=stored, scene=scene, seed=seed, truth=truth, look=look, kept=tuple(kept))
 
 
-def first_cases(data: Path, records: list[Record], results: Path) -> Iterator[Case]:
+def first_cases(data: Path, records: Sequence[RunRecord], results: Path) -> Iterator[Case]:
     """Yield one case a scene, the first repetition of which a volume is kept; scenes without one are left out.
 
     Raises InputError where `data` holds none of the scans that `results` measured.
     """
     folders = list_scans(data)
-    known = {record.run.scan for record in latest(records)}
+    known = {record.task.data for record in latest(records)}
     seen: set[str] = set()
     met = False
     for stored in map(open_scan, folders):
@@ -99,7 +99,7 @@ def open_case(data: Path, results: Path, scene: str | None = None) -> Case:
 
     Raises InputError where there is no such scan or no volume of it is kept.
     """
-    records, _ = read_all(results)
+    records = read(results)
     names = []
     for stored in map(open_scan, list_scans(data)):
         names.append(stored.name)

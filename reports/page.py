@@ -7,7 +7,7 @@ policy in the file itself forbids it to load anything.
 import html
 import json
 import string
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from typing import Any
@@ -16,7 +16,8 @@ import matplotlib
 import matplotlib.colors
 import numpy as np
 
-from ctsim.benchmarks.studies.methods.records import OK, Record
+from ctsim.benchmarks.engine.record import OK
+from ctsim.benchmarks.studies.methods.records import RunRecord
 from ctsim.benchmarks.studies.methods.tables import render
 from ctsim.reports import figures, markdown, slices
 from ctsim.reports.kept import Case, Kept
@@ -44,7 +45,7 @@ class Content:
 
     title: str
     provenance: str
-    records: list[Record]
+    records: Sequence[RunRecord]
     cases: list[Case]
     most: int = 1
     more: dict[str, str]
@@ -87,7 +88,7 @@ def _folded(name: str, text: str) -> str:
     return f"<details><summary>{html.escape(title)}</summary>{_table(name, text)}</details>"
 
 
-def _figures(records: list[Record]) -> str:
+def _figures(records: Sequence[RunRecord]) -> str:
     shown = (f"<figure>{figures.svg(figure, label)}</figure>" for label, figure in figures.drawn(records))
     return f'<div class="figures">{"".join(shown)}</div>'
 

@@ -17,7 +17,7 @@ from ctsim.durable import replacing
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:
-    from ctsim.benchmarks.studies.methods.records import Record
+    from ctsim.benchmarks.studies.methods.records import RunRecord
 
 log = logging.getLogger(__name__)
 
@@ -62,13 +62,11 @@ def _write(path: Path, text: str) -> None:
     sys.stdout.write(f"Written: {path} ({path.stat().st_size / 1e6:.1f} MB)\n")
 
 
-def read(results: Path) -> "list[Record]":
+def read(results: Path) -> "list[RunRecord]":
     """Read the records that tables show; raises InputError where there are none."""
     from ctsim.benchmarks.studies.methods import records
 
-    found, torn = records.read_all(results)
-    for rest in torn:
-        log.warning("%s", rest)
+    found = records.read(results)
     if not records.latest(found):
         raise InputError(f"{results}: {records.outdated(found) or 'there are no records; run a method first'}")
     return found
@@ -100,7 +98,7 @@ def _short(commit: str) -> str:
     return digits[:12] + plus + rest
 
 
-def measured(found: "list[Record]") -> str:
+def measured(found: "list[RunRecord]") -> str:
     """Say what was measured, when, at which commits and on which machines."""
     from ctsim.benchmarks.studies.methods import records
 

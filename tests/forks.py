@@ -78,7 +78,7 @@ def serve() -> None:
     tqdm.tqdm.monitor_interval = 0  # a fork would lose its thread
     import ctsim.benchmarks.make_dataset
     import ctsim.benchmarks.studies.methods.panels
-    import ctsim.benchmarks.studies.methods.schedule
+    import ctsim.benchmarks.studies.methods.run
     import ctsim.benchmarks.studies.methods.study
     import ctsim.phantoms.scene
     import ctsim.writer
@@ -89,7 +89,7 @@ def serve() -> None:
             ctsim.benchmarks.studies.methods.study,
             ctsim.benchmarks.make_dataset,
             ctsim.benchmarks.studies.methods.panels,
-            ctsim.benchmarks.studies.methods.schedule,
+            ctsim.benchmarks.studies.methods.run,
             ctsim.phantoms.scene,
         )
     )

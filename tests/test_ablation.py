@@ -96,7 +96,7 @@ def test_the_scenes_are_those_that_the_rows_speak_of():
 
 def test_rows_become_records_and_what_failed_is_tried_again(command, tmp_path):
     code, shown = command("--table", "1", "--table", "7")
-    found, _ = records.read_all(tmp_path / "results")
+    found = records.read(tmp_path / "results")
     runs = ablation.variants((1, 7))
     assert {(r.run.scene, r.label) for r in found} == {(v.scene, v.label) for v in runs} and len(found) == len(runs)
     assert {r.run.variant for r in found} == {"metal"}
@@ -110,7 +110,7 @@ def test_rows_become_records_and_what_failed_is_tried_again(command, tmp_path):
     score = next(r.scores["paper"].values["psnr3d"] for r in found if (r.run.scene, r.label) == (LUNG, label()))
     assert f"{score:.2f}" in ours
     assert command("--table", "1", "--table", "7")[0] == 1
-    again, _ = records.read_all(tmp_path / "results")
+    again = records.read(tmp_path / "results")
     assert [r.label for r in again[len(found) :]] == [label(response="gmm")]
     assert (tmp_path / "results" / "table.md").exists()
 
@@ -130,7 +130,7 @@ def test_runs_are_the_workers_where_some_are_asked_for(command, tmp_path, monkey
         line.unlink() if line.is_file() else shutil.rmtree(line)
     assert command("--table", "7", "--workers", "2")[0] == 0
     assert done == [v.params for v in ablation.variants((7,))]
-    found, _ = records.read_all(tmp_path / "results")
+    found = records.read(tmp_path / "results")
     assert len(found) == len(done) and {r.status for r in found} == {"ok"}
 
 
@@ -159,7 +159,7 @@ def test_the_cost_of_a_step_is_what_records_say():
 
 def test_a_time_limit_ends_a_run_with_a_record(command, tmp_path):
     code, shown = command("--table", "9", "--seconds", "0.01")
-    found, _ = records.read_all(tmp_path / "results")
+    found = records.read(tmp_path / "results")
     assert code == 1 and {r.status for r in found} == {"timeout"} and "| timeout |" in shown.out
 
 

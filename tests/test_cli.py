@@ -8,6 +8,7 @@ import time
 
 import pytest
 from conftest import SMALLEST
+from run_records import append
 from test_paper_tables import record
 
 from ctsim.benchmarks import cli, make_dataset
@@ -61,14 +62,14 @@ def test_a_terminated_run_benchmark_keeps_its_records_and_goes_on(smallest, tmp_
     arguments = [smallest, tmp_path / "r", "--method", "fdk", "--method", "waiting_method:reconstruct", *isolate]
     code, said = stopped("run_benchmark", arguments, tmp_path, (tmp_path / "waiting").exists)
     assert code == 130 and "interrupted" in said and "Traceback" not in said
-    assert [r.label for r in records.read(tmp_path / "r" / records.NAME)[0]] == ["fdk", "fdk"]  # the twin and the scan
+    assert [r.label for r in records.read(tmp_path / "r")] == ["fdk", "fdk"]  # the twin and the scan
     (tmp_path / "go").touch()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["run-benchmark", *map(str, arguments)])
     monkeypatch.setattr(sys, "path", list(sys.path))
     assert cli.run_benchmark() == 0 and "waiting_method" in capsys.readouterr().out
-    found, torn = records.read(tmp_path / "r" / records.NAME)
-    assert len(found) == 4 and {r.status for r in found} == {"ok"} and torn is None
+    found = records.read(tmp_path / "r")
+    assert len(found) == 4 and {r.status for r in found} == {"ok"}
 
 
 def test_the_signals_handler_is_put_back(smallest, tmp_path, monkeypatch, capsys):
@@ -117,7 +118,7 @@ def test_what_cannot_go_on_does_not_say_that_it_will(monkeypatch, capsys):
 def test_a_terminal_of_another_encoding_ends_no_command(tmp_path, monkeypatch, encoding, command, words, shown):
     """Tables have –, ³ and ±, and a file's name may be no text at all, which Python writes as such a surrogate."""
     for seed, psnr in ((1, 20.0), (2, 22.0)):
-        records.append(tmp_path / "r" / records.NAME, record(seed=seed, scan=str(seed), psnr=psnr))
+        append(tmp_path / "r", record(seed=seed, scan=str(seed), psnr=psnr))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["command", *words])
     streams = {name: io.TextIOWrapper(io.BytesIO(), encoding=encoding) for name in ("stdout", "stderr")}

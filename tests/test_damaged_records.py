@@ -6,17 +6,20 @@ import random
 import msgspec
 import pytest
 from test_paper_tables import record
-from test_pareto_points import task, timed
+from test_pareto_points import setting, timed
 
 from ctsim import locks, manifest
 from ctsim.benchmarks.engine import lines
 from ctsim.benchmarks.engine.host import host
+from ctsim.benchmarks.engine.record import Record, Store, Task, done
 from ctsim.benchmarks.methods import parse_overrides
 from ctsim.benchmarks.studies.methods import records, tables
-from ctsim.benchmarks.studies.pareto.finding import points
-from ctsim.benchmarks.studies.pareto.study import Flags, Pareto
+from ctsim.benchmarks.studies.methods.records import RunRecord
+from ctsim.benchmarks.studies.pareto.records import latest, points
+from ctsim.benchmarks.studies.pareto.records import read as read_pareto
 from ctsim.benchmarks.studies.peers import cases as peer_cases
 from ctsim.benchmarks.studies.peers import tables as peer_tables
+from ctsim.benchmarks.studies.skipping.finding import Skip
 from ctsim.benchmarks.studies.stress import tables as stress_records
 from ctsim.errors import InputError
 from ctsim.folder import read_progress
@@ -25,7 +28,8 @@ from ctsim.scaninfo import read_info
 BY = {"host": host(), "commit": "a" * 40, "time": "2026-01-01T00:00:00+00:00"}
 KINDS = {
     "records": (records.NAME, record(params={"a": [1, {"b": 2.5}]}, time=BY["time"])),
-    "pareto": ("pareto.jsonl", timed(task(hints={"a": [1]}), ("1", 1.0, 2.0))),
+    "pareto": ("pareto.jsonl", timed(setting(params={"a": [1]}), ("1", 1.0, 2.0))),
+    "skipping": ("skipping.jsonl", Record[Skip](task=Task(study="skipping", case="rays"), found=(Skip(),), **BY)),
     "stress": (
         stress_records.NAME,
         stress_records.StressRecord(
@@ -104,23 +108,23 @@ def changed(line, rng):
 
 
 def read_records(path):
-    found, torn = records.read(path)
-    assert torn is None or "cut short" in str(torn)
-    records.done(found)
+    found = records.read(path.parent)
+    done(found)
     if records.latest(found):
         tables.write(found, path.parent)
 
 
-def read_pareto(folder):
-    study, given = Pareto(), Flags(results=folder)
-    records = study.shown(study.store(given).read())
-    points(records)
-    study.tables(records, given)
+def store(kind, folder):
+    return {
+        "records": Store(folder, "records", RunRecord, "a record"),
+        "skipping": Store(folder, "skipping", Record[Skip], "a record"),
+    }[kind]
 
 
 READERS = {
     "records": read_records,
-    "pareto": lambda path: read_pareto(path.parent),
+    "pareto": lambda path: points(latest(read_pareto(path))),
+    "skipping": lambda path: store("skipping", path.parent).read(),
     "stress": stress_records.read,
     "peers": peer_tables.read,
 }
@@ -154,10 +158,8 @@ def test_a_damaged_file_is_read_or_refused(kind, tmp_path):
 def taken(kind, ours, theirs):
     """Take over the records of one folder by another."""
     name, whole = KINDS[kind]
-    if kind == "records":
-        records.collect(ours, [theirs])
-    elif kind == "pareto":
-        Pareto().store(Flags(results=ours)).collect([theirs])
+    if kind in ("records", "skipping"):
+        store(kind, ours).collect([theirs])
     else:
         lines.collect(ours / name, [theirs], type(whole), "a record")
 

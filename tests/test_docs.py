@@ -59,7 +59,7 @@ def arguments_of(name: str, words: list[str]) -> tuple[type, list[str]] | None:
     """Return the form and the words of a command of ours, None for another, and where it is but named."""
     from ctsim.benchmarks.cli import OTHERS
     from ctsim.benchmarks.make_dataset import Options
-    from ctsim.benchmarks.studies.methods.study import Arguments
+    from ctsim.benchmarks.studies.methods.study import Flags as Arguments
 
     if name.rpartition("/")[2] not in ("make-dataset", "run-benchmark"):
         return None

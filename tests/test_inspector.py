@@ -142,7 +142,7 @@ def test_the_command_shows_a_kept_volume_and_writes_the_table(smallest, results,
     assert said.out.startswith(text)
     rows = [line for line in text.splitlines() if line.startswith("| ")][2:]
     assert len(rows) == 1 + sum(map(len, SINGLE.values())) + len(WHOLE)
-    (record,) = (r for r in records.read_all(results)[0] if r.run.variant == "metal")
+    (record,) = (r for r in records.read(results) if r.run.variant == "metal")
     tissue = record.scores["tissue"]
     expected = f"| – | protocol tissue | {tissue.data_range:.4g} | {tissue.values['psnr3d']:.2f} | "
     assert rows[0].startswith(expected)
@@ -154,7 +154,7 @@ def test_the_command_shows_a_kept_volume_and_writes_the_table(smallest, results,
 def test_the_table_of_a_method_that_knows_energies_agrees_with_its_record(smallest, tmp_path, monkeypatch, capsys):
     chosen = ("--method", "test_inspector:spectral")
     assert command(monkeypatch, capsys, smallest, tmp_path, *chosen, "--no-anchor")[0] == 0
-    (record,) = records.read_all(tmp_path)[0]
+    (record,) = records.read(tmp_path)
     assert record.scores["paper"].volume == AT_50KEV and record.volume is not None
     paper = record.scores["paper"].values["psnr3d"]
     for source in ((tmp_path,), (*chosen, "--out", tmp_path / "made.md")):

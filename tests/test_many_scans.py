@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from ctsim.benchmarks import methods
-from ctsim.benchmarks.studies.methods import records, run
+from ctsim.benchmarks.studies.methods import plan, records
 from ctsim.benchmarks.studies.methods import study as cli_run
 from ctsim.errors import InputError
 from ctsim.manifest import INDEX, MANIFEST
@@ -61,7 +61,7 @@ def test_planning_and_running_need_few_files_however_many_scans_there_are(many, 
     asked = [word for k in range(0, 100, 5) for word in ("--scene", f"s{k:04d}")]
     done = limited(many, tmp_path / "results", "--no-keep-volumes", *asked)
     assert done.returncode == 0, done.stderr
-    assert [r.status for r in records.read_all(tmp_path / "results")[0]] == ["ok"] * 40
+    assert [r.status for r in records.read(tmp_path / "results")] == ["ok"] * 40
 
 
 def test_planning_opens_nothing_and_reads_every_recipe_once(many, monkeypatch, tmp_path):
@@ -70,17 +70,16 @@ def test_planning_opens_nothing_and_reads_every_recipe_once(many, monkeypatch, t
     monkeypatch.setattr(tomllib, "loads", lambda text: read.append(text) or loads(text))
     before = len(os.listdir("/proc/self/fd"))
     scans = [open_scan(folder) for folder in list_scans(many)]
-    options = run.Options()
-    listed = run.tasks(scans, [methods.find(name) for name in ("fdk", "limar", "nmar")], options)
-    assert len(run.pending(listed, tmp_path, force=False)) == 600
-    assert len({task.run.identity for task in listed}) == 600
+    listed = plan.jobs(scans, [methods.find(name) for name in ("fdk", "limar", "nmar")], anchor=True)
+    assert len(plan.pending([job.task for job in listed], [], tmp_path)) == 600
+    assert len({job.task.identity for job in listed}) == 600
     assert len(os.listdir("/proc/self/fd")) == before and len(read) == 100
 
 
 def test_a_scene_that_is_not_there_is_one_line(many):
-    given = cli_run.Arguments(data=many, results=many, scene=("s0007x",))
+    given = cli_run.Flags(data=many, results=many, scene=("s0007x",))
     with pytest.raises(InputError, match=r"'s0007x': .* has 100, nearest s0007,") as caught:
         cli_run._scans(given)
     assert len(str(caught.value)) < 300
     with pytest.raises(InputError, match="has 100, such as s0000,"):
-        cli_run._scans(cli_run.Arguments(data=many, results=many, scene=("lung",)))
+        cli_run._scans(cli_run.Flags(data=many, results=many, scene=("lung",)))

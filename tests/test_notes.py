@@ -161,7 +161,7 @@ def test_scoring_it_says_it(data, tmp_path, caplog):
     assert run_benchmark([str(data), str(tmp_path), *methods]) == 0
     warned = [r.getMessage() for r in caplog.records]
     assert any(GRID in w and "above, seen" in w for w in warned) and any(VIEW in w and "seen" not in w for w in warned)
-    found = [r for r in records.read_all(tmp_path)[0] if r.run.variant == "metal"]
+    found = [r for r in records.read(tmp_path) if r.run.variant == "metal"]
     assert len(found) == 4
     for record in found:
         for protocol in ("metal", "artefact"):

@@ -13,10 +13,10 @@ import numba
 import numpy as np
 import pytest
 import torch
+from run_records import run_methods
 from test_run import GEOMETRY, double
 
 from ctsim.benchmarks import methods
-from ctsim.benchmarks.studies.methods import run
 from ctsim.benchmarks.studies.methods.own import restored
 from ctsim.benchmarks.studies.methods.volumes import read_volume
 from ctsim.store import list_scans, open_scan
@@ -91,9 +91,8 @@ def into_one_buffer(scan, *, device):
 
 def run_all(stored, results, *names, **options):
     """Run methods of this module one after another; return their records of the scan itself."""
-    chosen = run.Options(**{"anchor": False, **options})
     found = [methods.find(f"test_own_view:{name}" if isinstance(name, str) else name) for name in names]
-    return list(run.run_all(run.tasks([stored], found, chosen), results, chosen))
+    return run_methods([stored], found, results, **{"anchor": False, **options})
 
 
 @pytest.fixture
@@ -115,8 +114,7 @@ def test_a_change_of_any_part_of_the_scan_is_found(stored, tmp_path, into, monke
     monkeypatch.setattr(HERE, "mask", "oracle", raising=False)
     method = methods.find("test_own_view:scribble", {"into": into})
     object.__setattr__(method, "params", {**method.params, "mask": "oracle"})
-    options = run.Options(anchor=False, keep_volumes=False)
-    (record,) = run.run_all(run.tasks([stored], [method], options), tmp_path, options)
+    (record,) = run_methods([stored], [method], tmp_path, anchor=False, keep_volumes=False)
     part = {"resized": "counts", "counts,flat": "counts, flat"}.get(into, into)
     assert (record.status, f"changed its input ({part})" in record.reason) == ("error", True), record.reason
 

@@ -4,13 +4,12 @@ from types import SimpleNamespace
 
 import msgspec
 import pytest
+from run_records import append, make_record
 
 from ctsim.benchmarks import cli
-from ctsim.benchmarks.engine.host import Host
 from ctsim.benchmarks.scores.protocol import Score
-from ctsim.benchmarks.studies.methods import records
-from ctsim.benchmarks.studies.methods.records import Cost, Record, Run
-from ctsim.benchmarks.studies.methods.run import repetition
+from ctsim.benchmarks.studies.methods.plan import repetition
+from ctsim.benchmarks.studies.methods.records import Cost
 from ctsim.benchmarks.studies.paper import layout as paper_layout
 from ctsim.benchmarks.studies.paper import tables as paper_tables
 from ctsim.benchmarks.suites import load as load_suite
@@ -19,7 +18,6 @@ from ctsim.phantoms.scene import scene_id
 
 PAPER = paper_layout.load()
 TABLES = {table.number: table for table in PAPER.table}
-HOST = Host(cpu="A CPU", cores=2, threads=2, ram=1, system="", python="", versions={})
 
 
 @functools.cache
@@ -33,19 +31,15 @@ def record(method="fdk", scene="lung-Fe", psnr=20.0, *, ssim=0.5, seed=1, scan="
     of = more.pop("scene_id", None) or identity(
         more.pop("suite", "ablation" if scene.startswith("ablation") else "core"), scene, seed
     )
-    run = Run(
-        scene=more.pop("name", scene), scene_id=of, scan=scan, seed=seed, method=method, params=params,
-        mask=more.pop("mask", "none"), protocol=more.pop("protocol", records.VERSION),
-    )  # fmt: skip
     score = Score(
         region="all voxels", reference="50 keV", alignment="none", data_range=0.25, n_voxels=n_voxels,
         values={"psnr3d": psnr, "ssim3d": ssim},
     )  # fmt: skip
     planned = paper_layout.Planned(suite="", scene=scene, method=method, params=more.pop("overrides", {}))
     status = more.pop("status", "ok")
-    return Record(
-        identity=run.identity, run=run, label=planned.label, inputs=more.pop("inputs", "counts only"), status=status,
-        scores={"paper": score} if status == "ok" else {}, host=HOST,
+    return make_record(
+        method, label=planned.label, scene=more.pop("name", scene), scene_id=of, scan=scan, seed=seed, params=params,
+        inputs=more.pop("inputs", "counts only"), status=status, scores={"paper": score} if status == "ok" else {},
         cost=Cost(wall=wall, cpu=2.5, peak_bytes=2**21, view_updates=60, device="cpu"), **more,
     )  # fmt: skip
 
@@ -221,7 +215,7 @@ def test_the_commands_are_understood_and_make_the_label_of_the_cell():
     import tyro
 
     from ctsim.benchmarks.methods import Method, parse_overrides
-    from ctsim.benchmarks.studies.methods.study import Arguments
+    from ctsim.benchmarks.studies.methods.study import Flags as Arguments
 
     for table in PAPER.table:
         for row in table.rows:
@@ -242,8 +236,8 @@ def test_a_failed_run_shows_its_status_and_its_reason():
 def test_folders_merge_and_the_newest_data_count(tmp_path, monkeypatch, capsys):
     new, old = tmp_path / "new", tmp_path / "old"
     for folder, when, scan, psnr in ((new, "2026-02", "b", 30.0), (old, "2026-01", "a", 10.0)):
-        records.append(folder / records.NAME, record("fdk", psnr=psnr, scan=scan, time=when))
-    records.append(old / records.NAME, record("fdk", "teeth-Ti", psnr=11.0, time="2026-01"))
+        append(folder, record("fdk", psnr=psnr, scan=scan, time=when))
+    append(old, record("fdk", "teeth-Ti", psnr=11.0, time="2026-01"))
     monkeypatch.setattr(sys, "argv", ["run-benchmark", "paper-tables", str(new), str(old), "--table", "3"])
     assert cli.run_benchmark() == 0
     text = capsys.readouterr().out

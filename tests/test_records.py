@@ -1,52 +1,37 @@
-import errno
 import os
 import sys
 
 import msgspec
 import pytest
+from run_records import make_record
 
 from ctsim.benchmarks import cli, methods
 from ctsim.benchmarks.engine.host import host, measured
+from ctsim.benchmarks.engine.record import Store, done
 from ctsim.benchmarks.scores.protocol import Score
 from ctsim.benchmarks.studies.methods import records, tables
-from ctsim.benchmarks.studies.methods.records import Record, Run
+from ctsim.benchmarks.studies.methods.records import Run, RunRecord
 from ctsim.errors import InputError
 
 
-def run(**changes):
-    given = {"scene": "lung", "scene_id": "a1", "scan": "b2", "seed": 0, "method": "fdk", "params": {"a": 1, "b": 2.5}}
-    return Run(**{**given, **changes})
-
-
 def record(status="ok", label="fdk", time="", **changes):
-    r = run(**changes)
     score = Score(region="r", reference="e", alignment="none", data_range=0.1, n_voxels=3, values={"psnr3d": None})
-    scores = {"tissue": score}
-    return Record(
-        identity=r.identity, run=r, label=label, inputs="counts only", status=status, scores=scores, time=time
-    )
+    given = {"scene": "lung", "scene_id": "a1", "scan": "b2", "params": {"a": 1, "b": 2.5}, **changes}
+    return make_record(label=label, time=time, status=status, inputs="counts only", scores={"tissue": score}, **given)
 
 
-def test_append_and_read_give_the_same_records(tmp_path):
-    path = tmp_path / "deep" / records.NAME
-    given = [record(), record("error", seed=1)]
-    for r in given:
-        records.append(path, r)
-    assert records.read(path) == (given, None)
-    assert path.read_bytes().count(b"\n") == 2
+def store(folder, name="records"):
+    return Store(folder, name, RunRecord, records.WHAT)
 
 
-def test_records_of_before_there_were_details_are_read(tmp_path):
-    path = tmp_path / records.NAME
-    records.append(path, record())
-    path.write_bytes(path.read_bytes().replace(b',"details":{}', b""))
-    assert b"details" not in path.read_bytes() and records.read(path) == ([record()], None)
+def append(folder, *found, name="records"):
+    store(folder, name).append(found)
 
 
 def test_scans_of_different_code_are_named():
-    one, two = (msgspec.structs.replace(record(seed=k, scan=f"s{k}"), data_code=f"v{k}") for k in (1, 2))
+    one, two = (record(seed=k, scan=f"s{k}", data_code=f"v{k}") for k in (1, 2))
     assert records.remarks([one, one]) == []
-    assert records.remarks([one, msgspec.structs.replace(one, label="limar", data_code="")]) == []  # of the same scan
+    assert records.remarks([one, record(seed=1, scan="s1", label="limar")]) == []  # of the same scan
     assert records.remarks([one, two]) == [
         "the scenes were made by different code of the simulator, so their scores may not compare: "
         "lung (seed 1) by v1; lung (seed 2) by v2; make-dataset --force makes them again"
@@ -60,64 +45,15 @@ def test_every_field_of_a_run_changes_its_identity():
         "scene": "teeth", "scene_id": "x", "scan": "x", "seed": 1, "method": "nmar", "params": {"a": 2, "b": 2.5},
         "mask": "oracle", "variant": "metal_free", "code": "x", "protocol": 99,
     }  # fmt: skip
-    assert set(changes) == set(Run.__struct_fields__)
-    identities = {run(**{k: v}).identity for k, v in changes.items()} | {run().identity}
+    assert set(changes) == {*Run.__struct_fields__, "scan", "code", "protocol"}
+    identities = {record(**{k: v}).identity for k, v in changes.items()} | {record().identity}
     assert len(identities) == len(changes) + 1
-    assert run(params={"b": 2.5, "a": 1}).identity == run().identity
-
-
-def test_a_torn_last_line_is_left_out_and_reported(tmp_path):
-    path = tmp_path / records.NAME
-    records.append(path, record())
-    whole = path.read_bytes()
-    path.write_bytes(whole + whole[:57])
-    found, torn = records.read(path)
-    assert found == [record()] and torn.length == 57 and "cut short" in str(torn)
-    assert records.repair(path) == torn
-    assert path.read_bytes() == whole and path.with_suffix(".torn").read_bytes() == whole[:57]
-    records.append(path, record(seed=1))
-    assert records.read(path) == ([record(), record(seed=1)], None)
-
-
-def test_a_whole_line_without_its_end_is_kept(tmp_path):
-    path = tmp_path / records.NAME
-    records.append(path, record())
-    path.write_bytes(path.read_bytes()[:-1])
-    assert records.repair(path) is None
-    records.append(path, record(seed=1))
-    assert records.read(path) == ([record(), record(seed=1)], None)
-
-
-def test_a_bad_line_within_is_an_error_with_its_number(tmp_path):
-    path = tmp_path / records.NAME
-    records.append(path, record())
-    path.write_bytes(path.read_bytes() + b'{"not": "a record"}\n')
-    records.append(path, record(seed=1))
-    with pytest.raises(InputError, match=r"line 2: expected a record"):
-        records.read(path)
-
-
-DEEP = b'{"details": {"a": ' + b"[" * 100_000
-
-
-@pytest.mark.parametrize(
-    "damage", [b'{"identity": "\xff"}', b"\x00" * 40, DEEP, b'{"identity": "\\ud800"}', b"\xef\xbb\xbf{}"]
-)
-def test_no_damage_is_a_traceback(tmp_path, damage):
-    path = tmp_path / records.NAME
-    records.append(path, record())
-    whole = path.read_bytes()
-    path.write_bytes(whole + damage + b"\n" + whole)
-    with pytest.raises(InputError, match=rf"{records.NAME}, line 2: expected a record of run-benchmark"):
-        records.read(path)
-    path.write_bytes(whole + damage)
-    found, torn = records.read(path)
-    assert found == [record()] and torn is not None and torn.length == len(damage)
+    assert record(params={"b": 2.5, "a": 1}).identity == record().identity
 
 
 def test_the_command_names_the_file_and_the_line_of_a_byte_that_is_no_text(tmp_path, monkeypatch, capsys):
-    path = tmp_path / records.NAME
-    records.append(path, record(label="fdk-in-latin-1"))
+    path = tmp_path / "records.jsonl"
+    append(tmp_path, record(label="fdk-in-latin-1"))
     path.write_bytes(path.read_bytes().replace(b"latin-1", b"l\xe4tin-1"))
     for words in (["data", str(tmp_path), "--table"], ["paper-tables", str(tmp_path)], ["report", str(tmp_path)]):
         monkeypatch.setattr(sys, "argv", ["run-benchmark", *words])
@@ -126,27 +62,11 @@ def test_the_command_names_the_file_and_the_line_of_a_byte_that_is_no_text(tmp_p
         assert f"{path}, line 1: " in said and "0xe4" in said and said.count("\n") == 1
 
 
-def test_a_full_disk_leaves_the_file_as_it_was(tmp_path, monkeypatch):
-    path = tmp_path / records.NAME
-    records.append(path, record())
-    before = path.read_bytes()
-    write = os.write
-
-    def fill_up(descriptor, data):
-        write(descriptor, data[:20])
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, "write", fill_up)
-    with pytest.raises(OSError, match="No space"):
-        records.append(path, record(seed=1))
-    assert path.read_bytes() == before
-
-
 def test_only_ok_is_done_and_counts_before_a_failure_of_the_same_run():
     a, b, c = record(), record("skipped", seed=1), record("error", seed=2)
-    assert records.done([a, b, c]) == {a.identity}
+    assert set(done([a, b, c])) == {a.identity}
     for given in ([a, record("error")], [record("error"), a], [record("error"), a, record("timeout")]):
-        assert records.done(given) == {a.identity} and records.latest(given) == [a]
+        assert set(done(given)) == {a.identity} and records.latest(given) == [a]
     again = record(label="fdk", time="later")
     assert records.latest([a, again, record("error")]) == [again]  # of two that ended well the last
     assert records.latest([record("error"), record("timeout")]) == [record("timeout")]
@@ -160,47 +80,46 @@ def test_a_failed_run_of_before_does_not_hide_what_is_measured_now():
 
 
 def test_within_a_file_the_last_line_counts_whatever_its_clock_said(tmp_path):
-    path = tmp_path / records.NAME
     for given in (record("error", time="2031-01-01"), record("timeout", time="2026-01-01")):
-        records.append(path, given)
-    assert [r.status for r in records.latest(records.read_all(tmp_path)[0])] == ["timeout"]
-    records.append(path, record(code="new", time="2026-01-02"))
-    assert [r.run.code for r in records.latest(records.read_all(tmp_path)[0])] == ["new"]
+        append(tmp_path, given)
+    assert [r.status for r in records.latest(records.read(tmp_path))] == ["timeout"]
+    append(tmp_path, record(code="new", time="2026-01-02"))
+    assert [r.task.code for r in records.latest(records.read(tmp_path))] == ["new"]
 
 
 def test_a_clock_ahead_on_one_machine_hides_nothing_of_another(tmp_path):
     """Here new code ran on the second day; there, old code on the first, one record of it dated 2031."""
     here, there = tmp_path / "here", tmp_path / "there"
     for k, time in enumerate(("2026-01-01T01", "2031-01-01", "2026-01-01T03", "2026-01-01T04")):
-        records.append(there / records.NAME, record("ok", code="old", seed=k, time=time))
+        append(there, record("ok", code="old", seed=k, time=time))
     for k in range(4):
-        records.append(here / records.NAME, record("ok", code="new", seed=k, time=f"2026-01-02T0{k}"))
-    assert records.collect(here, [there]) == {there: 4}
-    shown = records.latest(records.read_all(here)[0])
-    assert [r.run.code for r in shown] == ["new"] * 4
-    before = (here / records.NAME).read_bytes()
-    assert records.collect(here, [there]) == {there: 0} and (here / records.NAME).read_bytes() == before
+        append(here, record("ok", code="new", seed=k, time=f"2026-01-02T0{k}"))
+    assert store(here).collect([there]) == {there: 4}
+    shown = records.latest(records.read(here))
+    assert [r.task.code for r in shown] == ["new"] * 4
+    before = (here / "records.jsonl").read_bytes()
+    assert store(here).collect([there]) == {there: 0} and (here / "records.jsonl").read_bytes() == before
     # files that lie side by side are merged alike
-    (here / records.NAME).unlink()
-    (there / records.NAME).rename(here / "records-there.jsonl")
+    (here / "records.jsonl").unlink()
+    (there / "records.jsonl").rename(here / "records-there.jsonl")
     for k in range(4):
-        records.append(here / records.NAME, record("ok", code="new", seed=k, time=f"2026-01-02T0{k}"))
-    assert [r.run.code for r in records.latest(records.read_all(here)[0])] == ["new"] * 4
+        append(here, record("ok", code="new", seed=k, time=f"2026-01-02T0{k}"))
+    assert [r.task.code for r in records.latest(records.read(here))] == ["new"] * 4
 
 
 def test_a_failure_dated_in_the_future_is_mended_by_a_collected_success(tmp_path):
     here, there = tmp_path / "here", tmp_path / "there"
-    records.append(here / records.NAME, record("error", time="2031-01-01"))
-    records.append(there / records.NAME, record(time="2026-01-01"))
-    assert records.collect(here, [there]) == {there: 1}
-    assert [r.status for r in records.latest(records.read_all(here)[0])] == ["ok"]
+    append(here, record("error", time="2031-01-01"))
+    append(there, record(time="2026-01-01"))
+    assert store(here).collect([there]) == {there: 1}
+    assert [r.status for r in records.latest(records.read(here))] == ["ok"]
 
 
 def test_nothing_is_collected_where_a_folder_has_no_records(tmp_path):
     here, there = tmp_path / "here", tmp_path / "there"
-    records.append(there / records.NAME, record())
+    append(there, record())
     with pytest.raises(InputError, match=r"--collect .*none: there are no records"):
-        records.collect(here, [there, tmp_path / "none"])
+        store(here).collect([there, tmp_path / "none"])
     assert not here.exists()
 
 
@@ -215,10 +134,10 @@ def test_a_scan_made_anew_supersedes_what_was_measured_on_the_old():
 
 
 def test_files_of_several_machines_merge(tmp_path):
-    records.append(tmp_path / "records.jsonl", record())
-    records.append(tmp_path / "records-other.jsonl", record(seed=1))
-    found, torn = records.read_all(tmp_path)
-    assert {r.run.seed for r in found} == {0, 1} and torn == []
+    append(tmp_path, record())
+    append(tmp_path, record(seed=1), name="records-other")
+    found = records.read(tmp_path)
+    assert {r.run.seed for r in found} == {0, 1}
 
 
 def test_host_is_described_and_survives_json():

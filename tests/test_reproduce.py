@@ -3,12 +3,13 @@ import sys
 
 import pytest
 from conftest import SMALLEST
+from run_records import make_record
 
 from ctsim.benchmarks import cli, make_dataset
 from ctsim.benchmarks.scores.protocol import Score
 from ctsim.benchmarks.studies import claims as reproduce
-from ctsim.benchmarks.studies.methods import records
-from ctsim.benchmarks.studies.methods.records import Cost, Record, Run
+from ctsim.benchmarks.studies.methods import study
+from ctsim.benchmarks.studies.methods.records import Cost
 
 RMSE = {"fdk": 300.0, "limar": 150.0, "nmar": 120.0}
 WALL = {"fdk": 1.0, "limar": 2.0, "nmar": 4.0, "os-sart": 30.0}
@@ -16,13 +17,12 @@ WALL = {"fdk": 1.0, "limar": 2.0, "nmar": 4.0, "os-sart": 30.0}
 
 def record(method, seed, *, rmse=None, wall=None, status="ok", passes=10):
     params = {"iterations": passes} if method == "os-sart" else {}
-    run = Run(scene="lung-Fe", scene_id="a", scan=f"s{seed}", seed=seed, method=method, params=params)
     score = Score(
         region="", reference="", alignment="", data_range=None, n_voxels=1, values={"rmse": rmse or RMSE.get(method)}
     )
     cost = Cost(wall=wall or WALL[method], cpu=1.0, peak_bytes=1, view_updates=240 * passes, device="cpu")
-    return Record(
-        identity=run.identity, run=run, label=method, inputs="", status=status, cost=cost, scores={"artefact": score}
+    return make_record(
+        method, scan=f"s{seed}", seed=seed, params=params, status=status, cost=cost, scores={"artefact": score}
     )
 
 
@@ -68,22 +68,21 @@ def test_a_dry_run_plans_scans_and_lists_runs(tmp_path, capsys):
     before = sorted(tmp_path.iterdir())
     assert reproduce.main([*words, "--dry-run"]) == 0 and sorted(tmp_path.iterdir()) == before
     out = capsys.readouterr().out
-    assert "on disk" in out and "total: 8 of 8 pairs of runs, 0 s" in out  # 4 methods on 2 scans
-    assert out.rstrip().endswith("never run: fdk, limar, nmar, os-sart")
+    assert "on disk" in out and "on 2 scans to be made and their twins: 0 s" in out
+    assert out.rstrip().endswith("never measured: fdk, limar, nmar, os-sart")
     # one scan is there, and its runs are those of run-benchmark; what is recorded tells of the scan that is not
     assert make_dataset.main([str(suite), str(tmp_path / "data"), "--seeds", "1"]) == 0
     (tmp_path / "r").mkdir()
     for known in (record("fdk", 1, wall=3.0), record("limar", 1, wall=5.0)):
-        records.append(tmp_path / "r" / records.NAME, known)
+        study.Methods().store(study.Flags(data=tmp_path, results=tmp_path / "r")).append([known])
     capsys.readouterr()
     assert reproduce.main([*words, "--dry-run"]) == 0
     out = capsys.readouterr().out
     # scan and twin, 2 × (3 + 5) s, and what this machine's time of an FDK makes of the others
     assert out.count("already complete") == 1 and re.search(r"total: 8 of 8 runs, [\d.]+ (s|min)", out)
-    assert re.search(r"^limar +lung-Fe-s1 +5 s$", out, re.M)
-    assert re.search(r"^nmar +lung-Fe-s1 +[\d.]+ (s|min)$", out, re.M)
-    assert "total: 4 of 8 pairs of runs, 16 s" in out
-    assert sum("to be made, and its twin  6 s" in line and line.startswith("fdk") for line in out.splitlines()) == 1
+    assert re.search(r"^lung-Fe, seed 1 +limar +2 runs, 10 s$", out, re.M)
+    assert re.search(r"^lung-Fe, seed 1 +nmar +2 runs, [\d.]+ (s|min)$", out, re.M)
+    assert "on 1 scans to be made and their twins: 16 s" in out
 
 
 def test_one_command_makes_the_scans_the_records_and_the_verdict(tmp_path, monkeypatch, capsys):

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from run_records import run_jobs, run_methods
 
 from ctsim.benchmarks import cli, methods
 from ctsim.benchmarks.scores import artefact
 from ctsim.benchmarks.scores.protocol import truth_of
-from ctsim.benchmarks.studies.methods import attempt, intermediates, records, run
+from ctsim.benchmarks.studies.methods import attempt, intermediates, plan, records
 from ctsim.benchmarks.studies.methods import study as cli_run
 from ctsim.benchmarks.studies.methods.panels import Row, cut, draw, write_panels
 from ctsim.benchmarks.studies.methods.tables import caption
@@ -140,8 +141,8 @@ def crash(scan, *, device):
 def once(name, results, stored=None, **options):
     """Run one method on a scan alone, without its twin."""
     method = methods.find(f"test_run:{name}")
-    chosen = run.Options(store="test_run:open_double", anchor=False, **options)
-    return next(run.run_all(run.tasks([stored or double(results)], [method], chosen), results, chosen))
+    jobs = plan.jobs_on(stored or double(results), ("metal",), [(method, (0, 0))], "test_run:open_double")
+    return run_jobs(jobs, results, anchor=False, **options)[0]
 
 
 def test_a_run_is_scored_timed_kept_and_recorded(tmp_path):
@@ -154,7 +155,7 @@ def test_a_run_is_scored_timed_kept_and_recorded(tmp_path):
     assert set(record.scores["artefact"].values.values()) == {None}
     assert record.cost.view_updates == 12 and record.cost.peak_bytes > 0 and not record.cost.isolated
     assert record.host.ram > 0 and record.time.endswith("+00:00")
-    assert records.read(tmp_path / records.NAME) == ([record], None)
+    assert records.read(tmp_path) == [record]
     import tifffile
 
     assert tifffile.imread(tmp_path / record.volume).shape == GEOMETRY.n_voxel
@@ -172,7 +173,7 @@ def test_a_run_is_scored_timed_kept_and_recorded(tmp_path):
 def test_failures_have_a_status_and_a_reason(tmp_path, name, status, reason):
     record = once(name, tmp_path)
     assert (record.status, record.scores) == (status, {}) and reason in record.reason
-    assert records.read(tmp_path / records.NAME)[0] == [record]
+    assert records.read(tmp_path) == [record]
 
 
 def test_isolated_runs_end_as_they_do_here(tmp_path):
@@ -185,16 +186,14 @@ def test_isolated_runs_end_as_they_do_here(tmp_path):
 def test_a_time_limit_is_a_status(tmp_path):
     record = once("slow", tmp_path, seconds=0.5)
     assert record.status == "timeout" and "0.5 s" in record.reason
-    with pytest.raises(InputError, match="seconds"):
-        run.Options(seconds=-1)
 
 
 def test_a_method_that_can_be_told_its_seconds_ends_by_itself(tmp_path):
     told = methods.within(methods.find("test_run:punctual"), 0.5)
     assert told.label == "test_run:punctual[seconds=0.5]"
-    options = run.Options(store="test_run:open_double", seconds=0.5, anchor=False)  # less than a process has to start
-    (outcome,) = (run.run_one(task, options, {}) for task in run.tasks([double(tmp_path)], [told], options))
-    assert outcome.status == "ok" and outcome.cost.wall > 0.5
+    jobs = plan.jobs_on(double(tmp_path), ("metal",), [(told, (0, 0))], "test_run:open_double")
+    (record,) = run_jobs(jobs, tmp_path, anchor=False, seconds=0.5)  # less than a process has to start
+    assert record.status == "ok" and record.cost.wall > 0.5
     mine = methods.find("test_run:punctual", {"seconds": 0.1})
     assert methods.within(mine, 0.5) == mine and methods.within(methods.find("fdk"), 0.5) == methods.find("fdk")
 
@@ -206,25 +205,22 @@ def test_a_warm_up_goes_on_until_nothing_is_left_to_compile(tmp_path):
 
 
 def test_a_rerun_does_only_what_is_missing(tmp_path):
-    options = run.Options(anchor=False)
     found = [methods.find(f"test_run:{n}") for n in ("good", "broken")]
-    listed = run.tasks([double(tmp_path)], found, options)
-    assert [r.status for r in run.run_all(listed, tmp_path, options)] == ["ok", "error"]
-    assert [t.method.name for t in run.pending(listed, tmp_path, force=False)] == ["test_run:broken"]
-    assert run.pending(listed, tmp_path, force=True) == listed
-    other = run.tasks([double(tmp_path)], [methods.find("test_run:good", {"level": 0.02})], options)
-    assert run.pending(other, tmp_path, force=False) == other
+    jobs = plan.jobs([double(tmp_path)], found, anchor=False)
+    assert [r.status for r in run_jobs(jobs, tmp_path, anchor=False)] == ["ok", "error"]
+    left = plan.pending([job.task for job in jobs], records.read(tmp_path), tmp_path)
+    assert [task.subject for task in left] == ["test_run:broken"]
+    other = plan.jobs([double(tmp_path)], [methods.find("test_run:good", {"level": 0.02})], anchor=False)
+    assert plan.pending([job.task for job in other], records.read(tmp_path), tmp_path) == [other[0].task]
 
 
 def test_the_anchor_is_judged_in_the_region_of_the_metal_scan(tmp_path, monkeypatch):
     monkeypatch.setitem(methods.TABLE, "fdk", ("test_run:good", "counts only"))
-    options = run.Options()
-    listed = run.tasks([double(tmp_path)], [methods.find("fdk")], options)
-    without, with_metal = run.run_all(listed, tmp_path, options)
+    without, with_metal = run_methods([double(tmp_path)], [methods.find("fdk")], tmp_path)
     assert without.run.variant == "metal_free" and without.identity != with_metal.identity
     assert without.scores["tissue"] == with_metal.scores["tissue"]
     assert set(without.scores) == {"tissue", "aligned", "aligned_50kev"}
-    assert len(run.tasks([double(tmp_path, twin=False)], [methods.find("fdk")], options)) == 1
+    assert len(plan.jobs([double(tmp_path, twin=False)], [methods.find("fdk")], anchor=True)) == 1
 
 
 def test_a_method_can_skip_with_a_reason(tmp_path, monkeypatch):
@@ -340,7 +336,7 @@ def test_a_record_keeps_what_a_method_says_of_its_result(tmp_path, isolate):
         "read-out": "at Ē = 1", "misfit": 0.5, "loss": None, "on": True, "course": [1.0, None, 3], "nothing": None,
         "empty": {}, "response": {"eta": [0.25, 0.75], "theta": []},
     }  # fmt: skip
-    assert records.read(tmp_path / records.NAME)[0] == [record]
+    assert records.read(tmp_path) == [record]
     assert once("broken", tmp_path, isolate=isolate).details == {}
 
 
@@ -411,7 +407,7 @@ def test_ctrl_c_keeps_the_records(tmp_path, monkeypatch, capsys):
         monkeypatch, capsys, tmp_path, tmp_path, "--method", "test_run:good", "--method", "test_run:stop"
     )
     assert code == 130 and "interrupted" in said.err
-    assert [r.status for r in records.read(tmp_path / records.NAME)[0]] == ["ok", "ok"]  # the twin and the scan
+    assert [r.status for r in records.read(tmp_path)] == ["ok", "ok"]  # the twin and the scan
     assert (tmp_path / "table.md").exists()
 
 

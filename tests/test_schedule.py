@@ -1,5 +1,6 @@
 """Which runs come first, what they are said to take, records of several machines, and tables in any order of ends."""
 
+import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,17 +9,16 @@ import pytest
 from test_run import double
 from test_tables import record
 
-from ctsim.benchmarks.engine.workers import Lost
+from ctsim.benchmarks.engine.process import Lost, Pool
 from ctsim.benchmarks.methods import TABLE, Method, find
-from ctsim.benchmarks.studies.methods import estimates, records, run, schedule, tables
-from ctsim.benchmarks.studies.methods import study as cli_run
+from ctsim.benchmarks.studies.methods import estimates, plan, records, study, tables
 from ctsim.benchmarks.studies.methods.estimates import FDKS, fdk_seconds, in_fdks
-from ctsim.benchmarks.studies.methods.schedule import Costs, ordered
+from ctsim.benchmarks.studies.methods.plan import Costs, ordered
+from ctsim.benchmarks.studies.methods.records import RunTask
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.splat.course import PASSES
 
-OPTIONS = run.Options(keep_volumes=False)
 CIRCLE = Geometry(
     dso=100.0,
     dsd=150.0,
@@ -35,22 +35,24 @@ def method(name: str) -> Method:
     return Method(name=name, target="test_run:good", inputs="counts only", params={})
 
 
-def listed(*names: str) -> list[run.Task]:
+def listed(*names: str) -> list[RunTask]:
     """Return the runs of methods on two scans, each with its twin."""
-    return run.tasks([double(Path("a")), double(Path("b"))], [method(name) for name in names], OPTIONS)
+    scans = [double(Path("a")), dataclasses.replace(double(Path("b")), name="crate")]
+    return [job.task for job in plan.jobs(scans, [method(name) for name in names], anchor=True)]
 
 
 def took(name: str, seconds: float, status: str = "ok", **more):
     found = record(name, status=status, **more)
     assert found.cost is not None
-    return msgspec.structs.replace(found, cost=msgspec.structs.replace(found.cost, wall=seconds))
+    cost = msgspec.structs.replace(found.cost, wall=seconds)
+    return msgspec.structs.replace(found, found=(msgspec.structs.replace(found.found[0], cost=cost),))
 
 
 def order(names: tuple[str, ...], found) -> list[str]:
     groups = ordered(listed(*names), Costs(found))
-    assert all([t.variant for t in g] == ["metal_free", "metal"] for g in groups)  # the twin, then what it judges
+    assert all([t.part for t in g] == ["metal_free", "metal"] for g in groups)  # the twin, then what it judges
     assert [g[0].place[0] for g in groups] == [0, 1] * len(names)  # a whole row before the next method
-    return [g[0].method.name for g in groups[::2]]
+    return [g[0].subject for g in groups[::2]]
 
 
 def test_cheap_methods_come_first():
@@ -72,53 +74,33 @@ def test_the_cost_of_a_run_is_that_of_its_scan_else_the_methods_median():
     found = [took("fdk", 1.0, scene="box", seed=3), took("fdk", 5.0, scene="x"), took("fdk", 9.0, scene="y")]
     twin, scan = listed("fdk")[:2]
     assert (Costs(found).task(scan), Costs(found).task(twin), Costs([]).task(scan)) == (1.0, 5.0, None)
-    text = schedule.text(ordered(listed("fdk", "splat")[:4], Costs(found)), 8, Costs(found)).splitlines()
-    assert [line.split() for line in text[:3]] == [
-        ["fdk", "box", "(metal-free)", "5", "s"],
-        ["fdk", "box", "1", "s"],
-        ["splat", "box", "(metal-free)", "unknown"],
-    ]
-    assert text[-1].startswith("total: 4 of 8 runs, 6 s") and text[-1].endswith("never run: splat")
 
 
 def test_a_dry_run_writes_nothing(smallest, tmp_path, capsys):
 
-    assert cli_run.main([str(smallest), str(tmp_path / "results"), "--dry-run"]) == 0
+    assert study.main([str(smallest), str(tmp_path / "results"), "--dry-run"]) == 0
     assert "2 of 2 runs" in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == []
 
 
-class Fake:
-    """A pool that answers what it is told to."""
-
-    def __init__(self, *answers):
-        self._answers = answers
-
-    def answers(self, function, jobs):
-        yield None
-        yield from enumerate(self._answers)
-
-
-def test_a_run_whose_process_dies_is_a_failure_on_record(tmp_path):
-    groups = ordered(listed("fdk")[:2], Costs([]))
-    found = [r for _, r in schedule.work(groups, tmp_path, OPTIONS, Fake(Lost("it died")))]
-    assert [(r.status, r.reason, r.run.variant) for r in found] == [
+def test_a_run_whose_process_dies_is_a_failure_on_record(smallest, tmp_path, monkeypatch):
+    monkeypatch.setattr(Pool, "answers", lambda self, function, jobs: iter([None, (0, Lost("it died"))]))
+    assert study.main([str(smallest), str(tmp_path), "--workers", "2"]) == 1
+    assert [(r.status, r.reason, r.run.variant) for r in records.read(tmp_path)] == [
         ("error", "it died", "metal_free"),
         ("error", "it died", "metal"),
     ]
-    assert records.read_all(tmp_path)[0] == found
 
 
-def test_a_worker_with_other_code_is_refused(tmp_path):
-    groups = ordered(listed("fdk")[:2], Costs([]))
-    strange = [msgspec.json.encode(record(variant=v)) for v in ("metal_free", "metal")]
+def test_a_worker_with_other_code_is_refused(smallest, tmp_path):
+    given = study.Flags(data=smallest, results=tmp_path)
+    task = study.Methods().tasks(given)[0]
     with pytest.raises(InputError, match="a worker has another version"):
-        list(schedule.work(groups, tmp_path, OPTIONS, Fake(strange)))
-    assert records.read_all(tmp_path)[0] == []
+        study.Methods().measure(msgspec.structs.replace(task, code="other"), given)
 
 
 def placed(name: str, scene: str, place: tuple[int, int], **more):
-    return msgspec.structs.replace(record(name, scene, **more), place=place)
+    return record(name, scene, place=place, **more)
 
 
 def test_tables_do_not_depend_on_which_run_ended_first():
@@ -137,39 +119,40 @@ def test_tables_do_not_depend_on_which_run_ended_first():
     assert list(dict.fromkeys(r.label for r in shown)) == ["fdk", "nmar", "my:net", "a:lab"]
 
 
-def at(time: str, found, **more):
-    return msgspec.structs.replace(found, time=f"2026-01-01T00:00:{time}+00:00", **more)
+def at(time: str, name: str, **more):
+    return record(name, time=f"2026-01-01T00:00:{time}+00:00", **more)
 
 
 def test_results_of_several_machines_are_collected_once(tmp_path):
     here, there, third = (tmp_path / name for name in ("here", "there", "deep/third"))
-    new = record("fdk", psnr=30.0)
-    old = msgspec.structs.replace(new.run, code="old")
     for folder, found in (
-        (here, [at("20", new), at("21", record("nmar", status="error"))]),
-        (there, [at("05", new, run=old, identity=old.identity), at("30", record("nmar"), volume="volumes/n.tif")]),
-        (third, [at("40", record("nmar", status="error")), at("41", record("splat"))]),
+        (here, [at("20", "fdk", psnr=30.0), at("21", "nmar", status="error")]),
+        (there, [at("05", "fdk", psnr=30.0, code="old"), at("30", "nmar", volume="volumes/n.tif")]),
+        (third, [at("40", "nmar", status="error"), at("41", "splat")]),
     ):
-        for r in found:
-            records.append(folder / records.NAME, r)
-    assert records.collect(here, [there, third]) == {there: 2, third: 1}
-    assert records.collect(here, [there, third, here]) == {there: 0, third: 0, here: 0}
-    shown = {r.label: r for r in records.latest(records.read_all(here)[0])}
-    assert shown["fdk"].run.code == ""  # the older code came last, but does not supersede
+        store(folder).append(found)
+    assert store(here).collect([there, third]) == {there: 2, third: 1}
+    assert store(here).collect([there, third, here]) == {there: 0, third: 0, here: 0}
+    shown = {r.label: r for r in records.latest(records.read(here))}
+    assert shown["fdk"].task.code == ""  # the older code came last, but does not supersede
     assert shown["nmar"].status == "ok" and (here / (shown["nmar"].volume or "")).resolve() == there / "volumes/n.tif"
     assert set(shown) == {"fdk", "nmar", "splat"}
     with pytest.raises(InputError, match="no records"):
-        records.collect(here, [tmp_path / "nothing"])
+        store(here).collect([tmp_path / "nothing"])
+
+
+def store(folder):
+    return study.Methods().store(study.Flags(data=folder, results=folder))
 
 
 def test_collecting_renders_the_tables(tmp_path, capsys):
 
-    records.append(tmp_path / "there" / records.NAME, record("fdk"))
+    store(tmp_path / "there").append([record("fdk")])
     collect = [str(tmp_path / "data"), str(tmp_path / "here"), "--collect", str(tmp_path / "there")]
     with pytest.raises(InputError, match="--collect writes records, --dry-run writes nothing"):
-        cli_run.main([*collect, "--dry-run"])
+        study.main([*collect, "--dry-run"])
     assert not (tmp_path / "here").exists()
-    assert cli_run.main(collect) == 0
+    assert study.main(collect) == 0
     assert "| counts only | fdk |" in capsys.readouterr().out and (tmp_path / "here/table.csv").exists()
 
 
@@ -182,8 +165,8 @@ def test_tables_follow_the_runs(tmp_path, monkeypatch):
         write(found, results)
 
     monkeypatch.setattr(tables, "write", watched)
-    monkeypatch.setattr(cli_run, "_scans", lambda given: [double(given.data)])
-    assert cli_run.main([str(tmp_path), str(tmp_path / "r"), "--method", "test_run:good"]) == 0
+    monkeypatch.setattr(study, "_scans", lambda given: [double(given.data)])
+    assert study.main([str(tmp_path), str(tmp_path / "r"), "--method", "test_run:good"]) == 0
     assert seen[0] == 1 and seen[-1] == 2  # after the first run, and at the end
 
 
@@ -198,9 +181,9 @@ def test_a_method_that_never_ran_is_guessed_from_the_time_of_fdk(smallest, tmp_p
         "--method",
         "splat",
     ]
-    assert cli_run.main(told) == 0
+    assert study.main(told) == 0
     out = capsys.readouterr().out
-    assert "unknown" not in out and "guessed from FDK's time: fdk, splat" in out
+    assert "unknown" not in out and "never measured" not in out
 
 
 @pytest.mark.parametrize(
@@ -229,9 +212,9 @@ def test_a_method_that_has_so_many_seconds_is_guessed_to_take_no_more(monkeypatc
     monkeypatch.setattr(estimates, "fdk_seconds", lambda geometry: 100.0)
     stored = SimpleNamespace(geometry=CIRCLE)
     told, free = (SimpleNamespace(method=find("splat", given), stored=stored) for given in ({"seconds": 9.0}, {}))
-    assert schedule.estimated(told) == 9.0 < schedule.estimated(free)
+    assert estimates.estimated(told) == 9.0 < estimates.estimated(free)
     wrong = SimpleNamespace(method=find("splat", {"seconds": "soon"}), stored=stored)
-    assert schedule.estimated(wrong) == schedule.estimated(free)  # it is the method that refuses that
+    assert estimates.estimated(wrong) == estimates.estimated(free)  # it is the method that refuses that
 
 
 def test_every_method_of_the_table_has_a_guess_and_others_have_none():

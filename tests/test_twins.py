@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from run_records import run_jobs
 from test_run import GEOMETRY, Double
 
 from ctsim.benchmarks import methods
+from ctsim.benchmarks.engine.record import encoded
 from ctsim.benchmarks.scores import artefact
-from ctsim.benchmarks.studies.methods import attempt, records, run
+from ctsim.benchmarks.studies.methods import attempt, plan, records
 from ctsim.benchmarks.studies.methods.volumes import identity_of, map_volume, read_volume, write_volume
 from ctsim.errors import InputError
 from ctsim.materials import attenuation
@@ -51,12 +53,13 @@ def unhappy(scan, *, device):
 
 def do(folder, *, name="counted", scales=(1e-5,), **options):
     """Run what is missing; return the tasks that were run as (variant, scale) and the records."""
-    chosen = run.Options(**options)
     overrides = [{} if name != "counted" else {"scale": s} for s in scales]
-    listed = run.tasks([pair(folder)], [methods.find(f"test_twins:{name}", o) for o in overrides], chosen)
-    left = run.pending(listed, folder, force=False)
-    done = list(run.run_all(left, folder, chosen))
-    return [(t.variant, t.method.params.get("scale")) for t in left], done
+    found = [methods.find(f"test_twins:{name}", o) for o in overrides]
+    listed = {job.task.identity: job for job in plan.jobs([pair(folder)], found, anchor=options.get("anchor", True))}
+    listed = {k: dataclasses.replace(job, open="test_twins:pair") for k, job in listed.items()}
+    left = plan.pending([job.task for job in listed.values()], records.read(folder), folder)
+    jobs = [listed[task.identity] for task in left]
+    return [(j.variant, j.method.params.get("scale")) for j in jobs], run_jobs(jobs, folder, **options)
 
 
 def test_the_twin_is_reconstructed_first_and_compared_in_hu(tmp_path):
@@ -79,19 +82,18 @@ def test_methods_with_other_parameters_have_twins_of_their_own(tmp_path):
 
 
 def test_the_twin_that_was_just_run_is_not_taken_for_anothers(tmp_path):
-    options = run.Options(keep_volumes=False)
     found = [methods.find("test_twins:counted", {"scale": s}) for s in (1e-5, 3e-5)]
-    a_twin, _, _, b_scan = run.tasks([pair(tmp_path)], found, options)
-    _, record = run.run_all([a_twin, b_scan], tmp_path, options)
+    a_twin, _, _, b_scan = plan.jobs([pair(tmp_path)], found, anchor=True)
+    _, record = run_jobs([a_twin, b_scan], tmp_path, keep_volumes=False)
     assert record.scores["artefact"].note == artefact.NOT_ASKED
     assert set(record.scores["artefact"].values.values()) == {None}
 
 
 def forget(folder, identity):
     """Take the record of a run out of the file, as if it had not been done."""
-    path = folder / records.NAME
-    lines = path.read_bytes().splitlines(keepends=True)
-    path.write_bytes(b"".join(x for x in lines if identity.encode() not in x))
+    path = folder / f"{records.FILE}.jsonl"
+    kept = [record for record in records.read(folder) if record.identity != identity]
+    path.write_bytes(encoded(kept))
 
 
 def test_a_kept_twin_is_not_run_again(tmp_path):
@@ -155,28 +157,27 @@ def test_a_skipped_twin_is_not_a_reason_to_repeat_the_scan(tmp_path, monkeypatch
 
 def test_a_scan_without_a_twin_has_no_artefact_numbers(tmp_path):
     alone = dataclasses.replace(pair(tmp_path), metal_free=None)
-    chosen = run.Options()
-    listed = run.tasks([alone], [methods.find("test_twins:counted")], chosen)
-    (record,) = run.run_all(listed, tmp_path, chosen)
+    listed = plan.jobs([alone], [methods.find("test_twins:counted")], anchor=True)
+    (record,) = run_jobs(listed, tmp_path)
     assert record.scores["artefact"].note == artefact.NO_TWIN
     assert set(record.scores["artefact"].values) == set(artefact.METRICS)
     assert set(record.scores["artefact"].values.values()) == {None}
-    assert run.pending(listed, tmp_path, force=False) == []
+    assert plan.pending([job.task for job in listed], records.read(tmp_path), tmp_path) == []
 
 
 def test_repetitions_are_seeds_of_one_scene(tmp_path):
     stored = dataclasses.replace(pair(tmp_path), name="box-s7")
-    assert run.repetition(stored) == ("box-s7", 3)
+    assert plan.repetition(stored) == ("box-s7", 3)
     (tmp_path / "scene.toml").write_text('name = "box-s7"\nseed = 7\n')
-    assert run.repetition(stored) == ("box", 7)
-    assert run.repetition(dataclasses.replace(stored, name="box-s17")) == ("box-s17", 7)
+    assert plan.repetition(stored) == ("box", 7)
+    assert plan.repetition(dataclasses.replace(stored, name="box-s17")) == ("box-s17", 7)
     for damaged in ("seed = ", "seed = 'x'", "seed = " + "9" * 5000, "seed = " + "[" * 3000 + "]" * 3000):
         (tmp_path / "scene.toml").write_text(damaged)
         with pytest.raises(InputError, match=r"scene\.toml"):
-            run.repetition(stored)
+            plan.repetition(stored)
     (tmp_path / "scene.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(InputError, match=r"scene\.toml"):
-        run.repetition(stored)
+        plan.repetition(stored)
 
 
 def test_a_volume_that_cannot_be_read_is_one_sentence(tmp_path):
@@ -214,7 +215,7 @@ def masked(scan, *, device, mask="oracle"):
 
 @pytest.mark.parametrize("isolate", [False, True])
 def test_the_true_mask_goes_to_methods_that_ask_for_it_and_is_empty_in_the_twin(tmp_path, isolate):
-    twin, record = do(tmp_path, name="masked", isolate=isolate, store="test_twins:pair")[1]
+    twin, record = do(tmp_path, name="masked", isolate=isolate)[1]
     assert (twin.status, record.status, record.run.mask) == ("ok", "ok", "oracle")
     assert read_volume(tmp_path / twin.volume).max() == 0
     np.testing.assert_array_equal(read_volume(tmp_path / record.volume), pair(tmp_path).metal)

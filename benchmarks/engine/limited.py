@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 from ctsim.benchmarks.engine import workers
-from ctsim.benchmarks.studies.methods.isolate import how_it_ended
+from ctsim.benchmarks.engine.process import how_it_ended
 from ctsim.errors import InputError
 
 

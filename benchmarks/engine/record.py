@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypeVar
 
 import msgspec
 
@@ -81,7 +81,7 @@ class Record(msgspec.Struct, Generic[F], frozen=True, kw_only=True, forbid_unkno
     """A task and all that was found, and where, when and by which commit."""
 
     task: Task
-    found: tuple[F, ...]
+    found: Annotated[tuple[F, ...], msgspec.Meta(min_length=1)]
     host: Host
     commit: str
     time: str
@@ -97,24 +97,27 @@ class Record(msgspec.Struct, Generic[F], frozen=True, kw_only=True, forbid_unkno
         return min((len(s) for one in self.found for s in one.seconds.values()), default=1)
 
 
-class Store(Generic[F]):
+R = TypeVar("R", bound=Record[Any])
+
+
+class Store(Generic[R]):
     """The records of one study in a results folder: `NAME.jsonl`, and files of other machines, `NAME-*.jsonl`."""
 
-    def __init__(self, folder: Path, name: str, kind: type[Record[F]], what: str) -> None:
+    def __init__(self, folder: Path, name: str, kind: type[R], what: str) -> None:
         self.folder, self.path, self._name = folder, folder / f"{name}.jsonl", name
         self._decoder = msgspec.json.Decoder(kind)
         self._what = what
         self._warned: set[Path] = set()
 
     @uncollected()
-    def read(self) -> list[Record[F]]:
+    def read(self) -> list[R]:
         """Return all records, oldest first; none where there is no file. Warns of a last line that was cut short.
 
         Raises InputError where a whole line is not a record.
         """
         return merged([list(self._of(path)) for path in self._files(self.folder)])
 
-    def append(self, records: Iterable[Record[F]]) -> None:
+    def append(self, records: Iterable[R]) -> None:
         """Append records and force them to the disk; alone among processes."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with locked(self.path) as handle:
@@ -147,7 +150,7 @@ class Store(Generic[F]):
                 write_synced(self.path, encoded(merged(files)))
         return counts
 
-    def _at(self, folder: Path) -> "Store[F]":
+    def _at(self, folder: Path) -> "Store[R]":
         other = Store.__new__(Store)
         other.__dict__ |= self.__dict__ | {"folder": folder, "path": folder / self.path.name}
         return other
@@ -155,7 +158,7 @@ class Store(Generic[F]):
     def _files(self, folder: Path) -> list[Path]:
         return sorted([*folder.glob(f"{self._name}.jsonl"), *folder.glob(f"{self._name}-*.jsonl")])
 
-    def _of(self, path: Path) -> Iterator[Record[F]]:
+    def _of(self, path: Path) -> Iterator[R]:
         data = path.read_bytes() if path.exists() else b""
         *lines, rest = data.split(b"\n")  # not splitlines: a carriage return ends no line
         for number, line in enumerate(lines, 1):
@@ -186,7 +189,7 @@ def encoded(records: Iterable[msgspec.Struct]) -> bytes:
     return b"".join(msgspec.json.encode(record) + b"\n" for record in records)
 
 
-def _moved(record: Record[F], source: Path, folder: Path) -> Record[F]:
+def _moved(record: R, source: Path, folder: Path) -> R:
     """Return a record of another results folder with the paths from `folder` to its files."""
 
     def path(name: str) -> str:
@@ -199,7 +202,7 @@ def _moved(record: Record[F], source: Path, folder: Path) -> Record[F]:
     return msgspec.structs.replace(record, found=found)
 
 
-def merged(files: Sequence[Sequence[Record[F]]]) -> list[Record[F]]:
+def merged(files: Sequence[Sequence[R]]) -> list[R]:
     """Merge the records of several files, oldest first; those of one file keep their order.
 
     Records are dated by the clocks of several machines, which may be wrong; the order of lines never is.
@@ -237,39 +240,43 @@ def _never_falling(times: Sequence[str]) -> list[str]:
     return out
 
 
-def by_row(records: Sequence[Record[F]]) -> dict[tuple[str, str, str], list[Record[F]]]:
+def by_row(records: Sequence[R]) -> dict[tuple[str, str, str], list[R]]:
     """Return, for each row, the records of its newest identity, those that ended well where any did.
 
     Of a case only its newest data count, and the machine that was last to measure it: a scan that was made again
     supersedes all that was measured on the old one, and times of two machines do not compare.
     """
-    data = {r.task.row[:2]: r.task.data for r in records}
-    records = [r for r in records if r.task.data == data[r.task.row[:2]]]
-    machine = {r.task.row[:2]: r.task.machine for r in sorted(records, key=lambda r: r.finished)}
-    records = [r for r in records if r.task.machine == machine[r.task.row[:2]]]
-    rows: dict[tuple[str, str, str], list[Record[F]]] = {}
+    data = {(r.task.part, r.task.case): r.task.data for r in records}
+    records = [r for r in records if r.task.data == data[r.task.part, r.task.case]]
+    ended = sorted(records, key=lambda r: r.finished)
+    machine = {(r.task.part, r.task.case): r.task.machine for r in ended}
+    rows: dict[tuple[str, str, str], list[R]] = {}
     for record in records:
-        rows.setdefault(record.task.row, []).append(record)
+        task = record.task
+        if task.machine == machine[task.part, task.case]:
+            rows.setdefault((task.part, task.case, task.subject), []).append(record)
     return {row: _newest(found) for row, found in rows.items()}
 
 
-def _newest(found: list[Record[F]]) -> list[Record[F]]:
+def _newest(found: list[R]) -> list[R]:
+    if len(found) == 1:
+        return found
     identity = found[-1].task.identity
     newest = [r for r in found if r.task.identity == identity]
     return [r for r in newest if r.finished] or newest[-1:]
 
 
-def latest(records: Sequence[Record[F]]) -> list[Record[F]]:
+def latest(records: Sequence[R]) -> list[R]:
     """Return the record of each row that tables show: the last that ended well, without one the last. By place."""
     return sorted((found[-1] for found in by_row(records).values()), key=lambda r: r.task.place)
 
 
-def done(records: Sequence[Record[F]], repeats: int = 1) -> Counter[str]:
+def done(records: Sequence[R], repeats: int = 1) -> Counter[str]:
     """Count the records of each identity that ended well with at least so many timed runs."""
     return Counter(r.task.identity for r in records if r.finished and r.repeats >= repeats)
 
 
-def provenance(records: Sequence[Record[F]]) -> str:
+def provenance(records: Sequence[R]) -> str:
     """Say when, on which machines and by which commits the records were measured."""
     times = sorted(r.time for r in records)
     machines = dict.fromkeys(

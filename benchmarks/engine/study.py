@@ -1,17 +1,19 @@
 """The life of every measuring command: list tasks, skip what is recorded, measure, record, write tables."""
 
+import contextlib
 import pkgutil
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 from typing import Annotated, Any, ClassVar, Generic, Self, TypeVar
 
+import msgspec
 import tyro
 
 from ctsim.benchmarks.engine import host
@@ -61,10 +63,10 @@ class Flags(Options):
 
 
 G = TypeVar("G", bound=Options)
-F = TypeVar("F", bound=Found)
+R = TypeVar("R", bound=Record[Any])
 
 
-class Study(Generic[F, G]):
+class Study(Generic[R, G]):
     """What a command adds to the engine: its flags, its tasks, how one is measured, and its tables.
 
     `name` is the command's word, `file` the name of its records, `unit` what it calls a task. `kind` is what a task
@@ -83,8 +85,8 @@ class Study(Generic[F, G]):
     rounds: ClassVar[bool] = False
     follows: ClassVar[bool] = False
     estimate: ClassVar[str] = "without compiling"
-    kind: type[F]
-    record: type[Record[F]]
+    kind: type[Found]
+    record: type[R]
     flags: type[G]
 
     def check(self, given: G) -> None:
@@ -94,7 +96,7 @@ class Study(Generic[F, G]):
         """Return the results folder."""
         return given.results  # type: ignore[attr-defined]
 
-    def store(self, given: G) -> Store[F]:
+    def store(self, given: G) -> Store[R]:
         """Return the records in the results folder."""
         what = f"a record of run-benchmark {self.name}".rstrip()
         return Store(self.folder(given), self.file, self.record, what)
@@ -102,7 +104,7 @@ class Study(Generic[F, G]):
     def prepare(self, given: G) -> None:
         """Make what tasks depend on, such as data; called before `tasks`, and not with --dry-run."""
 
-    def tasks(self, given: G) -> list[Task]:
+    def tasks(self, given: G) -> Sequence[Any]:
         """Return the tasks that the flags ask for, in the order of the table. Simulates and reconstructs nothing."""
         raise NotImplementedError
 
@@ -110,7 +112,7 @@ class Study(Generic[F, G]):
         """Return how many timed runs a task needs."""
         return getattr(given, "repeats", 1)
 
-    def runs(self, task: Task, given: G) -> int:
+    def runs(self, task: Any, given: G) -> int:
         """Return how many timed runs this task needs, 1 where it is not timed."""
         return self.repeats(given)
 
@@ -119,11 +121,11 @@ class Study(Generic[F, G]):
         shared = f", {given.workers} tasks at once" if given.workers > 1 else ""
         return host.machine() + (f", by {given.scheduler}" if given.scheduler else shared)
 
-    def shows(self, task: Task, given: G) -> bool:
+    def shows(self, task: Any, given: G) -> bool:
         """Whether the tables of these flags show a recorded task."""
         return True
 
-    def pending(self, tasks: Sequence[Task], records: Sequence[Record[F]], given: G) -> list[Task]:
+    def pending(self, tasks: Sequence[Any], records: Sequence[R], given: G) -> Sequence[Any]:
         """Return the tasks that are not recorded, in the order in which they are to be measured."""
         records = [r for r in records if self.rounds or r.repeats >= self.runs(r.task, given)]
         known = done([] if given.force else records)
@@ -131,24 +133,24 @@ class Study(Generic[F, G]):
         # a commit with changes does not say what code ran
         return [t for n in rounds for t in tasks if known[t.identity] <= n or not host.certain(t.code)]
 
-    def groups(self, left: Sequence[Task], records: Sequence[Record[F]]) -> list[tuple[Task, ...]]:
+    def groups(self, left: Sequence[Any], records: Sequence[R]) -> Sequence[tuple[Any, ...]]:
         """Part tasks into groups that one worker measures, in this order."""
         return [(task,) for task in left]
 
-    def expected(self, task: Task, given: G) -> float | None:
+    def expected(self, task: Any, given: G) -> float | None:
         """Return the seconds that a task takes which was never recorded, None where that is not known."""
         return None
 
-    def took(self, record: Record[F], given: G) -> float | None:
+    def took(self, record: R, given: G) -> float | None:
         """Return the seconds that measuring a recorded task again takes: all its timed runs, the first one untimed."""
         once = sum(median(s) for one in record.found for s in one.seconds.values() if s)
         return once * (self.runs(record.task, given) + 1)
 
-    def line(self, task: Task) -> tuple[str, str]:
+    def line(self, task: Any) -> tuple[str, str]:
         """Return the line of --dry-run that a task counts in: a name and more."""
         return task.case, task.subject
 
-    def limit(self, task: Task, given: G) -> float | None:
+    def limit(self, task: Any, given: G) -> float | None:
         """Return the time limit of a task in seconds."""
         return given.seconds
 
@@ -156,29 +158,29 @@ class Study(Generic[F, G]):
         """Return variables for the process that measures."""
         return {}
 
-    def measure(self, task: Task, given: G) -> Sequence[F]:
+    def measure(self, task: Any, given: G) -> Sequence[Any]:
         """Measure a task in this process."""
         return pkgutil.resolve_name(self.work)(task, given)
 
-    def failed(self, task: Task, status: str, reason: str) -> F:
+    def failed(self, task: Any, status: str, reason: str) -> Found:
         """Return what stands for a task that did not end."""
         return self.kind(ok=False, status=status, reason=reason)
 
-    def tables(self, records: Sequence[Record[F]], given: G) -> list[Table]:
+    def tables(self, records: Sequence[R], given: G) -> list[Table]:
         """Return the tables of records: one of each row, with `rounds` those of all rounds, in order."""
         raise NotImplementedError
 
-    def details(self, records: Sequence[Record[F]], given: G) -> list[Table]:
+    def details(self, records: Sequence[R], given: G) -> list[Table]:
         """Return the tables that stand in the file only, below the others."""
         return []
 
-    def shown(self, records: Sequence[Record[F]]) -> list[Record[F]]:
+    def shown(self, records: Sequence[R]) -> list[R]:
         """Return the records that tables show, in order."""
         if not self.rounds:
             return latest(records)
         return sorted((r for rounds in by_row(records).values() for r in rounds), key=lambda r: r.task.place)
 
-    def write(self, records: Sequence[Record[F]], given: G) -> str:
+    def write(self, records: Sequence[R], given: G) -> str:
         """Write the tables into the results folder; return what the command prints."""
         shown = self.shown(records)
         text = f"{provenance(shown)}\n\n" + "\n".join(table.markdown() for table in self.tables(shown, given))
@@ -187,7 +189,14 @@ class Study(Generic[F, G]):
         write_synced(path, (text + more).encode())
         return f"{text}\nWritten: {path}; records in {self.file}.jsonl\n"
 
-    def code(self, tasks: Sequence[Task], records: Sequence[Record[F]], given: G) -> int:
+    def draw(self, records: Sequence[R], given: G) -> None:
+        """Draw pictures into the results folder, once all tasks have ended."""
+
+    def watched(self, say: Callable[[str], None]) -> contextlib.AbstractContextManager[None]:
+        """Call `say` with how far a task is that is measured in this process."""
+        return contextlib.nullcontext()
+
+    def code(self, tasks: Sequence[Any], records: Sequence[R], given: G) -> int:
         """Return the exit code: 0 if every task that was asked for ended as expected."""
         rows = {task.row for task in tasks}
         return int(any(not f.ok for r in latest(records) if not rows or r.task.row in rows for f in r.found))
@@ -214,7 +223,10 @@ def main(study: Study[Any, Any], arguments: list[str]) -> int:
     shown = _shown(study, store, given)
     if not shown:
         raise InputError(f"{store.path}: there are no records to show; run without --table first")
-    sys.stdout.write(study.write(shown, given))
+    text = study.write(shown, given)
+    if tasks:
+        study.draw(shown, given)
+    sys.stdout.write(text)
     return int(bool(failed)) or study.code(tasks, shown, given)
 
 
@@ -223,7 +235,7 @@ def _all(study: Study[Any, G], tasks: Sequence[Task], given: G) -> int:
     return len(tasks) * (study.repeats(given) if study.rounds else 1)
 
 
-def _shown(study: Study[F, G], store: Store[F], given: G) -> list[Record[F]]:
+def _shown(study: Study[R, G], store: Store[R], given: G) -> list[R]:
     """Return the records that the tables of these flags show."""
     return [record for record in store.read() if study.shows(record.task, given)]
 
@@ -240,7 +252,7 @@ def _check(study: Study[Any, Any], given: Options) -> None:
     study.check(given)
 
 
-def measure_all(study: Study[F, G], tasks: Sequence[Task], records: Sequence[Record[F]], given: G) -> list[Record[F]]:
+def measure_all(study: Study[R, G], tasks: Sequence[Task], records: Sequence[R], given: G) -> list[R]:
     """Measure what is not recorded, behind a progress bar; return the records of what did not end as expected.
 
     Each record is on the disk before the next task begins. The tables follow as tasks end, and once more at the end,
@@ -251,32 +263,41 @@ def measure_all(study: Study[F, G], tasks: Sequence[Task], records: Sequence[Rec
     left, store, n_all = study.pending(tasks, records, given), study.store(given), _all(study, tasks, given)
     if len(left) < n_all:
         sys.stderr.write(f"{n_all - len(left)} of {n_all} {study.unit}s are recorded already (--force)\n")
-    failed, written, took = [], 0.0, 0.0
+    failed, written, took, last = [], 0.0, 0.0, ""
     with open_jobs(given.workers, given.scheduler) as jobs:
         store.folder.mkdir(parents=True, exist_ok=True)  # before anything is measured that could not be recorded
-        with tqdm(total=len(left), unit=study.unit, disable=not left, file=sys.stderr) as bar:
+        with (
+            tqdm(total=len(left), unit=study.unit, disable=not left, file=sys.stderr) as bar,
+            study.watched(lambda text: bar.set_postfix_str(f"{last}, {text}" if last else text)),
+        ):
             try:
                 for record in _records(study, study.groups(left, records), given, jobs):
                     store.append([record])
                     if not all(one.ok for one in record.found):
                         failed.append(record)
-                    bar.set_postfix_str(f"{record.task.case} {record.task.subject}: {_status(record)}")
+                    last = f"{record.task.case} {record.task.subject}: {_status(record)}"
+                    bar.set_postfix_str(last)
                     bar.update()
                     if study.follows and time.monotonic() > written + took / SHARE:
                         began = time.monotonic()
                         _follow(study, store, given)
                         written, took = time.monotonic(), time.monotonic() - began
-            except KeyboardInterrupt:
+            except BaseException as error:
                 if study.follows:
-                    _follow(study, store, given)
+                    with contextlib.suppress(OSError, InputError):
+                        _follow(study, store, given, draw=True)
+                if isinstance(error, OSError) and error.filename is None:  # a full disk
+                    raise OSError(error.errno, error.strerror or str(error), str(store.folder)) from error
                 raise
     return failed
 
 
-def _follow(study: Study[F, G], store: Store[F], given: G) -> None:
-    """Write the tables, where there is something to show."""
+def _follow(study: Study[R, G], store: Store[R], given: G, *, draw: bool = False) -> None:
+    """Write the tables, and draw the pictures, where there is something to show."""
     if shown := _shown(study, store, given):
         study.write(shown, given)
+        if draw:
+            study.draw(shown, given)
 
 
 def _status(record: Record[Any]) -> str:
@@ -285,8 +306,8 @@ def _status(record: Record[Any]) -> str:
 
 
 def _records(
-    study: Study[F, G], groups: Sequence[tuple[Task, ...]], given: G, jobs: Jobs | None
-) -> Iterator[Record[F]]:
+    study: Study[R, G], groups: Sequence[tuple[Task, ...]], given: G, jobs: Jobs | None
+) -> Iterator[R]:
     """Measure groups of tasks here, or by `jobs` on several processes or a cluster; yield their records as they end.
 
     What has failed is not tried again in a later round.
@@ -322,10 +343,10 @@ def _rounds(groups: Sequence[tuple[Task, ...]]) -> list[list[tuple[Task, ...]]]:
     return [rounds[n] for n in sorted(rounds)]
 
 
-class _Here(Generic[F, G]):
+class _Here(Generic[R, G]):
     """Measures tasks one after the other: in this process, or in another one where the study or a limit asks for it."""
 
-    def __init__(self, study: Study[F, G], given: G) -> None:
+    def __init__(self, study: Study[R, G], given: G) -> None:
         self._study, self._given = study, given
         host.commit()  # remembered: of the code that is loaded, not of what is committed meanwhile
         # what a process leaves behind that is killed goes with the folder
@@ -339,7 +360,7 @@ class _Here(Generic[F, G]):
         self._process.close()
         self._folder.cleanup()
 
-    def record(self, task: Task) -> Record[F]:
+    def record(self, task: Task) -> R:
         study, given = self._study, self._given
         limit = study.limit(task, given)
         try:
@@ -352,13 +373,14 @@ class _Here(Generic[F, G]):
         return record_of(study, task, found)
 
 
-def record_of(study: Study[F, Any], task: Task, found: Sequence[F]) -> Record[F]:
+def record_of(study: Study[R, Any], task: Task, found: Sequence[Any]) -> R:
     """Return the record of what was found, as of now and here."""
     now = datetime.now(UTC).isoformat(timespec="seconds")
+    task = msgspec.structs.replace(task, hints={})  # of this machine alone
     return study.record(task=task, found=tuple(found), host=host.host(), commit=host.commit(), time=now)
 
 
-def _measure_group(job: tuple[Study[F, G], tuple[Task, ...], G]) -> list[Record[F]]:
+def _measure_group(job: tuple[Study[R, G], tuple[Task, ...], G]) -> list[R]:
     """Be a worker: measure a group of tasks."""
     study, group, given = job
     here = _here(type(study), given)
@@ -381,7 +403,7 @@ def _here(study: type[Study[Any, Any]], given: Any) -> _Here[Any, Any]:
     return _heres[study, given]
 
 
-def listing(study: Study[F, G], left: Sequence[Task], records: Sequence[Record[F]], given: G, n_all: int) -> str:
+def listing(study: Study[R, G], left: Sequence[Task], records: Sequence[R], given: G, n_all: int) -> str:
     """Return what --dry-run prints: a line for each row with the seconds expected, and their sum."""
     known = {r.task.row: study.took(r, given) for r in latest(records) if r.finished}
     lines: dict[tuple[str, str], list[float | None]] = {}

@@ -141,7 +141,7 @@ class Local:
 
     def _bury(self, worker: Worker) -> str:
         """Forget a worker whose pipe is closed; say how it ended."""
-        from ctsim.benchmarks.studies.methods.isolate import how_it_ended
+        from ctsim.benchmarks.engine.process import how_it_ended
 
         self._workers.remove(worker)
         worker.pipe.close()

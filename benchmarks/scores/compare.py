@@ -6,7 +6,7 @@ All of it is derived from scores that are recorded; nothing is reconstructed or 
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from ctsim.benchmarks.studies.methods.records import OK
+from ctsim.benchmarks.engine.record import OK
 
 FDK, NMAR = "fdk", "nmar"
 ANCHORED = {

@@ -7,23 +7,26 @@ share is run once. Steps are a tenth of the published; so the rows compare with 
 
 import statistics
 import sys
-from contextlib import AbstractContextManager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 
+from ctsim.benchmarks import make_dataset
+from ctsim.benchmarks.engine.process import check_limit
+from ctsim.benchmarks.engine.study import listing, measure_all
+from ctsim.benchmarks.methods import Method, find
+from ctsim.benchmarks.studies.methods import plan, records
+from ctsim.benchmarks.studies.methods.records import METAL, Run, RunRecord, RunTask, task_of
+from ctsim.benchmarks.studies.methods.study import Flags, Methods
 from ctsim.benchmarks.studies.paper.layout import load
-from ctsim.benchmarks.studies.paper.tables import ABLATION
+from ctsim.benchmarks.studies.paper.tables import ABLATION, text_of
+from ctsim.durable import write_synced
 from ctsim.errors import InputError
 from ctsim.human import human_time
-
-if TYPE_CHECKING:
-    from ctsim.benchmarks.engine.workers import Pool
-    from ctsim.benchmarks.methods import Method
-    from ctsim.benchmarks.studies.methods.records import Record
-    from ctsim.benchmarks.studies.methods.run import Options, Task
+from ctsim.store import list_scans, open_scan
 
 NAME = "ablation.md"
 # CPU seconds of a step of each preset on this suite, which ends with 65 536 splats, and its share of the warm-up, which
@@ -63,26 +66,83 @@ class Variant:
     rows: tuple[str, ...]
 
 
+class Ablation(Methods):
+    """The study of methods, on the paper's variants."""
+
+    def __init__(self, listed: "Sequence[Variant]") -> None:
+        super().__init__()
+        self._listed = {(v.scene, v.label): v for v in listed}
+        self.rates = dict(SECONDS)
+
+    def jobs(self, given: Flags) -> list[plan.Job]:
+        """List the runs scene by scene; those of scenes that are not in the data folder are left out."""
+        chosen = methods_of(list(self._listed.values()))
+        folders = {folder.name: folder for folder in list_scans(given.data)} if given.data.is_dir() else {}
+        found: list[plan.Job] = []
+        for scene in dict.fromkeys(scene for scene, _ in self._listed):
+            if scene in folders:
+                placed = [(chosen[label], (0, 0)) for where, label in self._listed if where == scene]
+                found += plan.jobs_on(open_scan(folders[scene]), (METAL,), placed)
+        return found
+
+    def pending(self, tasks: Sequence[RunTask], records: Sequence[RunRecord], given: Flags) -> list[RunTask]:
+        """Return the runs that have no record."""
+        self.rates = _rates(records)
+        return super().pending(tasks, records, given)
+
+    def expected(self, task: RunTask, given: Flags) -> float | None:
+        """Return the seconds of a run by the time of a step."""
+        params = self._listed[task.settings.scene, task.subject].params
+        return self.rates[params["preset"]] * params["steps"]
+
+    def line(self, task: RunTask) -> tuple[str, str]:
+        """Return the run and the rows of the paper's tables that show it."""
+        variant = self._listed[task.settings.scene, task.subject]
+        return f"{variant.label}  {variant.scene}", "; ".join(variant.rows)
+
+    def to_come(self, given: Flags) -> list[RunTask]:
+        """Return the runs on scans that are to be made first, whose data nobody knows yet."""
+        there = {job.stored.name for job in self.jobs(given)}
+        missing = [v for v in self._listed.values() if v.scene not in there]
+        runs = (Run(scene=v.scene, scene_id="", seed=0, method=v.method, params=v.params) for v in missing)
+        return [task_of(run, v.label, data="", code="") for run, v in zip(runs, missing, strict=True)]
+
+
 def main(arguments: list[str]) -> int:
     """Run the command; 0 if every run ended well, 1 if one failed."""
-    from ctsim.benchmarks.engine.limited import refuse_unless_positive
-
-    given = tyro.cli(Arguments, prog="run-benchmark ablation", args=arguments)
-    refuse_unless_positive(given.seconds)
-    listed = variants(given.table)
-    if given.dry_run:
-        sys.stdout.write(estimate(listed, given.data, given.results))
-        return 0
-    from ctsim.benchmarks import make_dataset
-    from ctsim.benchmarks.engine.workers import open_pool
-    from ctsim.benchmarks.studies.methods.run import Options
-
-    # what cannot run shows before scans are made
-    options, pool = Options(seconds=given.seconds, anchor=False), open_pool(given.workers, None)
+    asked = tyro.cli(Arguments, prog="run-benchmark ablation", args=arguments)
+    check_limit(asked.seconds)
+    listed = variants(asked.table)
     methods_of(listed)
+    study = Ablation(listed)
+    given = Flags(data=asked.data, results=asked.results, seconds=asked.seconds, workers=asked.workers, anchor=False)
     scenes = list(dict.fromkeys(v.scene for v in listed))
+    if asked.dry_run:
+        sys.stdout.write(_planned(study, given))
+        return 0
     code = make_dataset.main([ABLATION, str(given.data), "--only", *scenes, "--workers", str(given.workers)])
-    return code or _run(given, listed, options, pool)
+    if code:
+        return code
+    failed = measure_all(study, study.tasks(given), records.read(given.results), given)
+    found = records.read(given.results)
+    study.write(found, given)
+    text = text_of(found, "md", "paper", asked.table or ablations())
+    write_synced(given.results / NAME, text.encode())
+    sys.stdout.write(f"{text}\nWritten: {given.results / NAME}; under all protocols table.md\n")
+    return 1 if failed else 0
+
+
+def _planned(study: Ablation, given: Flags) -> str:
+    """Return what --dry-run prints: the runs that are left with the rows that show them, and scans to be made."""
+    known, tasks, later = records.read(given.results), study.tasks(given), study.to_come(given)
+    left = [*study.pending(tasks, known, given), *later]
+    text = listing(study, left, known, given, len(tasks) + len(later))
+    if later:
+        names = " ".join(dict.fromkeys(task.settings.scene for task in later))
+        text += f"scans to be made first: {names} (make-dataset {ABLATION} {given.data} --dry-run --only {names})\n"
+    steps = ", ".join(f"{preset} {human_time(rate)}" for preset, rate in study.rates.items())
+    how = "the records" if study.rates != SECONDS else "one core, measured once"
+    return f"{text}by the time of a step ({steps}): of {how}\n"
 
 
 def variants(numbers: tuple[int, ...] = ()) -> list[Variant]:
@@ -113,88 +173,15 @@ def ablations() -> tuple[int, ...]:
     return tuple(table.number for table in load().table if table.suite == ABLATION)
 
 
-def _run(
-    given: Arguments, listed: list[Variant], options: "Options", workers: AbstractContextManager["Pool | None"]
-) -> int:
-    """Run what has no record, then render tables from all records, also after Ctrl-C."""
-    from ctsim.benchmarks.studies.methods import records, run, tables
-    from ctsim.benchmarks.studies.methods.study import work
-    from ctsim.benchmarks.studies.paper import tables as paper_tables
-
-    given.results.mkdir(parents=True, exist_ok=True)
-    records.repair(given.results / records.NAME)
-    groups = [(task,) for task in run.pending(tasks(listed, given.data), given.results, force=False)]
-    try:
-        with workers as pool:
-            failed = work(groups, given.results, options, pool)
-    finally:
-        found, _ = records.read_all(given.results)
-        if found:
-            tables.write(found, given.results)
-    text = paper_tables.text_of(found, "md", "paper", given.table or ablations())
-    (given.results / NAME).write_text(text, encoding="utf-8")
-    sys.stdout.write(f"{text}\nWritten: {given.results / NAME}; under all protocols table.md\n")
-    return 1 if failed else 0
-
-
-def methods_of(listed: list[Variant]) -> "dict[str, Method]":
+def methods_of(listed: Sequence[Variant]) -> dict[str, Method]:
     """Return the methods by their labels. Raises InputError for a method or a parameter that does not exist."""
-    from ctsim.benchmarks.methods import find
-
     return {variant.label: find(variant.method, variant.params) for variant in listed}
 
 
-def tasks(listed: list[Variant], data: Path) -> "list[Task]":
-    """Return the runs as tasks, scene by scene; those of scenes that are not in `data` are left out."""
-    from ctsim.benchmarks.studies.methods.run import tasks_on
-    from ctsim.store import list_scans, open_scan
-
-    methods = methods_of(listed)
-    folders = {folder.name: folder for folder in list_scans(data)} if data.is_dir() else {}
-    found = []
-    for scene in dict.fromkeys(variant.scene for variant in listed):
-        if scene in folders:
-            stored = open_scan(folders[scene])
-            labels = [variant.label for variant in listed if variant.scene == scene]
-            found += tasks_on(stored, ("metal",), [(methods[label], (0, 0)) for label in labels])
-    return found
-
-
-def estimate(listed: list[Variant], data: Path, results: Path) -> str:
-    """Return what --dry-run prints: the runs, the rows that show them, what is recorded, and what the rest costs."""
-    from ctsim.benchmarks.studies.methods import records
-    from ctsim.benchmarks.studies.methods.run import pending
-
-    found = [r for r in records.read_all(results)[0] if r.status == records.OK and r.cost is not None]
-    there = tasks(listed, data)
-    left = {(task.stored.name, task.method.label) for task in pending(there, results, force=False)}
-    done = {(task.stored.name, task.method.label) for task in there} - left
-    took = {(r.run.scene, r.label): r.cost.wall for r in found if r.cost is not None}
-    rates, total = _rates(found), 0.0
-    lines = [("run", "scene", "rows", "state", "time")]
-    for v in listed:
-        key = (v.scene, v.label)
-        seconds = took[key] if key in done else rates[v.params["preset"]] * v.params["steps"]
-        total += 0 if key in done else seconds
-        state = "recorded" if key in done else "to run"
-        lines.append((v.label, v.scene, "; ".join(v.rows), state, human_time(seconds)))
-    widths = [max(len(line[k]) for line in lines) for k in range(4)]
-    text = "".join("  ".join([*(t.ljust(w) for t, w in zip(x, widths, strict=False)), x[4]]) + "\n" for x in lines)
-    scenes = dict.fromkeys(v.scene for v in listed if v.scene not in {task.stored.name for task in there})
-    if scenes:
-        names = " ".join(scenes)
-        text += f"scans to be made first: {names} (make-dataset {ABLATION} {data} --dry-run --only {names})\n"
-    steps = ", ".join(f"{preset} {human_time(rate)}" for preset, rate in rates.items())
-    return (
-        f"{text}total: {len(listed) - len(done)} of {len(listed)} runs, {human_time(total)}, by the time of a step "
-        f"({steps}): of {'the records' if rates != SECONDS else 'one core, measured once'}\n"
-    )
-
-
-def _rates(found: "list[Record]") -> dict[str, float]:
+def _rates(found: Sequence[RunRecord]) -> dict[str, float]:
     """Return the seconds that a step of each preset takes, warm-up included: as recorded, else as measured once."""
     known: dict[str, list[float]] = {}
-    for record in found:
+    for record in (r for r in found if r.finished):
         preset, steps = (record.run.params.get(name) for name in ("preset", "steps"))
         if preset in SECONDS and steps and record.cost is not None:
             known.setdefault(preset, []).append((record.cost.wall + record.cost.warm_up) / steps)

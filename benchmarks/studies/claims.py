@@ -8,15 +8,18 @@ import statistics
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import tyro
 
+from ctsim.benchmarks import make_dataset
+from ctsim.benchmarks.studies.methods import records, study, tables
+from ctsim.benchmarks.studies.methods.plan import Costs
+from ctsim.benchmarks.studies.methods.records import RunRecord
+from ctsim.benchmarks.suites import load, select
 from ctsim.errors import InputError
-
-if TYPE_CHECKING:
-    from ctsim.benchmarks.studies.methods.records import Record
-    from ctsim.phantoms.scene import Scene
+from ctsim.folder import is_complete
+from ctsim.human import human_time
+from ctsim.phantoms.scene import Scene, scene_id
 
 METHODS = ("fdk", "limar", "nmar", "os-sart")
 SCENE, SHARE = "lung-Fe", 0.6
@@ -58,13 +61,11 @@ class Claim:
 def main(arguments: list[str]) -> int:
     """Run the command; 0 if every claim holds, 1 if one does not or cannot be judged."""
     given = tyro.cli(Arguments, prog="run-benchmark reproduce", args=arguments)
-    from ctsim.benchmarks.studies.methods import records, tables
-
     if given.dry_run:
         return _dry_run(given)
     if not given.table and (code := _compute(given)) not in (0, 1):  # a method's failure is shown below
         return code
-    found = records.latest(records.read_all(given.results)[0])
+    found = records.latest(records.read(given.results))
     if not found:
         raise InputError(f"{given.results}: there are no records; run without --table first")
     claims = judged(found)
@@ -77,11 +78,8 @@ def main(arguments: list[str]) -> int:
 
 def _compute(given: Arguments) -> int:
     """Make the scans that are missing, then run what has no record."""
-    from ctsim.benchmarks import make_dataset
-    from ctsim.benchmarks.studies.methods import study as cli_run
-
     code = make_dataset.main(_scans_of(given))
-    return code or cli_run.main(_runs_of(given, [scene.name for scene in _scenes(given)]))
+    return code or study.main(_runs_of(given, [scene.name for scene in _scenes(given)]))
 
 
 def _scans_of(given: Arguments) -> list[str]:
@@ -95,49 +93,35 @@ def _runs_of(given: Arguments, scenes: list[str]) -> list[str]:
     return [str(given.data), str(given.results), *methods, *(word for name in scenes for word in ("--scene", name))]
 
 
-def _scenes(given: Arguments) -> "tuple[Scene, ...]":
-    from ctsim.benchmarks.suites import load, select
-
+def _scenes(given: Arguments) -> tuple[Scene, ...]:
     return select(load(given.suite), (), given.seeds)
 
 
 def _dry_run(given: Arguments) -> int:
     """Print the plans of scans to make, the runs on those that are there, and what runs on the others will take."""
-    from ctsim.benchmarks import make_dataset
-    from ctsim.benchmarks.engine import costs
-    from ctsim.benchmarks.studies.methods import records
-    from ctsim.benchmarks.studies.methods import study as cli_run
-    from ctsim.benchmarks.studies.methods.schedule import Costs
-    from ctsim.folder import is_complete
-    from ctsim.phantoms.scene import scene_id
-
     if code := make_dataset.main([*_scans_of(given), "--dry-run"]):
         return code
     scenes = _scenes(given)
     there = [scene.name for scene in scenes if is_complete(given.data, scene.name, scene_id(scene))]
-    if there and (code := cli_run.main([*_runs_of(given, there), "--dry-run"])):
+    if there and (code := study.main([*_runs_of(given, there), "--dry-run"])):
         return code
-    names = [scene.name for scene in scenes if scene.name not in there]
-    if names:
-        known = Costs(records.read_all(given.results)[0])
+    if later := len(scenes) - len(there):
+        known = Costs(records.read(given.results))
         usual = {method: known.method(method) for method in METHODS}
-        rows = [
-            (method, f"{name}, to be made, and its twin", None if seconds is None else 2 * seconds)
-            for method, seconds in usual.items()
-            for name in names
-        ]
-        how = "by each method's median in the records of earlier runs, without warm-up and scoring"
-        sys.stdout.write(costs.listing(rows, len(METHODS) * len(scenes), "pairs of runs", how))
+        seconds = sum(2 * later * s for s in usual.values() if s is not None)
+        sys.stdout.write(f"on {later} scans to be made and their twins: {human_time(seconds)}, by the records' medians")
+        unknown = [method for method, s in usual.items() if s is None]
+        sys.stdout.write(f"; never measured: {', '.join(unknown)}\n" if unknown else "\n")
     return 0
 
 
-def judged(found: "list[Record]") -> list[Claim]:
+def judged(found: list[RunRecord]) -> list[Claim]:
     """Judge every claim by the newest records of the scans with metal."""
     runs = {(r.run.scene, r.run.seed, r.label): r for r in found if r.run.variant == "metal"}
     return [_ordering(runs), *(_time(runs, method) for method in SLOWEST), _passes(runs)]
 
 
-Runs = dict[tuple[str, int, str], "Record"]
+Runs = dict[tuple[str, int, str], RunRecord]
 
 
 def _ordering(runs: Runs) -> Claim:

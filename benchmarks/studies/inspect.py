@@ -299,11 +299,11 @@ def _kept(given: Arguments, stored: "Stored") -> tuple[Volume, str, Volume | Non
     from ctsim.benchmarks.studies.methods.volumes import identity_of, own_at_50kev, read_volume
 
     assert given.results is not None
-    found, _ = records.read_all(given.results)
+    found = records.read(given.results)
     kept = {
         r.label: r
         for r in records.latest(found)
-        if r.run.scan == stored.content_hash and r.run.variant == "metal" and r.volume
+        if r.task.data == stored.content_hash and r.run.variant == "metal" and r.volume
     }
     if not kept:
         raise InputError(f"{given.results}: no volume of scene {stored.name!r} is kept; run a method first")

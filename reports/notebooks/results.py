@@ -20,13 +20,13 @@
 import os
 from pathlib import Path
 
-from ctsim.benchmarks.studies.methods.records import read_all
+from ctsim.benchmarks.studies.methods.records import read
 from ctsim.benchmarks.studies.methods.tables import render
 from ctsim.errors import InputError
 from ctsim.reports import figures, kept, show
 
 DATA, RESULTS = (Path(os.environ.get(f"CTSIM_{name.upper()}", name)) for name in ("data", "results"))
-records, _ = read_all(RESULTS)
+records = read(RESULTS)
 if not records:
     raise InputError(f"{RESULTS}: there are no records; run `run-benchmark {DATA} {RESULTS}` first")
 

@@ -3,6 +3,7 @@
 import dataclasses
 import logging
 import time
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -13,7 +14,7 @@ from ctsim.benchmarks.engine.host import measured
 from ctsim.benchmarks.methods import Method
 from ctsim.benchmarks.scores.protocol import Stored
 from ctsim.benchmarks.studies.methods import details, intermediates
-from ctsim.benchmarks.studies.methods.isolate import Outcome
+from ctsim.benchmarks.studies.methods.intermediates import Intermediates
 from ctsim.benchmarks.studies.methods.own import changed, restored
 from ctsim.benchmarks.studies.methods.records import Cost
 from ctsim.errors import InputError
@@ -27,6 +28,24 @@ log = logging.getLogger(__name__)
 
 SCORED = ("ok", "diverged")  # a run's status
 WARM, WARM_UPS = 1.0, 5  # seconds that a warm-up lasts beyond compiling, where a method knows of time, and how often
+
+
+@dataclass(slots=True, kw_only=True)
+class Outcome:
+    """How a run ended: its status and reason, the volume [z, y, x] float32 in 1/mm if any, and its cost.
+
+    `at_50kev` is the volume at 50 keV of a method that knows energies.
+    `intermediates` are what the method worked with, for pictures (`.intermediates`); `details` what it
+    says of its result, for the record (`.details`).
+    """
+
+    status: str
+    reason: str = ""
+    values: NDArray[np.float32] | None = None
+    at_50kev: NDArray[np.float32] | None = None
+    cost: Cost | None = None
+    intermediates: Intermediates = field(default_factory=dict)
+    details: dict[str, Any] = field(default_factory=dict)
 
 
 def scan_for(method: Method, stored: Stored, variant: str) -> "Scan":

@@ -8,6 +8,7 @@ import msgspec
 import torch
 
 from ctsim.benchmarks.methods import Method
+from ctsim.benchmarks.studies.methods.plan import Job
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.splat.course import PASSES, affordable
@@ -80,3 +81,12 @@ def fdk_seconds(geometry: Geometry) -> float:
 
 def _work(geometry: Geometry) -> int:
     return geometry.n_views * (math.prod(geometry.n_voxel) + PIXEL * math.prod(geometry.n_detector))
+
+
+def estimated(job: Job) -> float | None:
+    """Guess the seconds of a run from FDK's time on this machine, None for a method of the user's own."""
+    geometry = job.stored.geometry
+    fdks = in_fdks(job.method, geometry)
+    told = job.method.params.get("seconds")
+    limit = told if isinstance(told, int | float) else math.inf
+    return None if fdks is None else min(fdks * fdk_seconds(geometry), limit)

@@ -8,6 +8,7 @@ it backprojected with the metal's trace, and its prior.
 import hashlib
 import json
 import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,13 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 
+from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.texts import pictured
 from ctsim.benchmarks.scores.artefact import water_attenuation
 from ctsim.benchmarks.scores.protocol import Stored, Truth, truth_of
 from ctsim.benchmarks.studies.methods import intermediates
 from ctsim.benchmarks.studies.methods.intermediates import Intermediates
-from ctsim.benchmarks.studies.methods.records import OK, Record, latest
+from ctsim.benchmarks.studies.methods.records import RunRecord, latest
 from ctsim.benchmarks.studies.methods.volumes import identity_of, map_volume
 from ctsim.durable import replacing, sync
 
@@ -64,15 +66,15 @@ def cut(metal: NDArray[np.bool_], body: NDArray[np.bool_]) -> tuple[int, int, in
     return z, y, x
 
 
-def write_panels(records: list[Record], scans: list[Stored], results: Path) -> list[Path]:
+def write_panels(records: Sequence[RunRecord], scans: list[Stored], results: Path) -> list[Path]:
     """Draw panels/SCENE.png for every scan that has kept volumes; return what was written.
 
     A picture holds a digest of the runs and files that it shows (`_digest`); where they are the same it stays.
     """
-    mine: dict[str, list[Record]] = {}
+    mine: dict[str, list[RunRecord]] = {}
     for record in latest(records):
         if record.volume and "tissue" in record.scores and record.run.variant == "metal":
-            mine.setdefault(record.run.scan, []).append(record)
+            mine.setdefault(record.task.data, []).append(record)
     written = []
     for stored in scans:
         kept = [(r, results / str(r.volume)) for r in mine.get(stored.content_hash, [])]
@@ -88,12 +90,12 @@ def write_panels(records: list[Record], scans: list[Stored], results: Path) -> l
     return written
 
 
-def _row(record: Record, path: Path) -> Row:
+def _row(record: RunRecord, path: Path) -> Row:
     shown = intermediates.read(intermediates.path_of(path), record.identity)
     return Row(caption=_caption(record), volume=map_volume(path), shown=shown)
 
 
-def _digest(stored: Stored, kept: list[tuple[Record, Path]]) -> str:
+def _digest(stored: Stored, kept: list[tuple[RunRecord, Path]]) -> str:
     """Hash what a picture depends on: the scan, the runs with their scores, their files, and how it is drawn.
 
     A file counts by its size and time: a run that is done again has the same identity.
@@ -125,7 +127,7 @@ def _held(picture: Path) -> str | None:
         return None
 
 
-def _caption(record: Record) -> str:
+def _caption(record: RunRecord) -> str:
     """Name the method and its scores under `tissue`, as they stand in the tables."""
     values = record.scores["tissue"].values
     psnr, ssim = values["psnr3d"], values["ssim3d"]

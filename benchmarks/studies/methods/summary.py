@@ -5,12 +5,13 @@ table has a million of them: they are plain tuples, which the collector of garba
 """
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ctsim.benchmarks.engine.texts import harmless
 from ctsim.benchmarks.scores.columns import COLUMNS
 from ctsim.benchmarks.scores.compare import COMPARED, Row, derived
-from ctsim.benchmarks.studies.methods.records import Record, latest
+from ctsim.benchmarks.studies.methods.records import RunRecord, latest
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,7 +26,7 @@ volumes was scored; whether no seed has it because the volumes are the reference
 Numbers = dict[Key, Number]
 
 
-def numbers(shown: list[Record]) -> Numbers:
+def numbers(shown: Sequence[RunRecord]) -> Numbers:
     """Return the numbers of records that `records.latest` kept, in their order, those derived from them last."""
     found: Numbers = {}
     seeds: dict[Key, list[Number]] = {}
@@ -119,7 +120,7 @@ _COLUMNS = (
 )
 
 
-def summary(records: list[Record]) -> "pd.DataFrame":
+def summary(records: Sequence[RunRecord]) -> "pd.DataFrame":
     """Return the numbers of the latest records as table.csv holds them, a row each."""
     import pandas as pd
 

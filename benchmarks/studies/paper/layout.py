@@ -15,7 +15,7 @@ import msgspec
 from ctsim.benchmarks.engine import latex
 from ctsim.benchmarks.engine.texts import escape, ranked
 from ctsim.benchmarks.methods import Method
-from ctsim.benchmarks.scores.columns import COLUMNS, Column
+from ctsim.benchmarks.scores.columns import COLUMNS, Metric
 from ctsim.benchmarks.studies.paper.scenes import title
 from ctsim.errors import InputError
 
@@ -46,7 +46,7 @@ class Heading(What, frozen=True, kw_only=True, forbid_unknown_fields=True):
     group: str = ""
 
     @property
-    def column(self) -> Column:
+    def column(self) -> Metric:
         """How its metric is shown."""
         return COLUMNS["cost" if self.metric == "wall" else "paper"][self.metric]
 

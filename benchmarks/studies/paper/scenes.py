@@ -5,24 +5,20 @@ A record is of a planned scene when its `scene_id` is that of the bundled scene 
 """
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 import msgspec
 
+from ctsim.benchmarks.studies.methods.records import Run, RunRecord
+from ctsim.benchmarks.suites import load
 from ctsim.errors import InputError
-
-if TYPE_CHECKING:
-    from ctsim.benchmarks.studies.methods.records import Record, Run
-    from ctsim.phantoms.scene import Scene
+from ctsim.phantoms.scene import Scene, scene_id
 
 
 class Scenes:
     """The planned scenes by suite and name, and the identities that they have under a seed."""
 
-    def __init__(self, planned: "Iterable[tuple[str, str]]") -> None:
+    def __init__(self, planned: Iterable[tuple[str, str]]) -> None:
         """Read the suites of the planned scenes (suite, name)."""
-        from ctsim.benchmarks.suites import load
-
         wanted = set(planned)
         suites = {suite: load(suite) for suite in sorted({suite for suite, _ in wanted})}
         self._scenes = {(k, s.name): s for k, scenes in suites.items() for s in scenes if (k, s.name) in wanted}
@@ -31,15 +27,15 @@ class Scenes:
             self._named.setdefault(key[1], []).append(key)
         self._known: dict[tuple[tuple[str, str], int], tuple[str, ...]] = {}
 
-    def named(self, run: "Run") -> list[tuple[str, str]]:
+    def named(self, run: Run) -> list[tuple[str, str]]:
         """Return the planned scenes that have this run's name."""
         return self._named.get(run.scene, [])
 
-    def of(self, run: "Run") -> tuple[str, str] | None:
+    def of(self, run: Run) -> tuple[str, str] | None:
         """Return the planned scene that this run is of; None where it has no more in common than the name."""
         return next((key for key in self.named(run) if run.scene_id in self.identities(key, run)), None)
 
-    def identities(self, key: tuple[str, str], run: "Run") -> tuple[str, ...]:
+    def identities(self, key: tuple[str, str], run: Run) -> tuple[str, ...]:
         """Return the identities of a planned scene with the run's seed, as itself and as a repetition; none if bad."""
         asked = (key, run.seed)
         if asked not in self._known:
@@ -48,9 +44,7 @@ class Scenes:
         return self._known[asked]
 
 
-def _identity(scene: "Scene", name: str, seed: int) -> str:
-    from ctsim.phantoms.scene import scene_id
-
+def _identity(scene: Scene, name: str, seed: int) -> str:
     try:
         return scene_id(msgspec.structs.replace(scene, name=name, seed=seed))
     except InputError:  # no scene has such a seed
@@ -62,7 +56,7 @@ def title(key: tuple[str, str]) -> str:
     return "/".join(key)
 
 
-def strangers(found: "list[Record]", scenes: Scenes, planned: Iterable[tuple[str, str, str]]) -> list[str]:
+def strangers(found: list[RunRecord], scenes: Scenes, planned: Iterable[tuple[str, str, str]]) -> list[str]:
     """Say how many records have the name of a planned cell (suite, scene, label) but are of no planned scene."""
     cells: dict[tuple[str, str], set[str]] = {}
     for suite, scene, label in planned:
@@ -75,7 +69,7 @@ def strangers(found: "list[Record]", scenes: Scenes, planned: Iterable[tuple[str
     return [_stranger(key, runs, scenes) for key, runs in left.items()]
 
 
-def _stranger(key: tuple[str, str], runs: "list[Run]", scenes: Scenes) -> str:
+def _stranger(key: tuple[str, str], runs: list[Run], scenes: Scenes) -> str:
     count = "1 record is" if len(runs) == 1 else f"{len(runs)} records are"
     ids = _some(run.scene_id for run in runs)
     expected = _some(f"{' or '.join(scenes.identities(key, run)) or 'none'} (seed {run.seed})" for run in runs)

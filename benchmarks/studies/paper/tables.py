@@ -9,12 +9,16 @@ import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import tyro
 
+from ctsim.benchmarks.engine.record import OK, merged
 from ctsim.benchmarks.methods import TABLE
+from ctsim.benchmarks.scores.protocol import VERSION
+from ctsim.benchmarks.studies.methods import records, tables
+from ctsim.benchmarks.studies.methods.records import RunRecord, case_of
 from ctsim.benchmarks.studies.paper.layout import (
     Cell,
     Form,
@@ -29,9 +33,6 @@ from ctsim.benchmarks.studies.paper.layout import (
 )
 from ctsim.benchmarks.studies.paper.scenes import Scenes, strangers, title
 from ctsim.errors import InputError
-
-if TYPE_CHECKING:
-    from ctsim.benchmarks.studies.methods.records import Record
 
 Protocol = Literal["paper", "tissue", "aligned", "aligned_50kev"]
 ABLATION = "ablation"
@@ -59,31 +60,23 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def read(folders: tuple[Path, ...]) -> "list[Record]":
+def read(folders: tuple[Path, ...]) -> "list[RunRecord]":
     """Read the records of all folders, oldest first. Raises InputError where a folder or all are missing."""
-    from ctsim.benchmarks.engine import lines
-    from ctsim.benchmarks.studies.methods import records
-
     if not folders:
         raise InputError("no folder is given, expected one or more with records of run-benchmark")
-    found: list[list[Record]] = []
+    found: list[list[RunRecord]] = []
     for folder in folders:
         if not folder.is_dir():
             raise InputError(f"{folder}: there is no such folder, expected one with records of run-benchmark")
-        part, torn = records.read_all(folder)
-        found.append(part)
-        for rest in torn:
-            sys.stderr.write(f"{rest}\n")
-    return lines.merged(found)
+        found.append(records.read(folder))
+    return merged(found)
 
 
-def text_of(found: "list[Record]", form: Form, protocol: Protocol, numbers: tuple[int, ...] = ()) -> str:
+def text_of(found: "list[RunRecord]", form: Form, protocol: Protocol, numbers: tuple[int, ...] = ()) -> str:
     """Return the numbered tables, all where none is named, as text.
 
     Raises InputError for a table that the paper lacks.
     """
-    from ctsim.benchmarks.studies.methods import records
-
     paper = load()
     measured = Measured.of(found, paper)
     parts = [render(fill(t, measured, protocol), form) for t in chosen(paper, numbers)]
@@ -110,37 +103,39 @@ class Measured:
     the records before, whose scenes have the names of the scans.
     """
 
-    runs: "dict[tuple[str, str], list[Record]]"
+    runs: "dict[tuple[str, str], list[RunRecord]]"
     numbers: dict[tuple[str, str, str, str], dict[Any, Any]]
     replaced: dict[str, int]
-    all: "list[Record]"
+    all: "list[RunRecord]"
     scenes: Scenes
 
     @classmethod
-    def of(cls, found: "list[Record]", paper: Paper) -> "Measured":
+    def of(cls, found: "list[RunRecord]", paper: Paper) -> "Measured":
         """Keep what counts of records that are sorted by time."""
         from ctsim.benchmarks.studies.methods import records, tables
 
         scenes = Scenes((p.suite, p.scene) for table in paper.table for row in table.plan() for p in row)
-        own = [r for r in found if r.run.variant == "metal" and r.run.protocol == records.VERSION]
+        own = [r for r in found if r.run.variant == "metal" and r.task.version == VERSION]
         known = [_called(r, title(key)) for r in own if (key := scenes.of(r.run)) is not None]
         latest = records.latest(known)
-        runs: dict[tuple[str, str], list[Record]] = {}
+        runs: dict[tuple[str, str], list[RunRecord]] = {}
         for record in latest:
             runs.setdefault((record.run.scene, record.label), []).append(record)
-        data = {(r.run.scene, r.run.seed): r.run.scan for r in latest}
+        data = {(r.run.scene, r.run.seed): r.task.data for r in latest}
         replaced: dict[str, int] = {}
         for record in known:
-            if record.run.scan != data[record.run.scene, record.run.seed]:
+            if record.task.data != data[record.run.scene, record.run.seed]:
                 replaced[record.run.scene] = replaced.get(record.run.scene, 0) + 1
         rows: list[dict[Any, Any]] = tables.summary(latest).to_dict("records")
         numbers = {(row["scene"], row["method"], row["protocol"], row["metric"]): row for row in rows}
         return cls(runs=runs, numbers=numbers, replaced=replaced, all=own, scenes=scenes)
 
 
-def _called(record: "Record", scene: str) -> "Record":
+def _called(record: "RunRecord", scene: str) -> "RunRecord":
     """Return a record whose scene has this name; the identity stays that of the run as it was."""
-    return msgspec.structs.replace(record, run=msgspec.structs.replace(record.run, scene=scene))
+    run = msgspec.structs.replace(record.run, scene=scene)
+    task = msgspec.structs.replace(record.task, settings=run, case=case_of(run))
+    return msgspec.structs.replace(record, task=task)
 
 
 def fill(table: Table, measured: Measured, protocol: str) -> Sheet:
@@ -163,8 +158,6 @@ def fill(table: Table, measured: Measured, protocol: str) -> Sheet:
 
 def _cell(table: Table, k: int, planned: Planned, measured: Measured, protocol: str) -> Cell:
     """Return our cell of column `k`: mean ± standard deviation over seeds; of a failed run its status."""
-    from ctsim.benchmarks.studies.methods.records import OK
-
     metric = table.columns[k].metric
     runs = measured.runs.get((planned.place, planned.label), [])
     bad = [r.status for r in runs if r.status != OK]
@@ -180,10 +173,8 @@ def _cell(table: Table, k: int, planned: Planned, measured: Measured, protocol: 
     return Cell(number=float(row["mean"]), text=" ± ".join(texts))
 
 
-def caption(table: Table, used: "list[Record]", protocol: str) -> str:
+def caption(table: Table, used: "list[RunRecord]", protocol: str) -> str:
     """State protocol, region, reference, range, seeds, inputs and metal insertion of our columns, and what compares."""
-    from ctsim.benchmarks.studies.methods import tables
-
     timed = all(column.metric == "wall" for column in table.columns)
     parts = [f"The paper's Table {table.number} and what was measured here."]
     if not timed:
@@ -203,7 +194,7 @@ def caption(table: Table, used: "list[Record]", protocol: str) -> str:
     return " ".join(parts)
 
 
-def _circumstances(used: "list[Record]", timed: bool) -> list[str]:
+def _circumstances(used: "list[RunRecord]", timed: bool) -> list[str]:
     """Say under which circumstances the records came about."""
     seeds = sorted({r.run.seed for r in used})
     counts = {len({r.run.seed for r in used if (r.run.scene, r.label) == (s.run.scene, s.label)}) for s in used}
@@ -223,7 +214,7 @@ def _circumstances(used: "list[Record]", timed: bool) -> list[str]:
     return [*parts, f"Inputs: {inputs}.", f"Metal insertion: {metal}."]
 
 
-def _by(used: "list[Record]", what: "Callable[[Record], str]") -> str:
+def _by(used: "list[RunRecord]", what: "Callable[[RunRecord], str]") -> str:
     """Group the methods of records by what they have in common: "metal mask, oracle (limar, nmar)"."""
     groups: dict[str, dict[str, None]] = {}
     for record in used:
@@ -235,10 +226,8 @@ def _joined(texts: Iterable[str], by: str = ", ") -> str:
     return by.join(dict.fromkeys(texts))
 
 
-def _remarks(used: "list[Record]", measured: Measured) -> list[str]:
+def _remarks(used: "list[RunRecord]", measured: Measured) -> list[str]:
     """Say which runs failed and why, and how many records older data have left behind."""
-    from ctsim.benchmarks.studies.methods.records import OK
-
     failed = [f"{r.run.scene}, {r.label}: {r.status} – {r.reason or 'no reason given'}" for r in used if r.status != OK]
     scenes = dict.fromkeys(r.run.scene for r in used)
     old = [

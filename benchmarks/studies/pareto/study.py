@@ -58,7 +58,7 @@ class Flags(study.Flags):
     """Threads of the kernels."""
 
 
-class Pareto(study.Study[Run, Flags]):
+class Pareto(study.Study[Record[Run], Flags]):
     """The study."""
 
     name = file = "pareto"

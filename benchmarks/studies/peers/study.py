@@ -35,7 +35,7 @@ class Flags(study.Flags):
         return SMALL if self.small else FULL
 
 
-class Peers(study.Study[Measurement, Flags]):
+class Peers(study.Study[Record[Measurement], Flags]):
     """The study. A task is a case: its contenders run in turns, so all are measured together."""
 
     name = file = "peers"

@@ -37,7 +37,7 @@ class Flags(study.Flags):
     """Scene lung-Fe of the suite core, or tiny grids that prove the command and say nothing about speed."""
 
 
-class Skipping(study.Study[Skip, Flags]):
+class Skipping(study.Study[Record[Skip], Flags]):
     """The study."""
 
     name = file = "skipping"

@@ -69,7 +69,7 @@ class Flags(study.Options):
     """Time limit of one row, compilation and the start of its process included."""
 
 
-class Stress(study.Study[Outcome, Flags]):
+class Stress(study.Study[Record[Outcome], Flags]):
     """The study."""
 
     name = file = "stress"

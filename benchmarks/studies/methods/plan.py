@@ -1,0 +1,176 @@
+"""Which runs there are: scans and methods as tasks, which of them are left, in what order, and what they will take."""
+
+import functools
+import pkgutil
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+from ctsim.benchmarks import methods
+from ctsim.benchmarks.engine.record import done
+from ctsim.benchmarks.methods import Method
+from ctsim.benchmarks.scores.artefact import lacks_twin
+from ctsim.benchmarks.scores.protocol import Stored
+from ctsim.benchmarks.studies.methods.records import METAL, TWIN, Run, RunRecord, RunTask, rank, task_of
+from ctsim.benchmarks.studies.methods.volumes import identity_of
+from ctsim.errors import InputError
+from ctsim.phantoms.suites import read_toml
+
+OPEN = "ctsim.store:open_scan"
+"""The function that opens a scan's folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One run to do: a scan (the twin without metal where `variant` says so) and a method.
+
+    `scene` and `seed` are those of `repetition`; `place` are the numbers of the scan and of the method among those
+    asked for.
+    """
+
+    stored: Stored
+    variant: str
+    method: Method
+    scene: str
+    seed: int
+    place: tuple[int, int] = (0, 0)
+    open: str = OPEN
+
+    @functools.cached_property
+    def task(self) -> RunTask:
+        """What determines the result, and where a worker finds scan and method."""
+        run = Run(
+            scene=self.scene,
+            scene_id=self.stored.scene_id,
+            seed=self.seed,
+            method=self.method.target,
+            params=self.method.params,
+            mask=self.method.mask,
+            variant=self.variant,
+        )
+        return task_of(
+            run,
+            self.method.label,
+            data=self.stored.content_hash,
+            code=self.method.code,
+            place=self.place,
+            name=self.stored.name,
+            folder=str(self.stored.folder.resolve()),
+            method=self.method.name,
+            overrides=self.method.overrides,
+            open=self.open,
+        )
+
+
+def repetition(stored: Stored) -> tuple[str, int]:
+    """Return the scene's name and its seed; make-dataset names the repetitions of a scene NAME-sSEED."""
+    path = stored.folder / "scene.toml"
+    recipe = read_toml(path, "that make-dataset wrote") if path.exists() else {}
+    seed = recipe.get("seed", stored.info.seed)
+    if not isinstance(seed, int):
+        raise InputError(f"{path}: seed must be a whole number, got {seed!r}")
+    return stored.name.removesuffix(f"-s{seed}"), seed
+
+
+def jobs(scans: Sequence[Stored], chosen: Sequence[Method], *, anchor: bool) -> list[Job]:
+    """List every run: all methods on all scans; with `anchor` each on the metal-free twin first where there is one."""
+    found = []
+    for i, stored in enumerate(scans):
+        variants = (TWIN, METAL) if anchor and stored.metal_free is not None else (METAL,)
+        found += jobs_on(stored, variants, [(method, (i, k)) for k, method in enumerate(chosen)])
+    return found
+
+
+def jobs_on(
+    stored: Stored, variants: Sequence[str], placed: Sequence[tuple[Method, tuple[int, int]]], open: str = OPEN
+) -> list[Job]:
+    """List the runs of methods, each with its place, on a scan and on its twin, as `variants` say."""
+    scene, seed = repetition(stored)
+    return [
+        Job(stored=stored, variant=variant, method=method, scene=scene, seed=seed, place=place, open=open)
+        for method, place in placed
+        for variant in variants
+    ]
+
+
+def volume_name(task: RunTask) -> str:
+    """Return the path of a kept volume in the results folder: scene and method with what the file system allows."""
+    label = "".join(c if c.isalnum() or c in "-.=" else "_" for c in task.subject)
+    twin = "" if task.part == METAL else "__metal_free"
+    return f"volumes/{task.hints['name']}{twin}__{label}.tif"
+
+
+def is_kept(task: RunTask, results: Path) -> bool:
+    """Whether the volume on the disk is this very run's, not one of other parameters, code or data."""
+    return identity_of(results / volume_name(task)) == task.identity
+
+
+def job_of(task: RunTask) -> Job:
+    """Return a task with its scan and method."""
+    hints = task.hints
+    stored = pkgutil.resolve_name(hints["open"])(Path(hints["folder"]))
+    method = methods.find(hints["method"], hints["overrides"])
+    (job,) = jobs_on(stored, (task.part,), [(method, (task.place[0], task.place[1]))], hints["open"])
+    if job.task.identity != task.identity:
+        raise InputError(
+            f"{task.subject} on {stored.name}: a worker has another version of the data or of the method's code than "
+            "this command; expected the same files and the same installation"
+        )
+    return job
+
+
+def pending(tasks: Sequence[RunTask], records: Sequence[RunRecord], results: Path) -> list[RunTask]:
+    """Keep the tasks that have no record that ended well; a scan's kept volume is not asked for.
+
+    A scan that was scored without its twin's volume is run again where the twin is among the tasks. A twin is run
+    again where its scan is to be run and the twin's volume was not kept.
+    """
+    known = done(records)
+    alone = {r.task.identity for r in records if r.finished and lacks_twin(r.scores)}
+    alone -= {r.task.identity for r in records if r.finished and not lacks_twin(r.scores)}
+    twins = {(task.case, task.subject): task for task in tasks if task.part == TWIN}
+    left: list[RunTask] = []
+    for task in (t for t in tasks if t.part == METAL):
+        twin = twins.get((task.case, task.subject))
+        wanted = not known[task.identity] or (twin is not None and task.identity in alone)
+        if twin is not None and (not known[twin.identity] or (wanted and not is_kept(twin, results))):
+            left.append(twin)
+        if wanted:
+            left.append(task)
+    return left
+
+
+class Costs:
+    """Seconds that runs took, from records of runs that ended well; without warm-up and scoring."""
+
+    def __init__(self, records: Sequence[RunRecord]) -> None:
+        self._rows: dict[tuple[str, str, str], float] = {}
+        self._methods: dict[str, list[float]] = {}
+        for record in records:
+            if record.finished and (cost := record.cost) is not None:
+                self._rows[record.task.row] = cost.wall
+                self._methods.setdefault(record.label, []).append(cost.wall)
+
+    def method(self, label: str) -> float | None:
+        """Return the median of a method's seconds, None where it has never run."""
+        return statistics.median(self._methods[label]) if label in self._methods else None
+
+    def task(self, task: RunTask) -> float | None:
+        """Return what the same scan took the last time, else the method's median, else None."""
+        return self._rows.get(task.row, self.method(task.subject))
+
+
+def ordered(left: Sequence[RunTask], costs: Costs) -> list[tuple[RunTask, ...]]:
+    """Part runs into groups, a scan's after its twin's, so that a table soon has whole rows: cheap methods go first.
+
+    A method that has never run counts as dear as those before it in the methods table, which lists the cheap first.
+    """
+    labels = sorted(dict.fromkeys(task.subject for task in left), key=rank)
+    expected: dict[str, float] = {}
+    for label in labels:
+        known = costs.method(label)
+        expected[label] = max(expected.values(), default=0.0) if known is None else known
+    groups = [tuple(tasks) for _, tasks in groupby(left, key=lambda task: (task.case, task.subject))]
+    return sorted(groups, key=lambda g: (expected[g[0].subject], labels.index(g[0].subject), g[0].place))
