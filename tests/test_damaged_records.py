@@ -5,6 +5,8 @@ import random
 
 import msgspec
 import pytest
+from ctsim.benchmarks.studies.pareto.records import latest, points
+from ctsim.benchmarks.studies.pareto.records import read as read_pareto
 from test_paper_tables import record
 from test_pareto_points import setting, timed
 
@@ -15,8 +17,6 @@ from ctsim.benchmarks.engine.record import Record, Store, Task, done
 from ctsim.benchmarks.methods import parse_overrides
 from ctsim.benchmarks.studies.methods import records, tables
 from ctsim.benchmarks.studies.methods.records import RunRecord
-from ctsim.benchmarks.studies.pareto.records import latest, points
-from ctsim.benchmarks.studies.pareto.records import read as read_pareto
 from ctsim.benchmarks.studies.peers import cases as peer_cases
 from ctsim.benchmarks.studies.peers import tables as peer_tables
 from ctsim.benchmarks.studies.skipping.finding import Skip

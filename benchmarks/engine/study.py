@@ -305,9 +305,7 @@ def _status(record: Record[Any]) -> str:
     return next((one.status for one in record.found if one.status != OK), good)
 
 
-def _records(
-    study: Study[R, G], groups: Sequence[tuple[Task, ...]], given: G, jobs: Jobs | None
-) -> Iterator[R]:
+def _records(study: Study[R, G], groups: Sequence[tuple[Task, ...]], given: G, jobs: Jobs | None) -> Iterator[R]:
     """Measure groups of tasks here, or by `jobs` on several processes or a cluster; yield their records as they end.
 
     What has failed is not tried again in a later round.
