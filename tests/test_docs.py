@@ -65,7 +65,8 @@ def arguments_of(name: str, words: list[str]) -> tuple[type, list[str]] | None:
         return None
     form = Options if name.endswith("make-dataset") else Arguments
     if form is Arguments and words and (module := OTHERS.get(words[0])):
-        form, words = importlib.import_module(module).Arguments, words[1:]
+        loaded, words = importlib.import_module(module), words[1:]
+        form = loaded.Flags if hasattr(loaded, "Flags") else loaded.Arguments
     return (form, words) if any(not word.startswith("-") for word in words) else None
 
 
