@@ -119,8 +119,11 @@ def test_a_study_s_table_becomes_a_page(tmp_path, monkeypatch, capsys):
     assert text.startswith("# T: measured\n\nMade by `make it`, then `") and text.endswith("| 1 |\n")
     assert "Title of its own" not in text and "commit 0123456789ab" in text
     (tmp_path / "t.md").write_text("| a |\n")
-    with pytest.raises(InputError, match="names no commit"):
+    with pytest.raises(InputError, match="name a commit"):
         measured.main(["mine", str(tmp_path), str(tmp_path / "docs")])
+    (tmp_path / "records.jsonl").write_text('{"commit": "abcdef0123456789"}\n' * 2)
+    assert measured.main(["mine", str(tmp_path), str(tmp_path / "docs")]) == 0
+    assert "\nMeasured at commit abcdef012345.\n" in (tmp_path / "docs" / "mine.md").read_text()
 
 
 def test_git_s_errors_are_one_sentence(tmp_path):

@@ -7,6 +7,7 @@ machine, becomes the page, under a title and the command that measures it. `run-
 docs/measured/results.md` writes the page of the results.
 """
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -24,21 +25,30 @@ def main(arguments: list[str]) -> int:
     page = page_named(name)
     if page.file is None:
         raise InputError(f"{name}: no single study writes this page; its head says how it is made")
-    text = page_text(name, page, (results / page.file).read_text(encoding="utf-8"))
+    text = page_text(name, page, (results / page.file).read_text(encoding="utf-8"), recorded(results))
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.md").write_text(text, encoding="utf-8")
     sys.stdout.write(f"{folder / f'{name}.md'}\n")
     return 0
 
 
-def page_text(name: str, page: Page, table: str) -> str:
+def recorded(results: Path) -> list[str]:
+    """Return the commits in the records of `run-benchmark`, each once, in their order."""
+    path = results / "records.jsonl"
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return list(dict.fromkeys(str(json.loads(line)["commit"])[:12] for line in lines))
+
+
+def page_text(name: str, page: Page, table: str, commits: list[str]) -> str:
     """Return a page: title, how it was made, and the study's table as it is.
 
-    Raises InputError where the table names no commit.
+    `commits` are those of the records, for a table that names none. Raises InputError where there are none either.
     """
     if not commits_of(table):
-        raise InputError(f"{name}: the table names no commit, expected one that the study wrote")
-    body = re.sub(r"\A# .*\n+", "", table)
+        if not commits:
+            raise InputError(f"{name}: neither table nor records name a commit, expected one that the study wrote")
+        table = f"Measured at commit {', '.join(commits)}.\n\n{table}"
+    body = re.sub(r"^# .*\n+", "", table, flags=re.M)
     explained = f" [What the numbers say](../explanation/{page.explained})." if page.explained else ""
     made = f"Made by `{page.command}`, then `python -m ctsim.benchmarks.tools.measured {name} results/ docs/measured`."
     return f"# {page.title}: measured\n\n{made} Do not edit.{explained}\n\n{body.strip()}\n"

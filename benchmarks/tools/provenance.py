@@ -54,7 +54,7 @@ PAGES: dict[str, Page] = {
         explained="splats.md",
     ),
     "skipping": Page(
-        title="What is left out: time and difference",
+        title="What is left out",
         command="run-benchmark skipping results/ --repeats 3",
         sources=(*SIMULATOR, "reconstruct/", "baselines/", "benchmarks/studies/skipping/"),
         file="skipping.md",

@@ -15,8 +15,8 @@ from ctsim.phantoms.scene import Scene
 HEAD = """# Scene keys
 
 A scene file is TOML. Each `[[scene]]` table is one scene. The keys of `[defaults]` hold for all scenes of the file,
-table by table. A file with one scene may have the scene's keys at the top. A key that is not listed here is refused by name.
-The text `"null"` stands for an empty value. [Write a scene](../tutorials/write-a-scene.md) is the tutorial."""
+table by table. A file with one scene may have its keys at the top level. A key that is not listed here is refused by
+name. The text `"null"` stands for an empty value. [Write a scene](../tutorials/write-a-scene.md) is the tutorial."""
 
 
 def page() -> str:
