@@ -11,7 +11,7 @@ import tifffile
 import tyro
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.M | re.S)
 BLOCKS = [
     pytest.param(kind, text, id=f"{page.relative_to(ROOT)}-{number}")
@@ -23,6 +23,7 @@ MARKED = [p for p in BLOCKS if p.values[0] in ("python", "toml")]
 
 def test_there_are_examples():
     assert {p.values[0] for p in BLOCKS} >= {"python", "toml", "bash"}
+    assert {page.parent.name for page in PAGES} >= {"tutorials", "how-to", "explanation", "reference", "measured"}
 
 
 @pytest.mark.parametrize(("kind", "text"), MARKED)
@@ -39,7 +40,7 @@ def test_an_example_works(kind, text, smallest, tmp_path, monkeypatch):
         assert all(build(scene).labels.any() for scene in parse_suite(text))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_links_lead_to_files(page):
     for link in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
         if not link.startswith(("http://", "https://", "mailto:")):
@@ -70,7 +71,7 @@ def arguments_of(name: str, words: list[str]) -> tuple[type, list[str]] | None:
     return (form, words) if any(not word.startswith("-") for word in words) else None
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_commands_in_the_pages_are_understood(page):
     """Every make-dataset and run-benchmark line parses: its flags exist."""
     for line in commands(page.read_text(encoding="utf-8")):
