@@ -30,8 +30,8 @@ _SPARE = 64 * 2**20  # bytes left free for the file system's own needs
 class Options:
     """Simulate the scans of a suite, with their ground truth, into a data folder.
 
-    An interrupted run goes on where it stopped when it is started again; finished scenes are skipped. Those that
-    other code of the simulator made are named; an unfinished one is begun anew.
+    An interrupted run continues when it is started again; finished scenes are skipped. A message names finished scenes
+    that other code of the simulator made. An unfinished scene of other code starts again.
     """
 
     suite: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SUITE")]
@@ -49,9 +49,9 @@ class Options:
     seeds: tuple[int, ...] = ()
     """Make every scene once for each of these seeds, as NAME-sSEED."""
     workers: int = 1
-    """Make so many scenes at once, each with its share of the cores."""
+    """Number of scenes made at once, each with its share of the cores."""
     scheduler: Annotated[str | None, tyro.conf.arg(metavar="tcp://HOST:PORT")] = None
-    """Let the workers of this Dask scheduler make the scenes; OUT must be the same folder for them."""
+    """Make the scenes on the workers of this Dask scheduler; OUT must be the same folder for them."""
 
 
 def main(argv: list[str]) -> int:

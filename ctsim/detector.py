@@ -21,15 +21,18 @@ _DEPTHS = 24  # Gauss–Legendre nodes over the depth of the first interaction, 
 
 
 class Detector(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A detector and its sensitive thickness (mm).
+    """A detector.
 
-    `kind`: "gos" and "csi" integrate energy, with K-escape; "ideal" integrates E(1 − exp(−μt)) of GOS, for
-    comparison; "counting" counts photons that deposit more than `threshold` keV in CdTe.
+    "gos" and "csi" integrate energy, with K-escape. "ideal" integrates E(1 − exp(−μt)) of GOS, for comparison.
+    "counting" counts photons that deposit more than `threshold` in CdTe.
     """
 
     kind: Literal["gos", "csi", "ideal", "counting"] = "gos"
+    """The sensitive layer."""
     thickness: float = 0.1
+    """Its thickness in mm."""
     threshold: float = 15.0
+    """Threshold of "counting" in keV."""
 
     def __post_init__(self) -> None:
         if self.kind not in _SLAB:

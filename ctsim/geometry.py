@@ -26,25 +26,35 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A scan's geometry: source and detector poses, detector pixels, and the reconstruction grid.
 
-    Lengths are mm. `n_voxel`, `d_voxel`, `off_origin` are (z, y, x); `n_detector`, `d_detector`,
-    `off_detector` are (v, u). Views lie at start_deg + k·arc_deg/n_views, or at `angles_deg`, or at
-    `poses` (one 12-vector a view: source, detector centre, u step, v step; each x, y, z in mm, the
-    steps one pixel long), which then replace dso, dsd and the offsets for the rays.
+    Lengths are mm. Views lie at start_deg + k·arc_deg/n_views, or at `angles_deg`, or at `poses`.
     """
 
     dso: float
+    """Distance from the source to the axis."""
     dsd: float
+    """Distance from the source to the detector."""
     n_voxel: tuple[Count, Count, Count]
+    """Voxels (z, y, x) of the reconstruction grid."""
     d_voxel: Triple
+    """Size of a voxel (z, y, x)."""
     n_detector: tuple[Count, Count]
+    """Pixels (v, u)."""
     d_detector: Pair
+    """Size of a pixel (v, u)."""
     n_views: Count
+    """Number of views."""
     off_origin: Triple = (0.0, 0.0, 0.0)
+    """Centre of the grid (z, y, x)."""
     off_detector: Pair = (0.0, 0.0)
+    """Shift of the detector (v, u) along its own axes."""
     start_deg: float = 0.0
+    """Angle of the first view."""
     arc_deg: float = 360.0
+    """Arc of the scan; negative is clockwise."""
     angles_deg: tuple[float, ...] | None = None
+    """The angle of each view, instead of even steps."""
     poses: tuple[tuple[float, ...], ...] | None = None
+    """12 numbers a view: source, detector centre, u step, v step; each x, y, z, the steps one pixel long."""
 
     def __post_init__(self) -> None:
         for name in ("dso", "dsd", "d_voxel", "d_detector", "off_origin", "off_detector", "start_deg", "arc_deg"):

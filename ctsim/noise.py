@@ -17,28 +17,28 @@ _NO_PATTERN = np.empty((2, 0, 0), np.float32)
 class Noise(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How photons become counts.
 
-    `electronic` is the standard deviation of the electronic noise in photons that reach an open pixel (10 in TIGRE's
-    demos). The ADC's open field lies at `adc_fill` and its pedestal at `pedestal`, both fractions of full scale;
-    `adc_bits = None` writes float32 photons without pedestal, and so do "tigre" and "none". `n_flats` flats are
-    averaged (0: a perfect flat). `dead_fraction` is the share of pixels that always read the pedestal.
-
-    `fixed_pattern` is the relative standard deviation of the pixels' gains in the open field, which dividing by the
-    flat takes out. A pixel's gain also changes linearly from there to no signal, by `pattern_residual` times as much,
-    drawn anew; that stays after the flat and makes rings. The default, a tenth, is a choice.
-
     Model "tigre" is TIGRE's: P is normalised by the largest of the scan (of the twin by its own, so that the noise of
     the two differs everywhere). It has no fixed pattern, dead pixels, bow-tie or heel.
     """
 
     model: Literal["compound", "tigre", "none"] = "compound"
+    """Compound Poisson noise, the noise of TIGRE, or none."""
     electronic: Annotated[float, msgspec.Meta(ge=0)] = 5.0
+    """Standard deviation of the electronic noise, in photons at an open pixel (10 in TIGRE's demos)."""
     adc_bits: Annotated[int, msgspec.Meta(ge=4, le=16)] | None = 16
+    """Bits of the ADC; null, "tigre" and "none" write float32 photons without pedestal."""
     adc_fill: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.8
+    """The open field as a share of full scale."""
     pedestal: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.02
+    """The dark level as a share of full scale."""
     n_flats: Annotated[int, msgspec.Meta(ge=0, le=10_000)] = 64
+    """Open-field images that are averaged; 0 is a perfect flat."""
     fixed_pattern: Annotated[float, msgspec.Meta(ge=0, le=0.3)] = 0.0
+    """Relative spread of the pixels' gains in the open field, which the flat removes."""
     pattern_residual: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.1
+    """Spread of the change of gain with the signal, as a share of `fixed_pattern`; it makes rings."""
     dead_fraction: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
+    """Share of pixels that always read the pedestal."""
 
     def __post_init__(self) -> None:
         if self.model not in ("compound", "tigre", "none"):

@@ -14,10 +14,12 @@ from ctsim.geometry import Geometry
 
 
 class Scatter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Which scatter model runs; `fraction` replaces the geometry's S/I0 at level 1."""
+    """The scatter model."""
 
     level: Literal[0, 1] = 0
+    """0: none. 1: one constant in every pixel."""
     fraction: Annotated[float, msgspec.Meta(ge=0, lt=10)] | None = None
+    """The constant as a share of the open field, instead of the geometry's; needs level 1."""
 
     def __post_init__(self) -> None:
         if self.level not in (0, 1):

@@ -8,37 +8,38 @@ from ctsim.errors import InputError
 
 
 class Simulation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Accuracy of the simulation.
-
-    `tolerance` bounds the error of P = −ln(signal/open) made by replacing the fine spectrum with Gauss
-    nodes. `subrays` is the largest number of rays that first measure a pixel on the edge of a solid (1: central
-    rays only). Where the error in P estimated from their spread exceeds `edge_tolerance`, up to 16 times as many
-    follow (infinity: none follow). With `skip` off everything is computed even where it cannot matter: the
-    result is the same within `tolerance`, only slower.
-    """
+    """Accuracy of the simulation."""
 
     tolerance: Annotated[float, msgspec.Meta(ge=1e-7, le=1e-1)] = 1e-4
+    """Largest error of P = −ln(signal/open) from replacing the fine spectrum by Gauss nodes."""
     subrays: Annotated[int, msgspec.Meta(ge=1, le=256)] = 34
+    """Largest number of rays that first measure a pixel on the edge of a solid; 1: central rays only."""
     edge_tolerance: Annotated[float, msgspec.Meta(ge=1e-3)] = 0.03
+    """Estimated error in P above which such a pixel gets up to 16 times as many rays; infinity: never."""
     skip: bool = True
+    """Skip what cannot matter. The result is the same within `tolerance` without, only slower."""
 
 
 class Truth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Which ground truth is written beside the counts; each costs nothing unless asked for.
+    """Which ground truth is written in addition to the references.
 
-    `twin` is the scan without its metal inserts and with the same noise streams, so that open pixels are the same to
-    the count (but for the noise model "tigre", which normalises each scan by its own largest P); `mono_kev` lists
-    energies (keV) of noise-free monochromatic line integrals; `trace` marks the pixels whose rays meet
-    metal, `metal_path` is their length in metal (mm), `paths` the length in every material (mm).
+    The twin has the same noise streams: open pixels are the same to the count, except with the noise model "tigre".
     """
 
     twin: bool = True
+    """The scan without its metal."""
     noise_free: bool = False
+    """P without noise, with scatter."""
     scatter_free: bool = False
+    """P without noise and scatter."""
     mono_kev: tuple[float, ...] = ()
+    """Energies (keV) of noise-free monochromatic line integrals."""
     trace: bool = False
+    """The pixels whose rays meet metal."""
     metal_path: bool = False
+    """Length of each ray in metal (mm)."""
     paths: bool = False
+    """Length of each ray in every material (mm)."""
 
     def __post_init__(self) -> None:
         if any(not 1.0 <= e <= 800.0 for e in self.mono_kev):

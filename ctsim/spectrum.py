@@ -31,10 +31,12 @@ def _check_material(name: str) -> None:
 
 
 class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A sheet in front of the tube: material and thickness (mm)."""
+    """A sheet in front of the tube."""
 
     material: str
+    """Its material."""
     thickness: float
+    """Its thickness in mm."""
 
     def __post_init__(self) -> None:
         _check_material(self.material)
@@ -43,12 +45,16 @@ class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class Bowtie(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A filter that thickens from `center` to `edge` (mm) at the fan angle ±`half_angle_deg`, as its square."""
+    """A filter whose thickness grows with the square of the fan angle."""
 
     material: str = "Al"
+    """Its material."""
     center: float
+    """Thickness in mm on the central ray."""
     edge: float
+    """Thickness in mm at and beyond `half_angle_deg`."""
     half_angle_deg: float
+    """The fan angle at which `edge` is reached."""
 
     def __post_init__(self) -> None:
         _check_material(self.material)
@@ -61,18 +67,20 @@ class Bowtie(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class Tube(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An X-ray tube with a tungsten anode.
-
-    `model`: "table" interpolates bundled SpekPy spectra, 20–300 kVp; "finkelshtein-pavlova" is a closed form
-    for 10–500 kVp; "spekpy" asks the installed SpekPy; "mono" is one energy, `kvp` keV, that no filter changes.
-    """
+    """An X-ray tube with a tungsten anode."""
 
     kvp: float = 90.0
+    """Tube voltage in kV; for the model "mono" the photon energy in keV."""
     anode_deg: float = 11.0
+    """Angle of the anode."""
     filters: tuple[Filter, ...] = (Filter(material="Al", thickness=0.5),)
+    """Sheets in front of the tube."""
     model: Literal["table", "finkelshtein-pavlova", "spekpy", "mono"] = "table"
+    """Bundled SpekPy spectra (20–300 kVp), a closed form (10–500), the installed SpekPy, or one energy."""
     heel: bool = False
+    """Include the anode's heel."""
     bowtie: Bowtie | None = None
+    """A bow-tie filter."""
 
     def __post_init__(self) -> None:
         if self.model not in ("table", "finkelshtein-pavlova", "spekpy", "mono"):

@@ -23,19 +23,18 @@ InsertCount = Annotated[int, msgspec.Meta(ge=0, le=16)]
 
 
 class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="recipe"):
-    """Settings common to all recipes.
-
-    `size` is the edge of the object's cube in mm; the object stays inside 92 % of it. `n_voxel`
-    (z, y, x) is the label grid over that cube: it sets how finely the body is drawn, never its shape.
-    `metal` names the inserts' material, or "none"; `n_inserts` and `insert_mm` (diameter) override
-    the recipe's own number and size.
-    """
+    """Settings common to all recipes."""
 
     n_voxel: tuple[Side, Side, Side] = (96, 96, 96)
+    """Label grid (z, y, x) over the cube: how finely the body is drawn, never its shape."""
     size: Millimetres = 60.0
+    """Edge of the object's cube in mm. The object stays inside 92 % of it."""
     metal: str = "Fe"
+    """Material of the inserts; "none" leaves them out."""
     n_inserts: InsertCount | None = None
+    """Number of inserts, instead of the recipe's own."""
     insert_mm: Millimetres | None = None
+    """Diameter of the inserts in mm, instead of the recipe's own."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.size) and 1e-3 <= self.size <= 2000):

@@ -22,14 +22,13 @@ FORK = np.array([0.0, 0.0, -0.30])
 
 
 class Broccoli(Recipe, frozen=True, kw_only=True, tag="broccoli"):
-    """Broccoli with rivets in its stem and florets (Al by default).
-
-    `levels` is the number of forkings, `forks` the branches at each.
-    """
+    """Broccoli with rivets in its stem and florets (Al by default)."""
 
     metal: str = "Al"
     levels: int = 4
+    """Number of forkings."""
     forks: int = 5
+    """Branches at each forking."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -23,14 +23,13 @@ MIDDLE, FLATTER = -0.04, 1.12  # y of the widest place; how much flatter the bac
 
 
 class Lung(Recipe, frozen=True, kw_only=True, tag="lung"):
-    """Thorax with metal rods beside the spine and balls in the chest (Fe by default).
-
-    `vessels` is the number of terminal vessels in each lung, `ribs` the number of rib pairs.
-    """
+    """Thorax with metal rods next to the spine and balls in the chest (Fe by default)."""
 
     metal: str = "Fe"
     vessels: int = 160
+    """Terminal vessels in each lung."""
     ribs: int = 8
+    """Pairs of ribs."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -21,10 +21,11 @@ class Walnut(Recipe, frozen=True, kw_only=True, tag="walnut"):
 
 
 class Chicken(Recipe, frozen=True, kw_only=True, tag="chicken"):
-    """Chicken drumstick with a wire wound round it (Fe by default); `turns` of the wire."""
+    """Chicken drumstick with a wire wound round it (Fe by default)."""
 
     metal: str = "Fe"
     turns: float = 4.0
+    """Turns of the wire."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -33,10 +34,11 @@ class Chicken(Recipe, frozen=True, kw_only=True, tag="chicken"):
 
 
 class BellPepper(Recipe, frozen=True, kw_only=True, tag="bell_pepper"):
-    """Bell pepper with rivets through its wall (Al by default); `lobes` of the wall."""
+    """Bell pepper with rivets through its wall (Al by default)."""
 
     metal: str = "Al"
     lobes: int = 4
+    """Lobes of the wall."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

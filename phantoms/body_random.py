@@ -13,13 +13,11 @@ MATERIALS = ("air", "soft_tissue", "adipose", "lung", "cortical_bone", "water")
 
 
 class Random(Recipe, frozen=True, kw_only=True, tag="random"):
-    """Random organs in a random body, with random metal shapes (Ti by default).
-
-    `organs` is the number of inner ellipsoids.
-    """
+    """Random organs in a random body, with random metal shapes (Ti by default)."""
 
     metal: str = "Ti"
     organs: int = 24
+    """Number of inner ellipsoids."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

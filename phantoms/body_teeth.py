@@ -23,14 +23,13 @@ CENTRE = -0.32  # y of the half ellipse's centre that the dental arch is
 
 
 class Teeth(Recipe, frozen=True, kw_only=True, tag="teeth"):
-    """Jaws with implant screws and crowns (Ti by default).
-
-    `crowns` of the inserts are metal crowns, the others implant screws; `missing` teeth leave gaps.
-    """
+    """Jaws with implant screws and crowns (Ti by default)."""
 
     metal: str = "Ti"
     crowns: int = 2
+    """How many inserts are metal crowns; the others are implant screws."""
     missing: int = 1
+    """Missing teeth, which leave gaps."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

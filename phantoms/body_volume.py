@@ -28,19 +28,22 @@ LENGTH = 3.0  # of an insert, in its diameters
 class CtVolume(Recipe, frozen=True, kw_only=True, tag="ct_volume"):
     """A CT volume with metal capsules in its bone (Ti by default), two unless `n_inserts` or `at` say otherwise.
 
-    `path` is a TIFF stack or .npy array [z, y, x], z upwards, of voxels of `spacing` mm (z, y, x), whose value v is
-    v·rescale[0] + rescale[1] HU. Its middle comes to that of the cube of `size`; what lies beyond the object's reach
-    is cut off. At `kev` every voxel has the attenuation of its HU. `at` are the inserts' centres (x, y, z) in mm from
-    the middle. `sha256` is the file's, filled in where it is empty, and `path` made absolute; another file is refused.
+    Its middle becomes the middle of the cube of `size`. What lies beyond the object's reach is cut off.
     """
 
     path: str
+    """A TIFF stack or .npy array [z, y, x], z upwards."""
     spacing: tuple[Millimetres, Millimetres, Millimetres]
+    """Size of its voxels (z, y, x) in mm."""
     metal: str = "Ti"
     rescale: tuple[float, float] = (1.0, 0.0)
+    """Slope and intercept: a value v is v·slope + intercept HU."""
     kev: float = 70.0
+    """The energy at which every voxel has the attenuation of its HU."""
     at: tuple[Triple, ...] = ()
+    """Centres of the inserts (x, y, z) in mm from the middle; without, places in bone are drawn."""
     sha256: str = ""
+    """The file's SHA-256, filled in where it is empty; another file is refused."""
 
     def __post_init__(self) -> None:
         """Check the ranges; take the file's hash, so that the recipe says what is scanned."""

@@ -105,29 +105,43 @@ def preset(
 
 
 class ScannerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The scanner table of a scene: a preset with overrides, or a full `geometry`.
+    """The scanner of a scene: a preset with changes, or a full `geometry`.
 
-    With a `geometry`, the keys that shape one (n_views … off_origin) must be left out. `field_mm` is
-    the edge of the reconstructed cube, by default the object's. `tube`, `detector`, `noise`,
-    `scatter` and `i0` replace the preset's.
+    With a `geometry`, the keys that shape one (`n_views` … `off_origin`) must be left out.
     """
 
     preset: Literal["skyscan1273", "dental", "c-arm"] = "skyscan1273"
+    """The machine: distances, panel, arc, tube and detector."""
     n_views: Count | None = None
+    """Number of projections (60 by default)."""
     n_detector: tuple[Count, Count] | None = None
+    """Pixels (v, u); the panel is binned to cover the object (96, 96)."""
     n_voxel: tuple[Count, Count, Count] | None = None
+    """Grid (z, y, x) of the reconstruction and the references (64, 64, 64)."""
     field_mm: Annotated[float, msgspec.Meta(gt=0)] | None = None
+    """Edge of the reconstructed cube in mm, by default the object's."""
     start_deg: float | None = None
+    """Angle of the first view."""
     arc_deg: float | None = None
+    """Arc of the scan; negative is clockwise."""
     angles_deg: tuple[float, ...] | None = None
+    """The angle of each view, instead of even steps."""
     off_detector: Pair | None = None
+    """Shift of the detector (v, u) in mm."""
     off_origin: Triple | None = None
+    """Centre of the grid (z, y, x) in mm."""
     geometry: Geometry | None = None
+    """All of the geometry, instead of a preset."""
     tube: Tube | None = None
+    """Replaces the preset's tube."""
     detector: Detector | None = None
+    """Replaces the preset's detector."""
     noise: Noise | None = None
+    """How photons become counts."""
     scatter: Scatter | None = None
+    """The scatter model."""
     i0: Annotated[float, msgspec.Meta(ge=1, le=1e12)] | None = None
+    """Photons that reach an open pixel in one view (1e5 by default)."""
 
     def __post_init__(self) -> None:
         if self.field_mm is not None and not (math.isfinite(self.field_mm) and self.field_mm > 0):

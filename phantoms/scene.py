@@ -22,18 +22,22 @@ from ctsim.types import Phantom, Scanner
 
 
 class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A scene: what is scanned, by which scanner, and what is written.
-
-    `truncated = true` allows an object that reaches out of the field of view.
-    """
+    """A scene: what is scanned, by which scanner, and what is written."""
 
     name: str
+    """Names the scene's folder: letters, digits, '.', '_' and '-'."""
     phantom: AnyRecipe
+    """The object."""
     scanner: ScannerSettings = ScannerSettings()
+    """The scanner: a preset with changes, or a full geometry."""
     seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)] = 0
+    """Another seed draws another individual and another noise."""
     truncated: bool = False
+    """Allow an object that reaches out of the field of view."""
     truth: Truth = Truth()
+    """Which ground truth is written in addition to the references."""
     simulation: Simulation = Simulation()
+    """Accuracy of the simulation."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", self.name):

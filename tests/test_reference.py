@@ -89,6 +89,7 @@ def test_types_are_named_in_words():
     named = {
         "integer (≥ 1, ≤ 5)": Annotated[int, msgspec.Meta(ge=1, le=5)],
         "[number, text]": tuple[float, str],
+        "[2 × number (> 0)]": tuple[Annotated[float, msgspec.Meta(gt=0)], Annotated[float, msgspec.Meta(gt=0)]],
         "list of integer": tuple[int, ...],
         "number or text": float | str | None,
         "table": Inner,

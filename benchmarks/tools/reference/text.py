@@ -54,7 +54,8 @@ def kind_name(kind: Any, links: Mapping[type, str] | None = None) -> str:
     if origin is tuple:
         if inner[-1] is Ellipsis:
             return f"list of {kind_name(inner[0], links)}"
-        return "[" + ", ".join(kind_name(i, links) for i in inner) + "]"
+        names = [kind_name(i, links) for i in inner]
+        return f"[{len(names)} × {names[0]}]" if len(set(names)) == 1 else f"[{', '.join(names)}]"
     if isinstance(origin or kind, type) and issubclass(origin or kind, Mapping | msgspec.Struct):
         return "table"
     return getattr(kind, "__name__", str(kind)).lower()
