@@ -47,7 +47,7 @@ def response(detector: Detector, energies: ArrayLike) -> tuple[NDArray[np.float6
     """Return the mean deposit a1 (keV) [n] and mean squared deposit a2 (keV2) [n] per incident photon.
 
     For "counting" both are the probability that the photon is counted. The closed form lets a photon interact
-    once and follows one secondary; `docs/physics.md` says how far that is from a slab Monte Carlo.
+    once and follows one secondary; `docs/explanation/physics.md` says how far that is from a slab Monte Carlo.
     """
     e = np.ascontiguousarray(np.atleast_1d(np.asarray(energies, dtype=np.float64)))
     return _response(detector, e.tobytes())

@@ -1,6 +1,6 @@
-"""Draw the two pictures of the documentation: the frame of `docs/conventions.md` and the README's artefact.
+"""Draw the two pictures of the documentation: the frame of `docs/reference/conventions.md` and the README's artefact.
 
-`python -m ctsim.reports.drawings geometry docs/geometry.svg`
+`python -m ctsim.reports.drawings geometry docs/images/geometry.svg`
 `python -m ctsim.reports.drawings artefact DATA/SCENE docs/images/artefact.png RESULTS/volumes/SCENE__fdk.tif …`
 """
 

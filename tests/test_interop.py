@@ -82,7 +82,7 @@ def tigre(a, g):
 def leap(degrees, g):
     """src/parameters.cpp takes half of π from the angles; rays are those of src/projectors_Siddon_cpu.cpp.
 
-    What set_conebeam calls centerRow and centerCol is where docs/conventions.md puts it.
+    What set_conebeam calls centerRow and centerCol is where docs/reference/conventions.md puts it.
     """
     phi = degrees * np.pi / 180 - 0.5 * np.pi
     (n_v, n_u), (d_v, d_u), (off_v, off_u) = g.n_detector, g.d_detector, g.off_detector

@@ -60,5 +60,5 @@ def reading(beam, settings: Settings, material: str) -> float:
 )
 def test_attenuation_at_the_centre_is_that_of_the_assumed_response(beam, changes, expected):
     for material, ratio in expected.items():
-        # the two digits that docs/methods.md gives
+        # the two digits that docs/measured/methods.md gives
         assert reading(beam, Settings(**changes), material) == pytest.approx(ratio, abs=0.006), material

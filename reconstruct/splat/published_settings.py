@@ -2,7 +2,7 @@
 
 "paper" learns two densities a splat, ρ(Ē) = ρa + ρb·Ē⁻³, and the response's r and Ē_th; "r2" one density, no response,
 and adds 0.05 TV of a brick. The steps between, as the successor's ablation has them, are a change of `basis` and
-`response`: see `docs/methods.md`.
+`response`: see `docs/explanation/splats.md`.
 
 R2-Gaussian scales scenes to [−1, 1]³. Here lengths stay mm and P stays P, which is not homogeneous once it is
 polychromatic, so densities are learned per unit, half the volume's widest side.

@@ -267,7 +267,7 @@ def energies(setup: Setup) -> Iterator[Pair[list[NDArray[np.float32]]]]:
         difference=in_logarithm,
         unit="P",
         limit=1.1 * plan.settings.tolerance,  # between the paths tried it is up to a tenth more
-        stated="simulation.tolerance and docs/physics.md",
+        stated="simulation.tolerance and docs/explanation/physics.md",
         note=f"sub-rays counted by its own mean attenuation move edge pixels by up to {moved:.2g}" if moved else "",
     )
 
@@ -310,7 +310,7 @@ def edges(setup: Setup) -> Iterator[Pair[list[NDArray[np.float32]]]]:
         unit="P",
         # of concave thickness: two thirds of the change in the mean, an eighth of its range's square in the logarithm
         limit=2 / 3 * EDGE_THRESHOLD + (2 * EDGE_THRESHOLD) ** 2 / 8,
-        stated="docs/skipping.md",
+        stated="docs/explanation/skipping.md",
         note=f"all sub-rays instead of a share move the worst pixel at an edge by {moved:.2g}",
     )
 

@@ -61,7 +61,7 @@ class Flags(study.Options):
     case: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
     """Only this case; may be given several times (default: all)."""
     suite: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None
-    """Scenes for the methods in place of the bundled ones; docs/stability.md says what a file may hold."""
+    """Scenes for the methods in place of the bundled ones; docs/how-to/test-stability.md lists its keys."""
     method: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
     """Only the rows of this method, such as fdk, or of module:function of your own; may be given several times
     (default: all methods, simulator and splat kernels)."""
