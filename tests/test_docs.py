@@ -1,6 +1,5 @@
 """What the pages say is true: examples run, links lead somewhere, suites and recipes exist."""
 
-import importlib
 import re
 import shlex
 from pathlib import Path
@@ -58,17 +57,14 @@ def commands(text: str) -> list[str]:
 
 def arguments_of(name: str, words: list[str]) -> tuple[type, list[str]] | None:
     """Return the form and the words of a command of ours, None for another, and where it is but named."""
-    from ctsim.benchmarks.cli import OTHERS
-    from ctsim.benchmarks.make_dataset import Options
-    from ctsim.benchmarks.studies.methods.study import Flags as Arguments
+    from ctsim.benchmarks.tools.reference.commands import forms
 
-    if name.rpartition("/")[2] not in ("make-dataset", "run-benchmark"):
+    name = name.rpartition("/")[2]
+    if name not in ("make-dataset", "run-benchmark"):
         return None
-    form = Options if name.endswith("make-dataset") else Arguments
-    if form is Arguments and words and (module := OTHERS.get(words[0])):
-        loaded, words = importlib.import_module(module), words[1:]
-        form = loaded.Flags if hasattr(loaded, "Flags") else loaded.Arguments
-    return (form, words) if any(not word.startswith("-") for word in words) else None
+    if words and f"{name} {words[0]}" in forms():
+        name, words = f"{name} {words[0]}", words[1:]
+    return (forms()[name], words) if any(not word.startswith("-") for word in words) else None
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))

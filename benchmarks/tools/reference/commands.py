@@ -1,6 +1,7 @@
 """The page of the commands: every flag, from the dataclasses that tyro parses."""
 
 import dataclasses
+import functools
 import importlib
 import types
 import typing
@@ -20,14 +21,20 @@ REPEATED = typing.get_args(tyro.conf.UseAppendAction[int])[1]
 NO_PAIR = typing.get_args(tyro.conf.FlagCreatePairsOff[int])[1]
 
 
+@functools.cache
 def forms() -> dict[str, type]:
     """Return every command with the dataclass of its arguments."""
     from ctsim.benchmarks.cli import OTHERS
-    from ctsim.benchmarks.make_dataset import Options
-    from ctsim.benchmarks.studies.methods.study import Arguments
 
-    found: dict[str, type] = {"make-dataset": Options, "run-benchmark": Arguments}
-    return found | {f"run-benchmark {n}": importlib.import_module(m).Arguments for n, m in sorted(OTHERS.items())}
+    names = {"make-dataset": "ctsim.benchmarks.make_dataset", "run-benchmark": "ctsim.benchmarks.studies.methods.study"}
+    names |= {f"run-benchmark {name}": module for name, module in sorted(OTHERS.items())}
+    return {name: form_of(importlib.import_module(module)) for name, module in names.items()}
+
+
+def form_of(module: types.ModuleType) -> type:
+    """Return the dataclass of a command's arguments, by the first of these names that its module has."""
+    found = (getattr(module, name, None) for name in ("Flags", "Arguments", "Options"))
+    return next(form for form in found if form is not None and form.__module__ == module.__name__)
 
 
 def page() -> str:
@@ -38,6 +45,7 @@ def page() -> str:
 def section(name: str, form: type) -> str:
     """Return heading, call, description and flags of one command."""
     flags = [_flag(item, hint, said) for item, hint, said in _fields(form)]
+    flags.sort(key=lambda flag: flag[0].startswith("`-"))  # folders first, as they are typed
     call = " ".join([name, *(f[0].strip("`") for f in flags if not f[0].startswith("`-")), "[flags]"])
     rows = text.table(("argument", "value", "default", "meaning"), flags)
     return f"## {name}\n\n```text\n{call}\n```\n\n{text.described(form)}\n\n{rows}"
