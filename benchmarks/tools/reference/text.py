@@ -66,7 +66,8 @@ def bounds(meta: Any) -> str:
     if not isinstance(meta, msgspec.Meta):
         return ""
     signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
-    found = [f"{sign} {getattr(meta, name):g}" for name, sign in signs.items() if getattr(meta, name) is not None]
+    values = {sign: getattr(meta, name) for name, sign in signs.items()}
+    found = [f"{sign} {'2^63 − 1' if v == 2**63 - 1 else f'{v:g}'}" for sign, v in values.items() if v is not None]
     return f"({', '.join(found)})" if found else ""
 
 
