@@ -1,54 +1,93 @@
-"""Scenes that are hard on methods, as a TOML file says them: `benchmarks/suites/stress.toml`, or one of the user's own.
+"""Scenes that are hard on the numbers, as a TOML file says them: `benchmarks/suites/stress.toml`, or one of the user's.
 
-`docs/how-to/test-stability.md` lists the keys. Lengths mm.
+Simulator and methods take the same scenes. `docs/how-to/test-stability.md` lists the keys. Lengths mm.
 """
 
-import functools
 import hashlib
+import math
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
 
 from ctsim.benchmarks.methods import TABLE
-from ctsim.benchmarks.studies.stress.cases import FULL
-from ctsim.benchmarks.studies.stress.changes import AnyChange, Filled, Unchanged
-from ctsim.benchmarks.studies.stress.scans import (
-    BONE,
-    HEIGHT,
-    TITANIUM,
-    USUAL,
-    WATER,
-    Circle,
-    Example,
-    block_phantom,
-    example,
-    in_air,
-    rod,
-)
+from ctsim.benchmarks.studies.stress.changes import AnyChange, Filled, Positive, Twice, Unchanged
+from ctsim.benchmarks.studies.stress.limits import FULL, GROUPS, SHORT
 from ctsim.detector import Detector
 from ctsim.errors import InputError
-from ctsim.geometry import Pair
+from ctsim.geometry import Count, Geometry, Pair, Triple
 from ctsim.materials import material
 from ctsim.noise import Noise
+from ctsim.phantoms.shapes import cylinder
 from ctsim.phantoms.suites import read_toml, scenes_of
 from ctsim.scatter import Scatter
 from ctsim.solids import Solid
 from ctsim.spectrum import Tube
 from ctsim.types import Phantom, Scanner
 
-RODS = {"water": WATER, "bone": BONE, "titanium": TITANIUM}
+METALS = ("Ti", "Fe", "Sn", "W", "Au")
 TAKEN = ("threads", "float64")  # names of cases of methods that are no scenes
-GROUPS: dict[str, tuple[str, ...]] = {
-    "by-mask": ("limar", "nmar", "bhc-poly"),
-    # their steps are of one length whatever the gradient of TV, in flat regions rounding
-    "descent": ("asd-pocs", "awpcsd"),
-    "ordered": ("sart", "os-sart", "asd-pocs", "awpcsd", "splat"),  # a view that comes twice moves them twice
-    "sampled": ("bhc-poly",),  # fits in 64 views, other ones where there are twice as many
-    "physical": ("splat", "ibhc"),  # take materials from tables in 1/mm
-}
-"""Methods that have something in common, by the names that `unlike` may give."""
+AIR = np.zeros((2, 2, 2), np.uint8)
+
+
+class OfSide(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A count that grows with the grid: so many times its side, rounded down, and so many more."""
+
+    times: Positive = 1.0
+    plus: int = 0
+
+
+Number = Count | OfSide
+
+
+class Circle(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A circular scan and its grid, for every side of grids; a desktop scanner whose pixels cover the cube.
+
+    Tuples are (z, y, x) or (v, u), as in `Geometry`. `field_mm` is the edge of the reconstructed cube, `detector_mm`
+    the detector's extent. Views lie at start + arc·(k/n)^crowding.
+    """
+
+    n_voxel: tuple[Number, Number, Number] = (OfSide(), OfSide(), OfSide())
+    field_mm: Positive = 60.0
+    n_detector: tuple[Number, Number] = (OfSide(times=1.5), OfSide(times=1.5))
+    detector_mm: tuple[Positive, Positive] = (150.0, 150.0)
+    n_views: Number = OfSide(times=2)
+    dso: float = 250.0
+    dsd: float = 500.0
+    off_origin: Triple = (0.0, 0.0, 0.0)
+    off_detector: Pair = (0.0, 0.0)
+    start_deg: float = 0.0
+    arc_deg: float = 360.0
+    crowding: Positive = 1.0
+
+    def __post_init__(self) -> None:
+        for side in (SHORT, FULL):
+            self.resolve(side)
+
+    def resolve(self, side: int) -> Geometry:
+        """Return the geometry on grids of so many voxels a side; raises InputError where there is none."""
+        n_views, *rest = (_count(n, side) for n in (self.n_views, *self.n_voxel, *self.n_detector))
+        if min(n_views, *rest) < 1:
+            raise InputError(f"counts must be at least 1, got {rest[:3]} voxels, {rest[3:]} pixels and {n_views} views")
+        (z, y, x), (v, u) = rest[:3], rest[3:]
+        high, wide = self.detector_mm
+        crowded = self.start_deg + self.arc_deg * (np.arange(n_views) / n_views) ** self.crowding
+        alike = ("dso", "dsd", "off_origin", "off_detector", "start_deg", "arc_deg")
+        return Geometry(
+            n_voxel=(z, y, x),
+            d_voxel=(self.field_mm / z, self.field_mm / y, self.field_mm / x),
+            n_detector=(v, u),
+            d_detector=(high / v, wide / u),
+            n_views=n_views,
+            angles_deg=None if self.crowding == 1 else tuple(crowded.tolist()),
+            **{name: getattr(self, name) for name in alike},
+        )
+
+
+def _count(n: Number, side: int) -> int:
+    return n if isinstance(n, int) else math.floor(n.times * side) + n.plus
 
 
 class Rod(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -57,7 +96,7 @@ class Rod(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     material: str
     radius: float
     at: Pair = (0.0, 0.0)
-    height: float = HEIGHT
+    height: float = 52.0
     metal: bool | None = None
 
     def __post_init__(self) -> None:
@@ -66,21 +105,38 @@ class Rod(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     def solid(self) -> Solid:
         """Return the rod as it is simulated."""
-        return rod(self.material, self.radius, at=self.at, height=self.height, metal=self.metal)
+        metal = self.material in METALS if self.metal is None else self.metal
+        size = (self.radius, self.height)
+        return cylinder(f"{self.material} at {self.at}", self.material, size, centre=(*self.at, 0.0), metal=metal)
+
+
+RODS = {
+    "water": Rod(material="water", radius=24.0),
+    "bone": Rod(material="cortical_bone", radius=4.0, at=(-9.0, 6.0)),
+    "titanium": Rod(material="Ti", radius=3.0, at=(9.0, 2.0)),
+}
+
+
+def in_air(*solids: Solid) -> Phantom:
+    """Return a phantom of solids alone."""
+    materials = tuple(dict.fromkeys(["air", *(s.material for s in solids)]))
+    return Phantom(labels=AIR, materials=materials, d_voxel=(1.0, 1.0, 1.0), solids=solids)
 
 
 class Block(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A centred cube of water in voxels, of so many times its density."""
+    """A centred cube of water in voxels, of so many times its density where that is given."""
 
     edge: float
-    density: float
+    density: float | None = None
 
     def __post_init__(self) -> None:
         self.phantom()
 
     def phantom(self) -> Phantom:
-        """Return the block as it is simulated."""
-        return block_phantom(self.density, self.edge)
+        """Return the block as it is simulated, with a map of its density or without one."""
+        labels, d = np.ones((8, 8, 8), np.uint8), self.edge / 8
+        density = None if self.density is None else np.full(labels.shape, self.density, np.float32)
+        return Phantom(labels=labels, materials=("air", "water"), d_voxel=(d, d, d), density=density)
 
 
 class Machine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -103,15 +159,17 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A scan that is hard on methods: rods in air, by default the usual ones, or a block.
+    """A scan that is hard on the numbers: rods in air, by default the usual ones, or a block.
 
-    `near` says whether the data determine the object. `like` is how the simulated scan must be changed to give the same
-    volume as the scene's own `change` of it, but for a factor in length; methods that need not are `unlike`.
+    `near` says whether the data determine the object, `methods` whether methods run on it or the simulator alone.
+    `like` is how the simulated scan must be changed to give the same volume as the scene's own `change` of it, but for
+    a factor in length; methods that need not are `unlike`.
     """
 
     name: str
     what: str
     near: bool = True
+    methods: bool = True
     rods: Annotated[tuple[Literal["water", "bone", "titanium"] | Rod, ...], msgspec.Meta(min_length=1)] | None = None
     block: Block | None = None
     scanner: Machine = Machine()
@@ -128,13 +186,30 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         if unknown := [name for name in self.unlike if name not in known and ":" not in name]:
             raise InputError(f"unlike must name methods or groups, of {', '.join(known)}; got {unknown[0]!r}")
 
-    def scan(self, side: int) -> Example:
-        """Return the scan on grids of so many voxels a side."""
-        return self.change.of(_simulated(self.rods, self.block, self.scanner, side))
+    @property
+    def all_rods(self) -> tuple[Rod, ...]:
+        """The rods, later ones in place of earlier ones."""
+        if self.block is not None:
+            return ()
+        return tuple(RODS[rod] if isinstance(rod, str) else rod for rod in self.rods or RODS.values())
 
-    def other(self, side: int) -> Example | None:
-        """Return the other form of the scan, if there is one."""
-        return None if self.like is None else self.like.of(_simulated(self.rods, self.block, self.scanner, side))
+    def phantom(self) -> Phantom:
+        """Return what is scanned."""
+        return in_air(*(rod.solid() for rod in self.all_rods)) if self.block is None else self.block.phantom()
+
+    @property
+    def lone(self) -> Rod | None:
+        """The rod where there is one only and the grid holds all of it, so that its mass on the grid is known."""
+        if len(self.all_rods) != 1:
+            return None
+        (rod,), of = self.all_rods, self.scanner.geometry
+        reach = max(abs(rod.at[0]) + rod.radius, abs(rod.at[1]) + rod.radius, rod.height / 2)
+        return rod if 2 * reach <= of.field_mm and not any(of.off_origin) else None
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the simulator can make the scan itself, not only one that is then changed."""
+        return isinstance(self.change, Unchanged | Twice)
 
     def has_other(self, method: str) -> bool:
         """Say whether a method must give the same volume of the other form."""
@@ -149,15 +224,6 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     def digest(self) -> str:
         """A hash of what the scene says."""
         return hashlib.sha256(msgspec.json.encode(self)).hexdigest()[:16]
-
-
-@functools.lru_cache(maxsize=4)
-def _simulated(rods: tuple[str | Rod, ...] | None, block: Block | None, scanner: Machine, side: int) -> Example:
-    """Simulate a scan that all methods share."""
-    if block is not None:
-        return example(scanner.resolve(side), block.phantom())
-    solids = USUAL if rods is None else [RODS[rod] if isinstance(rod, str) else rod.solid() for rod in rods]
-    return example(scanner.resolve(side), in_air(solids))
 
 
 def load(path: Path | None = None) -> tuple[Scene, ...]:
