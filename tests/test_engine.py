@@ -421,8 +421,8 @@ def test_tables_follow_what_is_measured(tiny, tmp_path, capsys, monkeypatch):
     assert "| best |" in seen[3] and "| fails | error |" in seen[4] and "| good |" not in seen[3] + seen[4]
     seen.clear()
     monkeypatch.setattr(study, "SHARE", 1e-9)
-    assert tiny(tmp_path / "new", "good interrupted better", kind=tiny_study.Follows) == 130
-    assert "| good |" in seen[-1] and "better" not in seen[-1]
+    assert tiny(tmp_path / "new", "good better interrupted best", kind=tiny_study.Follows) == 130
+    assert "better" not in seen[-2] and "| better |" in seen[-1] and "best" not in seen[-1]  # as Ctrl-C came
     assert tiny(tmp_path / "new", "slow-x interrupted", "--seconds", "0.01", kind=tiny_study.Follows) == 1
     assert "good" not in seen[-1]
     seen.clear()

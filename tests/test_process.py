@@ -156,7 +156,7 @@ def test_large_arguments_and_answers_arrive(one, size):
 
 def test_it_finds_our_modules_leads_its_session_and_gets_no_answer_from_the_user(one, monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(tmp_path)
-    said = one.run(jobs.tell)
+    said = one.run(jobs.tell, seconds=60.0)
     assert said["path"] == sys.path and said["path"][0] == str(tmp_path)
     assert said["leads"] and said["stdin"] == ""
 
