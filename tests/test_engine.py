@@ -449,7 +449,9 @@ def test_a_cluster_finds_the_same_also_within_a_limit(tiny, tmp_path, capsys):
 
     cases = "good bad fails"
     assert tiny(tmp_path / "here", cases) == 1
-    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL") as cluster:
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs="CRITICAL"
+    ) as cluster:
         for name, words in (("there", ()), ("limited", ("--seconds", "60"))):
             assert tiny(tmp_path / name, cases, "--scheduler", cluster.scheduler_address, *words) == 1
             assert sorted(found(tmp_path / name)) == sorted(found(tmp_path / "here"))
