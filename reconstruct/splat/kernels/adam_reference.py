@@ -20,19 +20,15 @@ def activate(x_scales: Array, x_densities: Array, low: float, span: float, per_u
     return low + span * _sigmoid(x_scales), np.logaddexp(0, x_densities.astype(np.float64)) * per_unit
 
 
-def through(
-    x_scales: Array,
-    x_densities: Array,
-    by_log_scales: Array,
-    by_densities: Array,
-    low: float,
-    span: float,
-    per_unit: float,
-) -> tuple[Wide, Wide]:
-    """Return gradients by what is learned: d log s/dx = span·σ(1 − σ)/s, and dρ/dx = σ/unit."""
-    share = _sigmoid(x_scales)
-    by_scales = by_log_scales * span * share * (1 - share) / (low + span * share)
-    return by_scales, by_densities * _sigmoid(x_densities) * per_unit
+def by_scales(x: Array, by_log_scales: Array, low: float, span: float) -> Wide:
+    """Take gradients by log scales to those by what is learned: d log s/dx = span·σ(1 − σ)/s."""
+    share = _sigmoid(x)
+    return by_log_scales * span * share * (1 - share) / (low + span * share)
+
+
+def by_densities(x: Array, gradient: Array, per_unit: float) -> Wide:
+    """Take gradients by densities to those by what is learned: dρ/dx = σ/unit."""
+    return gradient * _sigmoid(x) * per_unit
 
 
 def _sigmoid(x: Array) -> Wide:
