@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from ctsim.benchmarks.engine.workers import TICK, Lost, Pool, open_pool
+from ctsim.benchmarks.engine.dask import open_jobs
+from ctsim.benchmarks.engine.process import TICK, Jobs, Lost
 from ctsim.benchmarks.suites import load, select
 from ctsim.errors import InputError
 from ctsim.human import human_bytes, human_time
@@ -168,7 +169,7 @@ def _make_all(scenes: "list[Scene]", out: Path, options: Options) -> None:
     from ctsim.phantoms.dataset import plan_scene
     from ctsim.sources import source_hash
 
-    with open_pool(options.workers, options.scheduler) as pool:
+    with open_jobs(options.workers, options.scheduler) as pool:
         plans = {scene.name: plan_scene(scene) for scene in scenes}  # all phantoms could be more than memory holds
         for name, plan in plans.items():
             for note in plan.notes:
@@ -210,7 +211,7 @@ def say(text: str) -> None:
     sys.stderr.write(text + "\n")
 
 
-def _make_apart(jobs: list[Job], pool: Pool) -> None:
+def _make_apart(jobs: list[Job], pool: Jobs) -> None:
     """Make scenes on workers behind one progress bar, which follows the views that the workers noted as safe."""
     from tqdm import tqdm
 

@@ -7,7 +7,7 @@ import pytest
 from conftest import SMALLEST
 
 from ctsim.benchmarks import cli, make_dataset, methods
-from ctsim.benchmarks.engine import workers
+from ctsim.benchmarks.engine import study as engine
 from ctsim.benchmarks.studies import ablation
 from ctsim.benchmarks.studies.methods import records
 from ctsim.benchmarks.suites import load as load_suite
@@ -121,10 +121,10 @@ def test_runs_are_the_workers_where_some_are_asked_for(command, tmp_path, monkey
     class Here:
         def answers(self, function, jobs):
             for k, job in enumerate(jobs):
-                done.append(job.overrides)
+                done.append(job[1][0].hints["overrides"])
                 yield k, function(job)
 
-    monkeypatch.setattr(workers, "open_pool", lambda n, _: contextlib.nullcontext(Here() if n == 2 else None))
+    monkeypatch.setattr(engine, "open_jobs", lambda n, _: contextlib.nullcontext(Here() if n == 2 else None))
     assert command("--table", "7")[0] == 0 and not done
     for line in (tmp_path / "results").iterdir():
         line.unlink() if line.is_file() else shutil.rmtree(line)

@@ -1,47 +1,57 @@
 """Files of records whose bytes were changed at random: they are read, or refused in one sentence."""
 
 import json
+import logging
 import random
+from pathlib import Path
 
 import msgspec
 import pytest
-from ctsim.benchmarks.studies.pareto.records import latest, points
-from ctsim.benchmarks.studies.pareto.records import read as read_pareto
 from test_paper_tables import record
-from test_pareto_points import setting, timed
+from test_pareto_points import task, timed
 
 from ctsim import locks, manifest
-from ctsim.benchmarks.engine import lines
 from ctsim.benchmarks.engine.host import host
-from ctsim.benchmarks.engine.record import Record, Store, Task, done
+from ctsim.benchmarks.engine.record import Record, Task, done
 from ctsim.benchmarks.methods import parse_overrides
-from ctsim.benchmarks.studies.methods import records, tables
-from ctsim.benchmarks.studies.methods.records import RunRecord
-from ctsim.benchmarks.studies.peers import cases as peer_cases
-from ctsim.benchmarks.studies.peers import tables as peer_tables
+from ctsim.benchmarks.studies.methods import study as methods
+from ctsim.benchmarks.studies.pareto import study as pareto
+from ctsim.benchmarks.studies.peers import study as peers
+from ctsim.benchmarks.studies.peers.finding import Measurement
+from ctsim.benchmarks.studies.skipping import study as skipping
 from ctsim.benchmarks.studies.skipping.finding import Skip
-from ctsim.benchmarks.studies.stress import tables as stress_records
+from ctsim.benchmarks.studies.stress import study as stress
 from ctsim.errors import InputError
 from ctsim.folder import read_progress
 from ctsim.scaninfo import read_info
 
 BY = {"host": host(), "commit": "a" * 40, "time": "2026-01-01T00:00:00+00:00"}
+SKIPPED = Skip(seconds={"skipping": (1.0,), "whole": (2.0,)}, difference=0.0, limit=0.1)
+PEER = Measurement(scene="s", contender="c", seconds={"run": (1.0,)})
 KINDS = {
-    "records": (records.NAME, record(params={"a": [1, {"b": 2.5}]}, time=BY["time"])),
-    "pareto": ("pareto.jsonl", timed(setting(params={"a": [1]}), ("1", 1.0, 2.0))),
-    "skipping": ("skipping.jsonl", Record[Skip](task=Task(study="skipping", case="rays"), found=(Skip(),), **BY)),
+    "records": (methods.Methods(), methods.Flags, record(params={"a": [1, {"b": 2.5}]}, time=BY["time"])),
+    "pareto": (pareto.Pareto(), pareto.Flags, timed(task(hints={"a": [1]}), ("1", 1.0, 2.0))),
+    "skipping": (
+        skipping.Skipping(),
+        skipping.Flags,
+        Record(task=Task(study="skipping", part="core", case="rays"), found=(SKIPPED,), **BY),
+    ),
     "stress": (
-        stress_records.NAME,
-        stress_records.StressRecord(
-            identity="i", case="c", subject="s", what="w", expected="e", side=8, ok=True, found="f", seconds=1.0, **BY
+        stress.Stress(),
+        stress.Flags,
+        stress.StressRecord(
+            task=Task(
+                study="stress", part="full", case="c", subject="s", settings={"side": 24, "expected": "e"},
+                hints={"what": "w"},
+            ),
+            found=(stress.Outcome(found="f", seconds={"row": (1.0,)}),),
+            **BY,
         ),
     ),
     "peers": (
-        "peers.jsonl",
-        peer_tables.PeerRecord(
-            measurement=peer_cases.Measurement(case="fdk", scene="s", contender="c", seconds=(1.0,)), side=8, rtk="",
-            **BY,
-        ),
+        peers.Peers(),
+        peers.Flags,
+        Record(task=Task(study="peers", part="full", case="fdk"), found=(PEER,), **BY),
     ),
 }  # fmt: skip
 NESTED = [b"[" * n + b"]" * n for n in (100, 400, 700, 900, 950, 980, 990, 1000, 1500, 20_000)]
@@ -107,33 +117,28 @@ def changed(line, rng):
     return bytes(data)
 
 
-def read_records(path):
-    found = records.read(path.parent)
+def shown(kind: str, folder: Path) -> None:
+    """Read the records of a folder and make its tables, as --table does."""
+    study, flags, _ = KINDS[kind]
+    given = flags(results=folder, **({"data": folder} if kind == "records" else {}))
+    found = study.store(given).read()
     done(found)
-    if records.latest(found):
-        tables.write(found, path.parent)
+    if found := [r for r in found if study.shows(r.task, given)]:
+        study.write(found, given)
 
 
-def store(kind, folder):
-    return {
-        "records": Store(folder, "records", RunRecord, "a record"),
-        "skipping": Store(folder, "skipping", Record[Skip], "a record"),
-    }[kind]
-
-
-READERS = {
-    "records": read_records,
-    "pareto": lambda path: points(latest(read_pareto(path))),
-    "skipping": lambda path: store("skipping", path.parent).read(),
-    "stress": stress_records.read,
-    "peers": peer_tables.read,
-}
+def taken(kind: str, ours: Path, theirs: Path) -> None:
+    """Take over the records of one folder by another."""
+    study, flags, _ = KINDS[kind]
+    study.store(flags(results=ours, **({"data": ours} if kind == "records" else {}))).collect([theirs])
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_damaged_file_is_read_or_refused(kind, tmp_path):
+def test_a_damaged_file_is_read_or_refused(kind, tmp_path, caplog):
     """A single exception of another kind is a traceback on every further call on that folder."""
-    name, whole = KINDS[kind]
+    caplog.set_level(logging.ERROR)
+    study, _, whole = KINDS[kind]
+    name = f"{study.file}.jsonl"
     line, rng, seen = msgspec.json.encode(whole), random.Random(f"records {kind}"), set()
     ours, theirs = tmp_path / "ours", tmp_path / "theirs"
     for folder in (ours, theirs):
@@ -143,9 +148,9 @@ def test_a_damaged_file_is_read_or_refused(kind, tmp_path):
         (theirs / name).write_bytes(b"\n".join([line, bad, line][: rng.randint(2, 3)]) + b"\n"[: rng.randrange(2)])
         (ours / name).unlink(missing_ok=True)
         try:
-            READERS[kind](theirs / name)
+            shown(kind, theirs)
             taken(kind, ours, theirs)
-            READERS[kind](ours / name)
+            shown(kind, ours)
             seen.add("read")
         except InputError as error:
             assert len(str(error)) < 2000, bad[:200]
@@ -153,15 +158,6 @@ def test_a_damaged_file_is_read_or_refused(kind, tmp_path):
         except BaseException as error:
             raise AssertionError(f"{type(error).__name__} at {bad[:3000]!r}") from error
     assert seen == {"read", "refused"}
-
-
-def taken(kind, ours, theirs):
-    """Take over the records of one folder by another."""
-    name, whole = KINDS[kind]
-    if kind in ("records", "skipping"):
-        store(kind, ours).collect([theirs])
-    else:
-        lines.collect(ours / name, [theirs], type(whole), "a record")
 
 
 def nested(depth):

@@ -13,10 +13,10 @@ from pathlib import Path
 import msgspec
 import pytest
 from small_scan import STACKS, content, write
-from test_lines import Row, row
+from test_record import Value, record
 
 from ctsim import locks, process
-from ctsim.benchmarks.engine import lines
+from ctsim.benchmarks.engine.record import Record, Store
 from ctsim.errors import InputError
 from ctsim.locks import Busy, Owner, lock, locked
 from ctsim.store import verify
@@ -132,11 +132,15 @@ def test_a_lock_removed_by_force_is_not_another_processs_to_lose(tmp_path, maybe
         assert path.exists()
 
 
+def store(folder: Path) -> Store:
+    return Store(folder, "rows", Record[Value], "a row")
+
+
 def keep_appending(path: Path, who: int) -> None:
     """Append lines from another process, which has no flock either."""
     take_flock_away()
     for k in range(APPENDED):
-        lines.append(path, row(who, k))
+        store(path.parent).append([record(who, k, case=f"{who} {k}")])
 
 
 def test_without_flock_no_record_is_lost_where_processes_append_and_collect_at_once(tmp_path, monkeypatch):
@@ -144,19 +148,19 @@ def test_without_flock_no_record_is_lost_where_processes_append_and_collect_at_o
     take_flock_away()
     path, there = tmp_path / "rows.jsonl", tmp_path / "there"
     there.mkdir()
-    lines.append(there / "rows.jsonl", row(0))
+    store(there).append([record(0)])
     spawn = multiprocessing.get_context("spawn")
     others = [spawn.Process(target=keep_appending, args=(path, who)) for who in (1, 2)]
     for other in others:
         other.start()
     while any(other.is_alive() for other in others):
-        lines.collect(path, (there,), Row, "a row")
+        store(tmp_path).collect((there,))
     for other in others:
         other.join()
     assert [other.exitcode for other in others] == [0, 0]
-    lines.collect(path, (there,), Row, "a row")
-    expected = [row(0), *(row(who, k) for who in (1, 2) for k in range(APPENDED))]
-    assert sorted(lines.read(path, Row, "a row"), key=lambda r: (r.time, r.value["error"])) == expected
+    store(tmp_path).collect((there,))
+    expected = [record(0), *(record(who, k, case=f"{who} {k}") for who in (1, 2) for k in range(APPENDED))]
+    assert sorted(store(tmp_path).read(), key=lambda r: (r.time, r.found[0].value)) == expected
     assert sorted(p.name for p in tmp_path.iterdir()) == ["rows.jsonl", "there"]
 
 
@@ -164,7 +168,7 @@ def test_lines_whose_lock_another_machine_left_are_refused_after_a_while(tmp_pat
     monkeypatch.setattr(locks, "PATIENCE", 0.0)
     (tmp_path / ".rows.jsonl.lock").write_bytes(msgspec.json.encode(owner(host="node7", machine="00000000")))
     with pytest.raises(InputError, match=r"node7\) is writing rows\.jsonl, .* delete .*/\.rows\.jsonl\.lock if it"):
-        lines.append(tmp_path / "rows.jsonl", row(1))
+        store(tmp_path).append([record(1)])
 
 
 SHIM = "#include <errno.h>\nint flock(int f, int o) { (void)f; (void)o; errno = ENOLCK; return -1; }\n"

@@ -111,7 +111,7 @@ def test_a_case_that_dies_is_a_row_and_the_next_begins(tmp_path, monkeypatch, ca
     monkeypatch.setattr(catalogue, "installed", dict)
     monkeypatch.setattr(host, "use_threads", lambda threads: None)  # those of this process are not ours to set
     fatal = study.Peers()
-    vars(fatal)["work"] = "apart_jobs:die_in_exact"  # of this one, which travels to the process
+    vars(fatal)["work"] = "peer_jobs:die_in_exact"  # of this one, which travels to the process
     monkeypatch.setenv("CTSIM_TEST_MARK", str(tmp_path / "mark"))
     words = [str(tmp_path / "r"), "--repeats", "1", "--small", "--case", "exact", "--case", "fdk", "--seconds", "60"]
     assert engine.main(fatal, words) == 1

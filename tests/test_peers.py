@@ -2,9 +2,9 @@ import os
 import subprocess
 import sys
 
-import apart_jobs
 import msgspec
 import numpy as np
+import peer_jobs
 import pytest
 
 from ctsim.benchmarks import oracles
@@ -307,7 +307,7 @@ def test_a_dataset_that_is_not_made_is_a_row():
 
 
 def test_a_dataset_is_timed_in_a_process_of_its_own(monkeypatch, capfd):
-    monkeypatch.setattr(cases.make_dataset, "main", apart_jobs.make_two_megabytes)
+    monkeypatch.setattr(cases.make_dataset, "main", peer_jobs.make_two_megabytes)
     (found,) = cases.paper(setup("paper"), "lung-Fe")
     assert (found.ok, found.note, found.views) == (True, "2 MB written, one run", 720)
     # the start of an interpreter is part of both times; it holds neither numba nor torch, as this process does

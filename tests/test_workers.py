@@ -18,8 +18,10 @@ import pytest
 from test_cli import stopped
 
 from ctsim.benchmarks import cli
-from ctsim.benchmarks.engine import workers
-from ctsim.benchmarks.engine.workers import Cluster, Local, Lost, open_pool, threads_of
+from ctsim.benchmarks.engine import dask as dask_jobs
+from ctsim.benchmarks.engine import process
+from ctsim.benchmarks.engine.dask import Cluster, open_jobs
+from ctsim.benchmarks.engine.process import Lost, Pool
 from ctsim.errors import InputError
 
 SUITE = """
@@ -249,8 +251,8 @@ def job(given: str) -> str:
 
 @pytest.mark.parametrize("kind", ["local", "cluster"])
 def test_a_job_that_kills_its_process_each_time_is_given_up_and_the_others_done(kind, request, monkeypatch):
-    monkeypatch.setattr(workers, "TRIES", 2)
-    with Local(2) if kind == "local" else Cluster(request.getfixturevalue("cluster")[0]) as pool:
+    monkeypatch.setattr(process, "TRIES", 2)
+    with Pool(2) if kind == "local" else Cluster(request.getfixturevalue("cluster")[0]) as pool:
         answers = dict(a for a in pool.answers(str if kind == "cluster" else job, ["one"]) if a)
         found = dict(a for a in pool.answers(job, ["die", "two"]) if a is not None)
     assert answers[0].startswith("one") and isinstance(found[0], Lost) and found[1].startswith("two")
@@ -264,7 +266,7 @@ def test_a_job_that_kills_its_process_each_time_is_given_up_and_the_others_done(
 )
 def test_what_a_job_raised_arrives_with_its_traceback_whatever_it_was(kind, given, kind_of, said, request):
     """For a RecursionError Dask itself failed, said nothing, and the client waited for ever."""
-    pool = Local(2) if kind == "local" else Cluster(request.getfixturevalue("cluster")[0])
+    pool = Pool(2) if kind == "local" else Cluster(request.getfixturevalue("cluster")[0])
     with pool, pytest.raises(kind_of, match=said) as caught:
         list(pool.answers(job, [given]))
     assert any("in job" in note for note in caught.value.__notes__)
@@ -305,18 +307,11 @@ def test_a_cluster_that_loses_all_its_workers_goes_on_with_those_that_come(clust
 
 
 def test_what_a_job_refuses_is_raised_here_and_the_cores_are_shared():
-    with Local(2) as pool:
-        assert [a for a in pool.answers(job, ["one"]) if a] == [(0, f"one with {threads_of(2)['NUMBA_NUM_THREADS']}")]
+    with Pool(2) as pool:
+        share = max(1, len(os.sched_getaffinity(0)) // 2)
+        assert [a for a in pool.answers(job, ["one"]) if a] == [(0, f"one with {share}")]
         with pytest.raises(InputError, match="not this one"):
             list(pool.answers(job, ["refuse"]))
-
-
-def test_threads_are_the_cores_through_the_workers_but_never_more_than_were_set(monkeypatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
-    monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
-    monkeypatch.setenv("OMP_NUM_THREADS", "2,1")
-    assert threads_of(2) == {"NUMBA_NUM_THREADS": "4", "OMP_NUM_THREADS": "2"}
-    assert threads_of(3)["NUMBA_NUM_THREADS"] == "2" and threads_of(99)["NUMBA_NUM_THREADS"] == "1"
 
 
 @pytest.mark.parametrize(
@@ -331,7 +326,7 @@ def test_threads_are_the_cores_through_the_workers_but_never_more_than_were_set(
     ],
 )
 def test_workers_that_cannot_be_had_are_one_sentence(serial, tmp_path, monkeypatch, capsys, flags, said):
-    monkeypatch.setattr(workers, "CONNECT", 0.3)
+    monkeypatch.setattr(dask_jobs, "CONNECT", 0.3)
     suite = tmp_path / "suite.toml"
     suite.write_text(SUITE, encoding="utf-8")
     for module, arguments in (
@@ -407,7 +402,7 @@ def test_a_scheduler_with_certificates_works_for_those_who_have_them_alone(tmp_p
         assert address.startswith("tls://")
         with dask.config.set(configured(ours)), Cluster(address) as pool:
             assert [answer for answer in pool.answers(str.upper, ["one"]) if answer] == [(0, "ONE")]
-        monkeypatch.setattr(workers, "CONNECT", 1.0)
+        monkeypatch.setattr(dask_jobs, "CONNECT", 1.0)
         with dask.config.set(configured(others)), pytest.raises(InputError, match="no Dask scheduler answers there"):
             Cluster(address)
         with pytest.raises(InputError, match=r"tls://.* needs certificates: expected distributed\.comm\.tls\.ca-file"):
@@ -432,7 +427,7 @@ def test_a_scheduler_that_does_not_answer_is_one_sentence_but_a_jobs_own_error_i
 def test_a_cluster_without_the_package_is_one_sentence(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"pip install 'ctsim\[cluster\]'"):
-        open_pool(1, "tcp://127.0.0.1:9")
+        open_jobs(1, "tcp://127.0.0.1:9")
 
 
 def test_sigterm_ends_the_workers_and_keeps_what_they_noted(serial, tmp_path):
@@ -447,8 +442,8 @@ def test_sigterm_ends_the_workers_and_keeps_what_they_noted(serial, tmp_path):
 
 def test_workers_end_with_a_command_that_is_killed(tmp_path):
     code = (
-        "from ctsim.benchmarks.engine.workers import Local; from test_workers import wait\n"
-        f"with Local(2) as pool: list(pool.answers(wait, [{str(tmp_path / 'pid')!r}]))"
+        "from ctsim.benchmarks.engine.process import Pool; from test_workers import wait\n"
+        f"with Pool(2) as pool: list(pool.answers(wait, [{str(tmp_path / 'pid')!r}]))"
     )
     with subprocess.Popen(
         [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
