@@ -7,18 +7,20 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.baselines.inpaint import Filled
-from ctsim.baselines.limar import check_insert, finished, mended, uncorrected
-from ctsim.baselines.metal import Trace, find_metal, reinsert
+from ctsim.baselines.limar import finished, mended, uncorrected
+from ctsim.baselines.metal import Insert, Mask, Trace, check_mask, find_metal, reinsert
 from ctsim.baselines.morphology import dilate
-from ctsim.baselines.prior import NO_BODY, RING, check_prior, choose_prior
 from ctsim.geometry import few_views
+from ctsim.baselines.prior import NO_BODY, RING, Prior, choose_prior
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reconstruct.projector import forward_columns
+from ctsim.reconstruct.settings import keywords
 from ctsim.types import Scan, Status, Volume
 
 TERMS = ("l", "l^2", "l^3", "l t", "l^2 t", "l t^2")  # l: mm of metal, t: mm of water that weigh as the tissue
@@ -28,32 +30,34 @@ FIT_VIEWS = 64  # six numbers need no more
 Array = NDArray[np.float32]
 
 
-def bhc_poly(
-    scan: Scan,
-    *,
-    device: str = "cpu",
-    mask: str = "oracle",
-    prior: str = "auto",
-    insert: str = "fdk",
-) -> Volume:
+class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """As those of the same names in `ctsim.baselines.nmar.Settings`."""
+
+    mask: Mask = "oracle"
+    prior: Prior = "auto"
+    insert: Insert = "fdk"
+
+    def __post_init__(self) -> None:
+        check_mask(self.mask)
+
+
+@keywords(Settings)
+def bhc_poly(scan: Scan, settings: Settings) -> Volume:
     """Reconstruct `scan` less a polynomial in metal and tissue length that is fitted to what metal adds to it.
 
     q are the projections of a tissue prior (`ctsim.baselines.prior.tissue_prior`) that has water in place of the metal;
     how P of tissue alone bends with q is fitted on a ring around the trace. What P exceeds that by in the trace is
     regressed on `TERMS`, leaving out clamped pixels, and the fit, where it is positive, is subtracted from P.
-    `prior` is that of `ctsim.baselines.nmar.Settings`, `mask` and `insert` those of
-    `ctsim.baselines.limar.Bridging`. Without metal, where the mask is not to be relied on, and where nothing can be
+    Keywords are those of `Settings`. Without metal, where the mask is not to be relied on, and where nothing can be
     fitted, the result is FDK's to the last bit. Raises InputError as LIMAR does.
     """
-    check_insert(insert)
-    check_prior(prior)
-    first = fdk(scan, device=device)
+    first = fdk(scan)
     x_0 = first.values.numpy()
-    metal = find_metal(scan, x_0, mask)
+    metal = find_metal(scan, x_0, settings.mask)
     if first.status is not Status.OK or not metal.found:
         return uncorrected(first, metal)
     trace = Trace(metal, scan)
-    choice = choose_prior(trace, metal, first.values, prior)
+    choice = choose_prior(trace, metal, first.values, settings.prior)
     if choice is None:
         return uncorrected(first, metal, NO_BODY)
     fit = _fit(scan, trace, choice.columns, choice.water)
@@ -71,7 +75,7 @@ def bhc_poly(
             p[k - views.start][held] -= np.maximum(added, 0).astype(np.float32)
 
     values, shown = mended(trace, first.values, correct)
-    reinsert(values, x_0, metal, insert)
+    reinsert(values, x_0, metal, settings.insert)
     counted = {
         "negative_pixels": negative,
         "view_updates": (2 + choice.view_updates) * scan.geometry.n_views,

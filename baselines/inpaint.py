@@ -1,6 +1,7 @@
 """Filling a trace in a projection from what surrounds it. Images [v, u]."""
 
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
 import scipy.sparse
@@ -9,6 +10,12 @@ from numpy.typing import NDArray
 
 from ctsim.baselines.kernels.fill_cpu import fill_rows
 from ctsim.errors import InputError
+from ctsim.reconstruct.settings import about, names_of
+
+Interpolation = Annotated[
+    Literal["rows", "harmonic"], about("how the trace is bridged: along detector rows, or by Laplace's equation")
+]
+FILLS = names_of(Interpolation)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -44,9 +51,6 @@ class Filled:
             "full_rows": self.full_rows,
             "filled_views": self.views,
         }
-
-
-FILLS = ("rows", "harmonic")
 
 
 def fill(image: NDArray[np.float32], trace: NDArray[np.bool_], how: str, filled: Filled) -> None:

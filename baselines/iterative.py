@@ -6,9 +6,9 @@ within the field of view that some ray meets are unknowns; all others are and st
 """
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -22,18 +22,19 @@ from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.log import NO_SIGNAL, is_blind, line_integrals
 from ctsim.reconstruct.projector import Views, adjoint_columns, forward_columns
 from ctsim.reconstruct.redundancy import ray_weights
+from ctsim.reconstruct.settings import about
 from ctsim.reconstruct.watch import Stopwatch
 from ctsim.reconstruct.watch import watch as watch
 from ctsim.types import Scan, Status, Volume
 
 Array = NDArray[np.float32]
-Weights = str | torch.Tensor
-WEIGHTS = ("none", "trace", "exp(-l)")
+Weighting = Literal["none", "trace", "exp(-l)"]
+Weights = Weighting | torch.Tensor
+Count = Annotated[int, about("iterations over all views", ge=1, le=100_000)]
 WORST = 1.5  # a relative residual that no fit of pure noise reaches: one view fitted to another's gives √2
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Iterations:
+class Iterations(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What all iterative methods are given; a method adds its own and may set other defaults.
 
     `weights` of the rays is "none" (all 1), "trace" (0 in the trace of the metal that `ctsim.baselines.metal.auto_mask`
@@ -41,13 +42,11 @@ class Iterations:
     inverse variance of l up to a factor), or a tensor [view, v, u] of one's own.
     """
 
-    iterations: int = 10
-    weights: Weights = "none"
-
-    def __post_init__(self) -> None:
-        check_count("iterations", self.iterations)
-        if isinstance(self.weights, str) and self.weights not in WEIGHTS:
-            raise InputError(f"weights must be one of {', '.join(WEIGHTS)}, got {self.weights!r}")
+    iterations: Count = 10
+    weights: Annotated[
+        Weighting,
+        about("of rays: all alike, none in the trace of metal, or by photons", also=torch.Tensor),
+    ] = "none"
 
 
 class System:
@@ -58,9 +57,7 @@ class System:
     and backprojected. `given` are the weights as in `Iterations`.
     """
 
-    def __init__(self, scan: Scan, device: str, given: Weights = "none") -> None:
-        if torch.device(device).type != "cpu":
-            raise InputError(f"the iterative methods run on device 'cpu' only, got {device!r}")
+    def __init__(self, scan: Scan, given: Weights = "none") -> None:
         self.geometry = scan.geometry
         data, clamped = line_integrals(scan, slice(None))
         self.data: Array = data.numpy()
@@ -165,18 +162,6 @@ def visiting_order(n: int) -> list[int]:
     while math.gcd(step, n) != 1:
         step += 1
     return [k * step % n for k in range(n)]
-
-
-def check_count(name: str, value: int, least: int = 1) -> None:
-    """Raise InputError unless `value` is a whole number of at least `least`."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
-        raise InputError(f"{name} must be a whole number of at least {least}, got {value!r}")
-
-
-def check_positive(name: str, value: float) -> None:
-    """Raise InputError unless `value` is finite and positive."""
-    if not (math.isfinite(value) and value > 0):
-        raise InputError(f"{name} must be positive, got {value!r}")
 
 
 def weighted_norm(values: Array, weights: Array) -> float:

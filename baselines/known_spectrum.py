@@ -8,7 +8,7 @@ volumes [z, y, x] in 1/mm, lengths in mm.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Self
+from typing import Annotated, Self
 
 import msgspec
 import numpy as np
@@ -24,11 +24,12 @@ from ctsim.errors import InputError
 from ctsim.geometry import few_views
 from ctsim.materials import attenuation, material
 from ctsim.quadrature import effective_weights, energy_rule, full_rule
-from ctsim.reconstruct.beam import Given, known_detector, known_tube
+from ctsim.reconstruct.beam import DetectorTable, Given, TubeTable, check_tables, known_detector, known_tube
 from ctsim.reconstruct.fdk import fdk_stream
 from ctsim.reconstruct.log import count_floor, how_it_ended, is_blind, line_integrals
 from ctsim.reconstruct.projector import forward_columns
 from ctsim.reconstruct.redundancy import ray_weights
+from ctsim.reconstruct.settings import about, keywords
 from ctsim.spectrum import Spectrum, Tube, spectrum
 from ctsim.types import Scan, Volume
 
@@ -112,50 +113,53 @@ def _median_path(scan: Scan, table: Table) -> float:
     return float(np.interp(np.median(met), table.poly, table.lengths)) if met.size else 0.0
 
 
-def water_precorrection(
-    scan: Scan,
-    *,
-    device: str = "cpu",
-    tube: Given | Tube = None,
-    detector: Given | Detector = None,
-) -> Volume:
+class Known(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is known of the spectrum: a scan does not carry it."""
+
+    tube: TubeTable = None
+    detector: DetectorTable = None
+
+    def __post_init__(self) -> None:
+        check_tables(self.tube, self.detector)
+
+
+@keywords(Known)
+def water_precorrection(scan: Scan, settings: Known) -> Volume:
     """Reconstruct `scan` by FDK of line integrals that a table for water made linear in its length.
 
-    The scale is that of the effective spectrum. `tube` and `detector` are those of a scene file, whole or in part:
-    a scan does not carry its spectrum, so what is left out is the simulator's default, at the scan's highest energy.
-    Exact for water alone; beside metal the streaks become worse. Raises InputError as `Beam.of` and FDK do.
+    The scale is that of the effective spectrum. Keywords are those of `Known`. Exact for water alone; beside metal the
+    streaks become worse. Raises InputError as `Beam.of` and FDK do.
     """
-    _on_cpu(device, "water-precorrection")
-    beam = Beam.of(scan, tube, detector)
+    beam = Beam.of(scan, settings.tube, settings.detector)
     table = beam.table()
     return _ended(*_changed(scan, lambda p, _: precorrect(p, table)), scan, beam, 1, {})
 
 
-def ibhc(
-    scan: Scan,
-    *,
-    device: str = "cpu",
-    iterations: int = 2,
-    bone: str = "cortical_bone",
-    metal: str = "",
-    tube: Given | Tube = None,
-    detector: Given | Detector = None,
-) -> Volume:
+class Ibhc(Known, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is known, and of what the object is."""
+
+    iterations: Annotated[int, about("corrections after that of water", ge=1, le=50)] = 2
+    bone: Annotated[str, about("material of what is denser than water")] = "cortical_bone"
+    metal: Annotated[str, about("material of what the automatic mask finds; empty: metal is taken for bone")] = ""
+
+    def __post_init__(self) -> None:
+        Known.__post_init__(self)
+        for key, which in (("bone", self.bone), ("metal", self.metal)):
+            if which or key == "bone":
+                _material(key, which)
+
+
+@keywords(Ibhc)
+def ibhc(scan: Scan, settings: Ibhc) -> Volume:
     """Reconstruct `scan` and repeat, each time with P + mono − poly of the water, bone and metal found in the volume.
 
-    It begins with the volume of `water_precorrection`. Voxels from 1.5 times water on are `bone` of whatever density
-    gives their value, less dense ones water; `metal` names the material of what the automatic mask finds ("": metal
-    is taken for bone). poly is −ln of the signal behind the three lengths, mono their sum at the effective spectrum.
-    `tube` and `detector` as in `water_precorrection`. Raises InputError as that does. Al gains; rods of iron, whose
-    streaks are not of hardening alone, do not.
+    Keywords are those of `Ibhc`. It begins with the volume of `water_precorrection`. Voxels from 1.5 times water on are
+    `bone` of the density that gives their value, less dense ones water. poly is −ln of the signal behind the three
+    lengths, mono their sum at the effective spectrum. Raises InputError as `water_precorrection` does. Al gains; rods
+    of iron, whose streaks are not of hardening alone, do not.
     """
-    _on_cpu(device, "ibhc")
-    if not 1 <= iterations <= 50:
-        raise InputError(f"iterations must be within 1 … 50, got {iterations}")
-    for key, which in (("bone", bone), ("metal", metal)):
-        if which or key == "bone":
-            _material(key, which)
-    beam = Beam.of(scan, tube, detector)
+    bone, metal = settings.bone, settings.metal
+    beam = Beam.of(scan, settings.tube, settings.detector)
     table = beam.table()
     values, clamped = _changed(scan, lambda p, _: precorrect(p, table))
     found = auto_mask(values.numpy()) if metal else None
@@ -165,7 +169,7 @@ def ibhc(
     mu = np.stack([attenuation(name, rule.energies) for name in names])
     mono = np.array([beam.effective(name) for name in names])
     runs, mask = 1, found.mask if found is not None and found.found else None
-    while runs <= iterations and (water := water_value(values.numpy())) > 0:
+    while runs <= settings.iterations and (water := water_value(values.numpy())) > 0:
         columns = _classes(values.numpy(), water, mask, mono)
 
         def change(p: Array, views: slice, columns: list[Array] = columns) -> Array:
@@ -202,11 +206,6 @@ def _material(key: str, which: str) -> None:
         material(which)
     except InputError as error:
         raise InputError(f"{key}: {error}") from None
-
-
-def _on_cpu(device: str, name: str) -> None:
-    if torch.device(device).type != "cpu":
-        raise InputError(f"{name} runs on device 'cpu' only, got {device!r}")
 
 
 def _changed(scan: Scan, change: Callable[[Array, slice], Array]) -> tuple[torch.Tensor, int]:

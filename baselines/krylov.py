@@ -1,31 +1,28 @@
 """Conjugate gradients on the weighted normal equations Aᵀ W A x = Aᵀ W p (CGLS)."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
-from ctsim.baselines.iterative import Course, Iterations, System, finish, weighted_dot, weighted_norm
+from ctsim.baselines.iterative import Count, Course, Iterations, System, finish, weighted_dot, weighted_norm
 from ctsim.reconstruct.settings import keywords
 from ctsim.types import Scan, Volume
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Cgls(Iterations):
+class Cgls(Iterations, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As `Iterations`."""
 
-    iterations: int = 15
+    iterations: Count = 15
 
 
 @keywords(Cgls)
-def cgls(scan: Scan, settings: Cgls, device: str) -> Volume:
+def cgls(scan: Scan, settings: Cgls) -> Volume:
     """Reconstruct by CGLS; stopping early is the only regularisation, and values may be negative.
 
     Hestenes and Stiefel, J. Res. Natl. Bur. Stand. 49, 1952, doi:10.6028/jres.049.044. Ends before `iterations` where
-    rounding lets the residual fall no more. Keywords are those of `Cgls`. Raises InputError for wrong parameters
-    and another device than the CPU.
+    rounding lets the residual fall no more. Keywords are those of `Cgls`.
     """
-    system, course = System(scan, device, settings.weights), Course()
+    system, course = System(scan, settings.weights), Course()
     x, lacking, steps = system.empty(), system.data.copy(), []
     ones = np.ones_like(x)
     gradient = system.adjoint(lacking * system.weights)

@@ -5,52 +5,50 @@ cut out of the projections and bridged, the rest is reconstructed, the metal is 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Annotated
 
+import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ctsim.baselines.inpaint import FILLS, Filled, fill
-from ctsim.baselines.metal import INSERTS, Metal, Trace, find_metal, reinsert
-from ctsim.errors import InputError
+from ctsim.baselines.inpaint import Filled, Interpolation, fill
+from ctsim.baselines.metal import Insert, Mask, Metal, Trace, check_mask, find_metal, reinsert
 from ctsim.reconstruct.fdk import add_fdk
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.log import finite_or_not
-from ctsim.reconstruct.settings import keywords
+from ctsim.reconstruct.settings import about, keywords
 from ctsim.types import Scan, Status, Volume
 
+Pixels = Annotated[int, msgspec.Meta(ge=0, le=1000)]
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Bridging:
+
+class Bridging(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where the metal is, how its trace is bridged, and how it comes back.
 
-    `mask` is "oracle", "auto" or a file (`ctsim.baselines.metal.find_metal`); `interpolation` "rows" or "harmonic"
-    (`ctsim.baselines.inpaint.fill`); `insert` "fdk", "mean" or "none" (`ctsim.baselines.metal.reinsert`); `dilation`
-    widens the trace by so many pixels, None by what the mask's edge leaves out of it (`ctsim.baselines.metal.Trace`).
+    See `ctsim.baselines.metal.find_metal`, `ctsim.baselines.inpaint.fill`, `ctsim.baselines.metal.reinsert` and, for
+    `dilation`, `ctsim.baselines.metal.Trace`.
     """
 
-    mask: str = "oracle"
-    interpolation: str = "rows"
-    insert: str = "fdk"
-    dilation: int | None = None
+    mask: Mask = "oracle"
+    interpolation: Interpolation = "rows"
+    insert: Insert = "fdk"
+    dilation: Annotated[Pixels | None, about("widens the trace; null: what the mask's edge leaves out", "pixels")] = (
+        None
+    )
 
     def __post_init__(self) -> None:
-        check_insert(self.insert)
-        if self.interpolation not in FILLS:
-            raise InputError(f"interpolation must be one of {', '.join(FILLS)}, got {self.interpolation!r}")
-        if self.dilation is not None and self.dilation < 0:
-            raise InputError(f"dilation must be 0 or more pixels, got {self.dilation}")
+        check_mask(self.mask)
 
 
 @keywords(Bridging)
-def reconstruct(scan: Scan, settings: Bridging, device: str) -> Volume:
+def reconstruct(scan: Scan, settings: Bridging) -> Volume:
     """Reconstruct `scan` with the metal trace interpolated; keywords are those of `Bridging`.
 
     Without metal, or where the mask is not to be relied on, the result is FDK's to the last bit and nothing is
     projected. Raises InputError as `find_metal` and FDK do, and for settings that are not there.
     """
-    first = fdk(scan, device=device)
+    first = fdk(scan)
     metal = find_metal(scan, first.values.numpy(), settings.mask)
     if first.status is not Status.OK or not metal.found:
         return uncorrected(first, metal)
@@ -60,12 +58,6 @@ def reconstruct(scan: Scan, settings: Bridging, device: str) -> Volume:
     details: dict[str, object] = {"view_updates": 2 * scan.geometry.n_views, "dilation": settings.dilation}
     details["intermediates"] = filled.intermediates(trace.view(filled.shown))
     return finished(values, first, metal, details | filled.details())
-
-
-def check_insert(insert: str) -> None:
-    """Raise InputError unless `insert` is a way to put metal back."""
-    if insert not in INSERTS:
-        raise InputError(f"insert must be one of {', '.join(INSERTS)}, got {insert!r}")
 
 
 def interpolated(trace: Trace, first: torch.Tensor, how: str) -> tuple[torch.Tensor, Filled]:

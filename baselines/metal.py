@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 import scipy.ndimage
@@ -15,12 +16,17 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry, crosswise
 from ctsim.project import Tracer
 from ctsim.reconstruct.log import LineIntegrals
+from ctsim.reconstruct.settings import about, names_of
 from ctsim.types import Phantom, Scan
 
 PEAK, HALF, SMALLEST = 0.25, 0.5, 8  # of the maximum; of the metal's value; voxels
 FACTORS = (8.0, 1.5)  # metal must exceed this many times water, and this many times the body's 99.9th percentile
 SHARE, PLAIN = 0.5, 0.75  # at most this share of the mask may lie below three quarters of the metal's value
 THINNEST = 0.05  # length in metal, in voxels, from which a pixel belongs to the trace
+
+Mask = Annotated[str, about("where the metal is: oracle (the scan's own), auto (found), a TIFF or a .npy file")]
+Insert = Annotated[Literal["fdk", "mean", "none"], about("what is put back where the metal is")]
+INSERTS = names_of(Insert)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,15 +73,20 @@ def find_metal(scan: Scan, volume: NDArray[np.float32], mask: str) -> Metal:
             raise InputError("mask = 'oracle': the scan has no true metal mask; say 'auto' or name a file")
         found = scan.metal.numpy() != 0
     else:
+        check_mask(mask)
         found = _read(Path(mask), volume.shape)
     if found.shape != volume.shape:
         raise InputError(f"mask {mask!r} has shape {found.shape}, the volume {volume.shape}")
     return Metal(mask=found, source=mask)
 
 
+def check_mask(mask: str) -> None:
+    """Raise InputError unless `mask` is a known word or a file that is there."""
+    if mask not in ("oracle", "auto") and not Path(mask).is_file():
+        raise InputError(f"mask: expected oracle, auto, a TIFF or a .npy file; there is no file {mask!r}")
+
+
 def _read(path: Path, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    if not path.is_file():
-        raise InputError(f"mask: expected 'oracle', 'auto', a TIFF or a .npy file, and there is no file {path}")
     try:
         return read_array(path, shape) != 0
     except InputError as error:
@@ -247,6 +258,3 @@ def reinsert(values: torch.Tensor, first: NDArray[np.float32], metal: Metal, ins
     names, n = pieces(mask)
     means = np.asarray(scipy.ndimage.mean(first, names, np.arange(1, n + 1)), np.float32)
     out[mask] = means[names[mask] - 1]
-
-
-INSERTS = ("fdk", "mean", "none")

@@ -7,7 +7,9 @@ by those of a prior, an image of tissue classes, before the metal trace is inter
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
+import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -15,14 +17,17 @@ from numpy.typing import NDArray
 from ctsim.baselines.inpaint import Filled, fill
 from ctsim.baselines.limar import Bridging, finished, mended, uncorrected
 from ctsim.baselines.metal import Trace, find_metal, reinsert
-from ctsim.baselines.prior import NO_BODY, check_prior, choose_prior
-from ctsim.errors import InputError
+from ctsim.baselines.prior import NO_BODY, Prior, choose_prior
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.projector import forward_columns
-from ctsim.reconstruct.settings import keywords
+from ctsim.reconstruct.settings import about, keywords
 from ctsim.types import Scan, Status, Volume
 
-NORMALISATIONS = ("offset", "additive", "ratio")
+Normalisation = Annotated[
+    Literal["offset", "additive", "ratio"],
+    about("how projections are made flat by the prior's before bridging"),
+]
+Floor = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,12 +41,6 @@ class Normalise:
 
     kind: str = "offset"
     floor: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.kind not in NORMALISATIONS:
-            raise InputError(f"normalisation must be one of {', '.join(NORMALISATIONS)}, got {self.kind!r}")
-        if self.floor is not None and not 0 < self.floor < np.inf:
-            raise InputError(f"floor must be positive, got {self.floor}")
 
     def fill(
         self,
@@ -66,37 +65,28 @@ class Normalise:
         return np.where(trace, scale * flat - shift, p).astype(np.float32)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settings(Bridging):
+class Settings(Bridging, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Those of `ctsim.baselines.limar.Bridging`; `normalisation` and `floor` as in `Normalise`; and which prior.
 
-    `prior` is segmented from the "fdk" or the "limar" volume, or "auto": from the latter where its projections
-    fit the measured ones better by a twentieth around the trace (`ctsim.baselines.prior.choose_prior`).
+    With `prior` "auto" it is LIMAR's where its projections fit the measured ones better by a twentieth around the
+    trace (`ctsim.baselines.prior.choose_prior`).
     """
 
-    prior: str = "auto"
-    normalisation: str = "offset"
-    floor: float | None = None
-
-    def __post_init__(self) -> None:
-        Bridging.__post_init__(self)
-        check_prior(self.prior)
-        _ = self.rule
-
-    @property
-    def rule(self) -> Normalise:
-        """The normalisation."""
-        return Normalise(kind=self.normalisation, floor=self.floor)
+    prior: Prior = "auto"
+    normalisation: Normalisation = "offset"
+    floor: Annotated[
+        Floor | None, about("what is added to, or least of, the divisor; null: 0.2, or 0.05 of a ratio", "of max q")
+    ] = None
 
 
 @keywords(Settings)
-def reconstruct(scan: Scan, settings: Settings, device: str) -> Volume:
+def reconstruct(scan: Scan, settings: Settings) -> Volume:
     """Reconstruct `scan` with the metal trace interpolated after normalisation by a prior; keywords as `Settings`.
 
     Without metal, or where the mask is not to be relied on, the result is FDK's to the last bit and nothing is
     projected. Raises InputError as LIMAR does.
     """
-    first = fdk(scan, device=device)
+    first = fdk(scan)
     x_0 = first.values.numpy()
     metal = find_metal(scan, x_0, settings.mask)
     if first.status is not Status.OK or not metal.found:
@@ -105,7 +95,8 @@ def reconstruct(scan: Scan, settings: Settings, device: str) -> Volume:
     choice = choose_prior(trace, metal, first.values, settings.prior, settings.interpolation)
     if choice is None:
         return uncorrected(first, metal, NO_BODY)
-    bridge = functools.partial(settings.rule.fill, largest=choice.largest, how=settings.interpolation)
+    rule = Normalise(kind=settings.normalisation, floor=settings.floor)
+    bridge = functools.partial(rule.fill, largest=choice.largest, how=settings.interpolation)
     values, filled = normalised(trace, first.values, choice.columns, bridge)
     reinsert(values, x_0, metal, settings.insert)
     details: dict[str, object] = {"dilation": settings.dilation, "largest_prior": choice.largest}

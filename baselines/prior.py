@@ -4,6 +4,7 @@ Volumes [z, y, x] in 1/mm, projections [view, v, u].
 """
 
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
 import scipy.ndimage
@@ -13,8 +14,8 @@ from numpy.typing import NDArray
 from ctsim.baselines.limar import interpolated
 from ctsim.baselines.metal import Metal, Trace, around, reach, water_value
 from ctsim.baselines.morphology import dilate, opened, spread
-from ctsim.errors import InputError
 from ctsim.reconstruct.projector import forward_columns
+from ctsim.reconstruct.settings import about, names_of
 
 AIR, LUNG, BONE = 0.5, 0.15, 1.5  # bounds of the classes in multiples of water
 LUNG_SHARE = 0.03  # of the body; with less there is no lung class
@@ -22,7 +23,11 @@ SKIN = 1  # voxels around the mask that hold blurred metal
 CHOICE_VIEWS = 32  # views that decide between the priors
 MARGIN = 0.95  # LIMAR's prior must fit better by this
 RING = 4  # width in pixels of the ring around the trace that the priors are judged on
-PRIORS = ("auto", "fdk", "limar")
+Prior = Annotated[
+    Literal["auto", "fdk", "limar"],
+    about("volume that the tissue prior is made of; auto: limar where it fits the projections better"),
+]
+PRIORS = names_of(Prior)
 NO_BODY = "nothing stands out from air"
 Array = NDArray[np.float32]
 
@@ -48,12 +53,6 @@ class Choice:
     def view_updates(self) -> int:
         """How often each view was backprojected for it, beside FDK."""
         return int("limar" in self.misfit)
-
-
-def check_prior(prior: str) -> None:
-    """Raise InputError unless `prior` is a way to come by one."""
-    if prior not in PRIORS:
-        raise InputError(f"prior must be one of {', '.join(PRIORS)}, got {prior!r}")
 
 
 def choose_prior(trace: Trace, metal: Metal, first: torch.Tensor, prior: str, how: str = "rows") -> Choice | None:

@@ -7,85 +7,74 @@ Imaging 6, 1984, doi:10.1177/016173468400600107; ordered subsets: Hudson and Lar
 """
 
 import math
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from ctsim.baselines.iterative import (
     Array,
+    Count,
     Course,
     Iterations,
     System,
-    check_count,
-    check_positive,
     finish,
     visiting_order,
     weighted_dot,
 )
 from ctsim.baselines.kernels.sart_cpu import move
-from ctsim.reconstruct.settings import keywords
+from ctsim.reconstruct.settings import about, keywords
 from ctsim.types import Scan, Volume
 
+Relaxation = Annotated[float, about("share of what rays lack that a step adds; converges below 2", gt=0, le=10)]
+Positivity = Annotated[bool, about("cut negative values to zero")]
 CACHE_BYTES = 1 << 30  # voxel sums of the subsets are kept up to this size, else made anew on each visit
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sart(Iterations):
-    """`iterations` are passes over all views; `relaxation` is λ; `positivity` cuts negative values to zero."""
+class Sart(Iterations, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`iterations` are passes over all views."""
 
-    relaxation: float = 0.5
-    positivity: bool = True
-
-    def __post_init__(self) -> None:
-        Iterations.__post_init__(self)
-        check_positive("relaxation", self.relaxation)
+    relaxation: Relaxation = 0.5
+    positivity: Positivity = True
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OsSart(Sart):
-    """As `Sart`, with the views in `subsets` interleaved subsets (at most one a view)."""
+class OsSart(Sart, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """As `Sart`, with the views in interleaved subsets."""
 
-    relaxation: float = 1.0
-    subsets: int = 20
-
-    def __post_init__(self) -> None:
-        Sart.__post_init__(self)
-        check_count("subsets", self.subsets)
+    relaxation: Relaxation = 1.0
+    subsets: Annotated[int, about("subsets of the views, at most one a view", ge=1, le=100_000)] = 20
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sirt(Sart):
+class Sirt(Sart, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As `Sart`."""
 
-    iterations: int = 100
-    relaxation: float = 1.9
+    iterations: Count = 100
+    relaxation: Relaxation = 1.9
 
 
 @keywords(Sart)
-def sart(scan: Scan, settings: Sart, device: str) -> Volume:
+def sart(scan: Scan, settings: Sart) -> Volume:
     """Reconstruct by SART, one view at a time; keywords are those of `Sart`.
 
     Details hold view updates, residuals (by pass, each view's taken before its update, and that of the result) and
-    step sizes, and as limitation where the object goes on beyond the grid or the detector. Raises InputError for wrong
-    parameters and another device than the CPU.
+    step sizes, and as limitation where the object goes on beyond the grid or the detector.
     """
-    return _run(scan, device, settings, scan.geometry.n_views)
+    return _run(scan, settings, scan.geometry.n_views)
 
 
 @keywords(OsSart)
-def os_sart(scan: Scan, settings: OsSart, device: str) -> Volume:
+def os_sart(scan: Scan, settings: OsSart) -> Volume:
     """Reconstruct by OS-SART: as `sart`, a subset of the views at a time; keywords are those of `OsSart`."""
-    return _run(scan, device, settings, min(settings.subsets, scan.geometry.n_views))
+    return _run(scan, settings, min(settings.subsets, scan.geometry.n_views))
 
 
 @keywords(Sirt)
-def sirt(scan: Scan, settings: Sirt, device: str) -> Volume:
+def sirt(scan: Scan, settings: Sirt) -> Volume:
     """Reconstruct by SIRT: as `sart`, with all views at once; the residual in the norm W M falls in each iteration."""
-    return _run(scan, device, settings, 1)
+    return _run(scan, settings, 1)
 
 
-def _run(scan: Scan, device: str, settings: Sart, subsets: int) -> Volume:
-    system, course = System(scan, device, settings.weights), Course()
+def _run(scan: Scan, settings: Sart, subsets: int) -> Volume:
+    system, course = System(scan, settings.weights), Course()
     passes, x = Passes(system, subsets), system.empty()
     for _ in range(settings.iterations):
         residual = passes.run(x, settings.relaxation, settings.positivity)

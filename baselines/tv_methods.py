@@ -1,27 +1,26 @@
 """Reconstruction with total variation: FISTA-TV, ASD-POCS and AwPCSD."""
 
 import math
-from dataclasses import dataclass
+from typing import Annotated
 
+import msgspec
 import numpy as np
 
 from ctsim.baselines.iterative import (
     Array,
+    Count,
     Course,
     Iterations,
     System,
     Weights,
     as_volume,
-    check_count,
-    check_positive,
     finish,
     weighted_dot,
     weighted_norm,
 )
 from ctsim.baselines.metal import water_value
-from ctsim.baselines.sart import Passes
-from ctsim.errors import InputError
-from ctsim.reconstruct.settings import keywords
+from ctsim.baselines.sart import Passes, Positivity
+from ctsim.reconstruct.settings import about, keywords
 from ctsim.reconstruct.tv import Denoiser, axis_ratios, descend, total_variation
 from ctsim.types import Scan, Volume
 
@@ -31,70 +30,48 @@ TV_FALLS = 0.95
 LARGEST_RATIO = 0.95
 OPPOSED = -0.99
 SUBSETS = 20
+Share = Annotated[float, msgspec.Meta(gt=0, le=10)]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FistaTv(Iterations):
-    """`tv` is how large ripples a step flattens, in units of the scan's water; `tv_iterations` denoise in each."""
+class FistaTv(Iterations, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """As `Iterations`, and how each denoises."""
 
-    iterations: int = 50
-    tv: float = 0.0024
-    tv_iterations: int = 20
-    positivity: bool = True
-
-    def __post_init__(self) -> None:
-        Iterations.__post_init__(self)
-        check_count("tv_iterations", self.tv_iterations)
-        if not (math.isfinite(self.tv) and self.tv >= 0):
-            raise InputError(f"tv must not be negative, got {self.tv!r}")
+    iterations: Count = 50
+    tv: Annotated[float, about("ripples that a step flattens", "of the scan's water", ge=0, le=1000)] = 0.0024
+    tv_iterations: Annotated[int, about("iterations of denoising in each", ge=1, le=10_000)] = 20
+    positivity: Positivity = True
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Descent(Iterations):
-    """SART passes in turn with `tv_steps` steps down TV, each of `alpha` of the first pass's change at first."""
+class Descent(Iterations, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """SART passes in turn with steps down TV."""
 
-    tv_steps: int = 20
-    alpha: float = 0.02
-
-    def __post_init__(self) -> None:
-        Iterations.__post_init__(self)
-        check_count("tv_steps", self.tv_steps)
-        check_positive("alpha", self.alpha)
+    tv_steps: Annotated[int, about("steps down TV after a pass", ge=1, le=10_000)] = 20
+    alpha: Annotated[float, about("first step down TV", "of the first pass's change", gt=0, le=1000)] = 0.02
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AsdPocs(Descent):
-    """As `Descent`; `epsilon` is the relative residual to keep to, None that of photon noise."""
+class AsdPocs(Descent, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """As `Descent`."""
 
-    epsilon: float | None = None
-
-    def __post_init__(self) -> None:
-        Descent.__post_init__(self)
-        if self.epsilon is not None:
-            check_positive("epsilon", self.epsilon)
+    epsilon: Annotated[Share | None, about("relative residual to keep to; null: that of photon noise")] = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AwPcsd(Descent):
-    """As `Descent`; `delta`, in units of the scan's water, is the step between voxels from which an edge is spared."""
+class AwPcsd(Descent, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """As `Descent`."""
 
-    delta: float = 2.0
-
-    def __post_init__(self) -> None:
-        Descent.__post_init__(self)
-        check_positive("delta", self.delta)
+    delta: Annotated[
+        float, about("step between voxels from which an edge is spared", "of the scan's water", gt=0, le=1e6)
+    ] = 2.0
 
 
 @keywords(FistaTv)
-def fista_tv(scan: Scan, settings: FistaTv, device: str) -> Volume:
+def fista_tv(scan: Scan, settings: FistaTv) -> Volume:
     """Minimise ½‖A x − p‖²_W + τ TV(x) by FISTA; keywords are those of `FistaTv`.
 
     Beck and Teboulle, SIAM J. Imaging Sci. 2, 2009, doi:10.1137/080716542, with their denoiser as proximal map.
     The step is 1/L with a proven bound L of ‖Aᵀ W A‖; τ is `tv` · L · the water of a pass of OS-SART, so a step
-    flattens ripples of about `tv` of that. Details hold step sizes, τ, water and the TV reached. Raises InputError
-    for wrong parameters and another device than the CPU.
+    flattens ripples of about `tv` of that. Details hold step sizes, τ, water and the TV reached.
     """
-    system, course = System(scan, device, settings.weights), Course()
+    system, course = System(scan, settings.weights), Course()
     ratios = axis_ratios(scan.geometry)
     largest, water = _largest_curvature(system), _water(system)
     denoiser = Denoiser(system.support, ratios, settings.positivity)
@@ -122,15 +99,14 @@ def fista_tv(scan: Scan, settings: FistaTv, device: str) -> Volume:
 
 
 @keywords(AsdPocs)
-def asd_pocs(scan: Scan, settings: AsdPocs, device: str) -> Volume:
+def asd_pocs(scan: Scan, settings: AsdPocs) -> Volume:
     """Lower TV subject to ‖A x − p‖_W ≤ ε ‖p‖_W and x ≥ 0, by SART passes and steepest descent in turn.
 
     Adaptive steepest descent, Sidky and Pan, Phys. Med. Biol. 53, 2008, doi:10.1088/0031-9155/53/17/021, with
     SART for ART. TV steps shrink while TV moves the volume more than the data do and the residual is above ε. Ends
-    early where the two moves oppose each other at a residual below. Keywords are those of `AsdPocs`. Raises
-    InputError as `fista_tv`.
+    early where the two moves oppose each other at a residual below. Keywords are those of `AsdPocs`.
     """
-    system, course, passes = _begin(scan, device, settings.weights)
+    system, course, passes = _begin(scan, settings.weights)
     aim = _photon_noise(scan, system) if settings.epsilon is None else settings.epsilon
     ratios, x, ones = axis_ratios(scan.geometry), system.empty(), np.ones(system.support.shape, np.float32)
     relaxation, length, steps = 1.0, 0.0, []
@@ -159,15 +135,15 @@ def asd_pocs(scan: Scan, settings: AsdPocs, device: str) -> Volume:
 
 
 @keywords(AwPcsd)
-def awpcsd(scan: Scan, settings: AwPcsd, device: str) -> Volume:
+def awpcsd(scan: Scan, settings: AwPcsd) -> Volume:
     """Lower adaptive-weighted TV with steps that follow the data residual, between SART passes.
 
     Projection-controlled steepest descent, Lohvithee, Biguri and Soleimani, Phys. Med. Biol. 62, 2017,
     doi:10.1088/1361-6560/aa93d3: the TV step is `alpha` · the first pass's change, times the residual before a
     pass over that after the first; passes stop while the residual is below photon noise. Keywords are those of
-    `AwPcsd`. Raises InputError as `fista_tv`.
+    `AwPcsd`.
     """
-    system, course, passes = _begin(scan, device, settings.weights)
+    system, course, passes = _begin(scan, settings.weights)
     aim, ratios, x = _photon_noise(scan, system), axis_ratios(scan.geometry), system.empty()
     water = _water(system)
     edge = settings.delta * max(water, 1e-30)
@@ -197,8 +173,8 @@ def awpcsd(scan: Scan, settings: AwPcsd, device: str) -> Volume:
     return finish(system, course, x, step_sizes=steps, **details)
 
 
-def _begin(scan: Scan, device: str, weights: Weights) -> tuple[System, Course, Passes]:
-    system, course = System(scan, device, weights), Course()
+def _begin(scan: Scan, weights: Weights) -> tuple[System, Course, Passes]:
+    system, course = System(scan, weights), Course()
     return system, course, Passes(system, scan.geometry.n_views)
 
 

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 OTHERS = {
+    "methods": "ctsim.benchmarks.list_methods",
     "inspect": "ctsim.benchmarks.studies.inspect",
     "pareto": "ctsim.benchmarks.studies.pareto.study",
     "peers": "ctsim.benchmarks.studies.peers.study",

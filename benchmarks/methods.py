@@ -1,8 +1,10 @@
-"""The methods table: a name to a plain function `reconstruct(scan, *, device, ...) -> Volume`.
+"""The methods table: a name to a plain function `reconstruct(scan, ...) -> Volume`.
 
-`--method my_lab.net:reconstruct` names a function outside the table in the same way. The function's
-module may define `skip(scan) -> str | None` (a reason, or None to run) and `INPUTS`, a sentence
-fragment saying what the method needs beside the counts; methods are ranked within one such class.
+A method states its parameters as a struct of settings (`ctsim.reconstruct.settings`). `--method
+my_lab.net:reconstruct` names a function outside the table in the same way: its keyword parameters are its settings,
+converted by their annotations where it has some; one called `device` is always "cpu". Its module may define
+`skip(scan) -> str | None` (a reason, or None to run) and `INPUTS`, a sentence fragment saying what the method needs
+beside the counts; methods are ranked within one such class.
 """
 
 import ast
@@ -14,13 +16,16 @@ import inspect
 import os
 import pkgutil
 import sys
+import typing
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
+import msgspec.inspect
 
 from ctsim.errors import InputError
+from ctsim.reconstruct.settings import Parameter, build, convert, parameters_of
 
 if TYPE_CHECKING:
     from ctsim.types import Scan, Volume
@@ -42,16 +47,20 @@ TABLE: dict[str, tuple[str, str]] = {
     "fista-tv": ("ctsim.baselines.tv_methods:fista_tv", COUNTS_ONLY),
     "asd-pocs": ("ctsim.baselines.tv_methods:asd_pocs", COUNTS_ONLY),
     "awpcsd": ("ctsim.baselines.tv_methods:awpcsd", COUNTS_ONLY),
-    "splat": ("ctsim.reconstruct.splat.method:reconstruct", COUNTS_ONLY),
+    "splat": ("ctsim.reconstruct.splat.fast:reconstruct", COUNTS_ONLY),
+    "splat-paper": ("ctsim.reconstruct.splat.published:paper", COUNTS_ONLY),
+    "splat-r2": ("ctsim.reconstruct.splat.published:r2", COUNTS_ONLY),
 }
 """name -> ("module:function", what it needs beside the counts)."""
+GONE = {("splat", "preset"): "presets are methods of their own; expected --method splat-paper or --method splat-r2"}
+"""(method, parameter that it no longer has) -> what to do instead."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Method:
-    """A method that was found, with its parameters.
+    """A method that was found, with its parameters as plain JSON values.
 
-    `params` are all keyword parameters with their values, `overrides` those given by the user.
+    `params` are all of them, `overrides` those that differ from the defaults.
     """
 
     name: str
@@ -63,7 +72,7 @@ class Method:
 
     @property
     def label(self) -> str:
-        """The name with the parameters that were given, as tables show it."""
+        """The name with the parameters that differ from the defaults, as tables show it."""
         given = ", ".join(f"{k}={v}" for k, v in sorted(self.overrides.items()))
         return f"{self.name}[{given}]" if given else self.name
 
@@ -72,9 +81,13 @@ class Method:
         """Where the metal mask comes from, "none" for a method without."""
         return str(self.params.get("mask", "none"))
 
-    def reconstruct(self, scan: "Scan", device: str) -> "Volume":
+    def reconstruct(self, scan: "Scan") -> "Volume":
         """Run the method."""
-        return resolve(self.target)(scan, device=device, **self.overrides)
+        function = resolve(self.target)
+        given = convert(parameters(self.name, function), self.overrides, f"{self.name}.")
+        if "device" in inspect.signature(function).parameters:
+            given["device"] = "cpu"
+        return function(scan, **given)
 
     def skip(self, scan: "Scan") -> str | None:
         """Ask the method's module why it would rather not run on `scan`; None to run."""
@@ -113,12 +126,7 @@ def find(name: str, overrides: dict[str, Any] | None = None) -> Method:
         raise InputError(f"there is no method {name!r}: {hint}")
     function = resolve(target)
     module = sys.modules[function.__module__]
-    params = _parameters(name, function)
-    given = dict(overrides or {})
-    for key in given:
-        if key not in params:
-            raise InputError(f"method {name!r} has no parameter {key!r}: expected one of {', '.join(params) or 'none'}")
-    params |= given
+    params, changed = _settings(name, function, overrides or {})
     if inputs == METAL_MASK and params["mask"] == "auto":
         inputs = COUNTS_ONLY  # it finds the metal itself
     if inputs == COUNTS_ONLY and params.get("response") == "known":
@@ -128,31 +136,83 @@ def find(name: str, overrides: dict[str, Any] | None = None) -> Method:
         target=target,
         inputs=inputs or getattr(module, "INPUTS", COUNTS_ONLY),
         params=params,
-        overrides=given,
+        overrides=changed,
         code=code_version(function.__module__),
     )
+
+
+def chosen(names: tuple[str, ...], settings: tuple[str, ...], seconds: float | None = None) -> list[Method]:
+    """Return the methods that --method names, with what --set and --seconds say.
+
+    Raises InputError for what is wrong with either, before anything is run.
+    """
+    given = parse_overrides(settings, names)
+    found = []
+    for name in names:
+        find(name)  # that there is none is not the fault of --set
+        try:
+            found.append(within(find(name, given[name]), seconds))
+        except InputError as error:
+            raise InputError(f"--set {error}" if given[name] else str(error)) from None
+    return found
 
 
 def within(method: Method, seconds: float | None) -> Method:
     """Tell a method how many seconds it has, where it can be told and was not."""
     if seconds is None or "seconds" not in method.params or "seconds" in method.overrides:
         return method
-    return find(method.name, {**method.overrides, "seconds": seconds})
+    whole = int(seconds) if float(seconds).is_integer() else seconds  # which suits whole numbers, too
+    return find(method.name, {**method.overrides, "seconds": whole})
 
 
-def _parameters(name: str, function: Callable[..., Any]) -> dict[str, Any]:
-    """Return the keyword parameters with their defaults, as JSON values; scan and device are not among them."""
-    parameters = list(inspect.signature(function).parameters.values())
-    if not parameters or "device" not in {p.name for p in parameters}:
-        raise InputError(
-            f"method {name!r} must be reconstruct(scan, *, device, ...), got {inspect.signature(function)}"
+def parameters(name: str, function: Callable[..., Any]) -> dict[str, Parameter]:
+    """Return the parameters of a method: those of its settings, else its keyword parameters but `device`."""
+    settings = getattr(function, "settings", None)
+    if settings is not None:
+        return parameters_of(settings)
+    listed = list(inspect.signature(function).parameters.values())
+    if not listed:
+        raise InputError(f"method {name!r} must be reconstruct(scan, ...), got {inspect.signature(function)}")
+    try:
+        types = typing.get_type_hints(function, include_extras=True)
+    except (NameError, TypeError, AttributeError):  # a name that is there for type checkers only
+        types = {}
+    several = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+    return {
+        p.name: Parameter(
+            name=p.name, kind=_known(types.get(p.name, Any)), default=None if p.default is p.empty else p.default
         )
-    found = {}
-    for parameter in parameters[1:]:
-        if parameter.name != "device" and parameter.kind is not inspect.Parameter.VAR_KEYWORD:
-            default = None if parameter.default is inspect.Parameter.empty else parameter.default
-            found[parameter.name] = msgspec.to_builtins(default, enc_hook=repr)
-    return found
+        for p in listed[1:]
+        if p.name != "device" and p.kind not in several
+    }
+
+
+def _known(kind: Any) -> Any:
+    """Return a type that values can be converted to, Any for those that msgspec does not know, such as arrays."""
+    try:
+        return Any if isinstance(msgspec.inspect.type_info(kind), msgspec.inspect.CustomType) else kind
+    except TypeError:
+        return Any
+
+
+def _settings(name: str, function: Callable[..., Any], given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Check settings; return all parameters, and those that differ from the defaults, as plain JSON values."""
+    known, where = parameters(name, function), f"{name}."
+    for key in given:
+        if key not in known and (name, key) in GONE:
+            raise InputError(f"{where}{key}: {GONE[name, key]}")
+    values = convert(known, given, where)
+    if hasattr(function, "settings"):
+        build(cast("Any", function).settings, given, where)
+    defaults = {key: _plain(parameter.default) for key, parameter in known.items()}
+    changed = {key: plain for key, value in values.items() if (plain := _plain(value)) != defaults[key]}
+    return defaults | changed, changed
+
+
+def _plain(value: Any) -> Any:
+    """Return a value in the types of JSON, for records; by its `repr` where it has none."""
+    plain = msgspec.to_builtins(value, enc_hook=repr)
+    return [_plain(item) for item in plain] if isinstance(plain, tuple) else plain
 
 
 def parse_overrides(settings: tuple[str, ...], names: tuple[str, ...]) -> dict[str, dict[str, Any]]:

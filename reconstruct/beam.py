@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -12,10 +12,18 @@ from ctsim.detector import Detector
 from ctsim.errors import InputError
 from ctsim.materials import E_MIN
 from ctsim.quadrature import full_rule
+from ctsim.reconstruct.settings import about
 from ctsim.spectrum import Tube, spectrum
 
 ROUNDED = 1e-6  # keV
 Given = Mapping[str, Any] | None
+TubeTable = Annotated[
+    dict[str, Any] | None,
+    about("tube of a scene file, whole or in part; what is left out is the simulator's, kvp the scan's highest energy"),
+]
+DetectorTable = Annotated[
+    dict[str, Any] | None, about("detector of a scene file, whole or in part; what is left out is the simulator's")
+]
 Kind = TypeVar("Kind", Tube, Detector)
 
 
@@ -36,6 +44,14 @@ def known_detector(given: Given | Detector) -> Detector:
     return _of("detector", given, Detector, {})
 
 
+def check_tables(tube: Given, detector: Given) -> None:
+    """Raise InputError, as `known_tube` and `known_detector` do, for tables that are wrong whatever the scan."""
+    if tube is not None:
+        known_tube(tube, Tube().kvp)
+    if detector is not None:
+        known_detector(detector)
+
+
 def detected(
     tube: Given | Tube, detector: Given | Detector, e_max: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -50,8 +66,9 @@ def detected(
 
 def refuse_beam(response: str | None, tube: Given | Tube, detector: Given | Detector) -> None:
     """Raise InputError for a tube or a detector that comes with a response which does not read them."""
-    if response != "known" and not (tube is None and detector is None):
-        raise InputError(f"tube and detector are for response 'known', got them with response {response!r}")
+    for name, table in (("tube", tube), ("detector", detector)):
+        if response != "known" and table is not None:
+            raise InputError(f"{name}: only for response 'known', got it with response {response!r}")
 
 
 def _of(name: str, given: "Given | Kind", kind: type[Kind], defaults: dict[str, Any]) -> Kind:

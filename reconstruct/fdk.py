@@ -14,24 +14,30 @@ from numpy.typing import NDArray
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.kernels.backproject_cpu import backproject
-from ctsim.reconstruct.filters import filter_rows, padded_length, ramp_response
+from ctsim.reconstruct.filters import Cutoff, Window, filter_rows, padded_length, ramp_response
 from ctsim.reconstruct.log import LineIntegrals, how_it_ended, is_blind
 from ctsim.reconstruct.redundancy import RayWeights, ray_weights
+from ctsim.reconstruct.settings import keywords
 from ctsim.types import Scan, Volume
 
 CHUNK_BYTES = 1 << 25
 
 
-def reconstruct(scan: Scan, *, device: str = "cpu", window: str = "ram-lak", cutoff: float = 1.0) -> Volume:
-    """Reconstruct `scan` by FDK without any correction.
+class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The filter."""
 
-    `window` and `cutoff` are those of `ctsim.reconstruct.filters.window_gain`. Details hold the clamped pixels,
-    the number of views backprojected (`view_updates`) and how redundant rays were weighted. Where no pixel has
-    signal the volume is empty and the status an error. Raises InputError for another device than the CPU, for a
-    geometry given by poses, and for an unknown window.
+    window: Window = "ram-lak"
+    cutoff: Cutoff = 1.0
+
+
+@keywords(Settings)
+def reconstruct(scan: Scan, settings: Settings) -> Volume:
+    """Reconstruct `scan` by FDK without any correction; keywords are those of `Settings`.
+
+    Details hold the clamped pixels, the number of views backprojected (`view_updates`) and how redundant rays were
+    weighted. Where no pixel has signal the volume is empty and the status an error. Raises InputError for a geometry
+    given by poses.
     """
-    if torch.device(device).type != "cpu":
-        raise InputError(f"fdk runs on device 'cpu' only, got {device!r}")
     clamped, logarithm = 0, LineIntegrals(scan)
 
     def read(views: slice) -> NDArray[np.float32]:
@@ -41,13 +47,13 @@ def reconstruct(scan: Scan, *, device: str = "cpu", window: str = "ram-lak", cut
         return p
 
     weights = _orbit_weights(scan.geometry)
-    values = torch.from_numpy(_run(read, scan.geometry, weights, window, cutoff))
+    values = torch.from_numpy(_run(read, scan.geometry, weights, settings.window, settings.cutoff))
     status, reason = how_it_ended(values, scan, clamped)
     if is_blind(scan, clamped):
         values = torch.zeros_like(values)
     details = {
-        "window": window,
-        "cutoff": cutoff,
+        "window": settings.window,
+        "cutoff": settings.cutoff,
         "view_updates": scan.geometry.n_views,
         "clamped_pixels": clamped,
         "count_floor": logarithm.floor,

@@ -1,15 +1,17 @@
 """The ramp filter of filtered backprojection, in its band-limited spatial form, and its windows."""
 
-from typing import Any, cast
+from typing import Annotated, Any, Literal, cast
 
 import numba
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from ctsim.errors import InputError
+from ctsim.reconstruct.settings import about, names_of, value_of
 
-WINDOWS = ("ram-lak", "shepp-logan", "cosine", "hamming", "hann")
+Window = Annotated[Literal["ram-lak", "shepp-logan", "cosine", "hamming", "hann"], about("window of the ramp filter")]
+WINDOWS = names_of(Window)
+Cutoff = Annotated[float, about("frequency where the filter ends", "of the Nyquist frequency", gt=0, le=1)]
 
 
 def padded_length(n: int) -> int:
@@ -37,10 +39,7 @@ def window_gain(frequency: NDArray[np.float64], window: str = "ram-lak", cutoff:
 
     Raises InputError for an unknown window or a cutoff outside (0, 1].
     """
-    if window not in WINDOWS:
-        raise InputError(f"window must be one of {', '.join(WINDOWS)}, got {window!r}")
-    if not 0 < cutoff <= 1:
-        raise InputError(f"cutoff must be within (0, 1] of the Nyquist frequency, got {cutoff}")
+    window, cutoff = value_of("window", window, Window), value_of("cutoff", cutoff, Cutoff)
     x = np.abs(frequency) / cutoff
     gains = {
         "ram-lak": np.ones_like(x),

@@ -29,9 +29,9 @@ from ctsim.human import human_time
 from ctsim.store import list_scans, open_scan
 
 NAME = "ablation.md"
-# CPU seconds of a step of each preset on this suite, which ends with 65 536 splats, and its share of the warm-up, which
+# CPU seconds of a step of each method on this suite, which ends with 65 536 splats, and its share of the warm-up, which
 # takes as many steps on 8 views: 0.046 + 0.015 and 0.10 + 0.03, on one core of a busy AMD EPYC.
-SECONDS = {"paper": 0.06, "r2": 0.13}
+SECONDS = {"splat-paper": 0.06, "splat-r2": 0.13}
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,8 @@ class Ablation(Methods):
 
     def expected(self, task: RunTask, given: Flags) -> float | None:
         """Return the seconds of a run by the time of a step."""
-        params = self._listed[task.settings.scene, task.subject].params
-        return self.rates[params["preset"]] * params["steps"]
+        variant = self._listed[task.settings.scene, task.subject]
+        return self.rates[variant.method] * variant.params["steps"]
 
     def line(self, task: RunTask) -> tuple[str, str]:
         """Return the run and the rows of the paper's tables that show it."""
@@ -140,7 +140,7 @@ def _planned(study: Ablation, given: Flags) -> str:
     if later:
         names = " ".join(dict.fromkeys(task.settings.scene for task in later))
         text += f"scans to be made first: {names} (make-dataset {ABLATION} {given.data} --dry-run --only {names})\n"
-    steps = ", ".join(f"{preset} {human_time(rate)}" for preset, rate in study.rates.items())
+    steps = ", ".join(f"{method} {human_time(rate)}" for method, rate in study.rates.items())
     how = "the records" if study.rates != SECONDS else "one core, measured once"
     return f"{text}by the time of a step ({steps}): of {how}\n"
 
@@ -179,10 +179,10 @@ def methods_of(listed: Sequence[Variant]) -> dict[str, Method]:
 
 
 def _rates(found: Sequence[RunRecord]) -> dict[str, float]:
-    """Return the seconds that a step of each preset takes, warm-up included: as recorded, else as measured once."""
+    """Return the seconds that a step of each method takes, warm-up included: as recorded, else as measured once."""
     known: dict[str, list[float]] = {}
     for record in (r for r in found if r.finished):
-        preset, steps = (record.run.params.get(name) for name in ("preset", "steps"))
-        if preset in SECONDS and steps and record.cost is not None:
-            known.setdefault(preset, []).append((record.cost.wall + record.cost.warm_up) / steps)
-    return SECONDS | {preset: statistics.median(values) for preset, values in known.items()}
+        method, steps = record.label.partition("[")[0], record.run.params.get("steps")
+        if method in SECONDS and steps and record.cost is not None:
+            known.setdefault(method, []).append((record.cost.wall + record.cost.warm_up) / steps)
+    return SECONDS | {method: statistics.median(values) for method, values in known.items()}

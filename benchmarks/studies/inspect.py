@@ -40,8 +40,6 @@ class Arguments:
     """Which scene (default: the first)."""
     out: Path | None = None
     """The file to write (default: inspect-SCENE-METHOD.md in RESULTS, or here)."""
-    device: str = "cpu"
-    """Where the method computes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -323,17 +321,15 @@ def _kept(given: Arguments, stored: "Stored") -> tuple[Volume, str, Volume | Non
 def _made(given: Arguments, stored: "Stored") -> tuple[Volume, str, Volume | None]:
     """Reconstruct the scan."""
     from ctsim.benchmarks import methods
-    from ctsim.benchmarks.engine.devices import check_device
     from ctsim.benchmarks.studies.methods.attempt import attempt, scan_for
 
     if given.method is None:
         raise InputError("expected a results folder or --method NAME")
-    check_device(given.device)
     method = methods.find(given.method)
     scan = scan_for(method, stored, "metal")
     if reason := method.skip(scan):
         raise InputError(f"method {given.method!r} does not apply to {stored.name!r}: {reason}")
-    outcome = attempt(method, scan, given.device, 0.0)
+    outcome = attempt(method, scan, 0.0)
     if outcome.status != "ok" or outcome.values is None:
         raise InputError(f"method {given.method!r} ended as {outcome.status}: {outcome.reason}")
     return outcome.values, method.label, outcome.at_50kev

@@ -85,7 +85,7 @@ def curve(method: Method, stored: StoredScan, truth: Truth) -> dict[int, list[fl
             found[done] = psnrs(volume.numpy(), truth)
 
     with watch(score):
-        volume = method.reconstruct(stored.scan, "cpu")
+        volume = method.reconstruct(stored.scan)
     found[done] = psnrs(volume.values.numpy(), truth)
     return found
 

@@ -1,7 +1,8 @@
 """Adding splats where the loss pulls at them and removing faint ones (Kerbl et al. 2023; Zha et al. 2024)."""
 
-from dataclasses import dataclass
+from typing import Annotated
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,18 +13,20 @@ from ctsim.reconstruct.splat.adam import Array, Moments, unit_length
 from ctsim.reconstruct.splat.kernels.rotations_cpu import write_rotations
 from ctsim.reconstruct.splat.model import Splats
 
+Step = Annotated[int, msgspec.Meta(ge=0)]
+Threshold = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Schedule:
+
+class Schedule(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """When and where to densify; `large` is a share of the volume's widest side, `faint` per unit (see `adam`)."""
 
-    first: int = 500
-    last: int = 15000
-    every: int = 100
-    pull: float = 5e-5
-    large: float = 0.1
-    faint: float = 1e-5
-    most: int = 500_000
+    first: Step = 500
+    last: Step = 15000
+    every: Annotated[int, msgspec.Meta(ge=1)] = 100
+    pull: Threshold = 5e-5
+    large: Threshold = 0.1
+    faint: Threshold = 1e-5
+    most: Step = 500_000
 
     def is_due(self, step: int) -> bool:
         """Say whether to densify after `step` steps."""

@@ -1,37 +1,35 @@
-"""The preset "fast": polychromatic splats from counts, geometry and the greatest energy alone.
+"""The method "splat": polychromatic splats from counts, geometry and the greatest energy alone.
 
 Coarse to fine: the object is carved from its shadows, fitted on a coarse grid from a start of plain water, and refined
 to a grid finer than the volume's, as fine as the detector sees. No mask, no spectrum (unless one is given) and no FDK
 enter.
 """
 
-import dataclasses
 import functools
 import math
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ctsim.detector import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry, few_views
-from ctsim.reconstruct.beam import Given, detected, refuse_beam
+from ctsim.reconstruct.beam import detected, refuse_beam
 from ctsim.reconstruct.log import finite_or_not, how_it_ended, line_integrals
 from ctsim.reconstruct.scatter import open_excess
+from ctsim.reconstruct.settings import about, keywords
 from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
+from ctsim.reconstruct.splat.common import Common, Energy
 from ctsim.reconstruct.splat.course import PASSES, Course, levels_of, passes_over
 from ctsim.reconstruct.splat.curve import STRONGEST, MaterialCurve
 from ctsim.reconstruct.splat.level import Data, weighted
 from ctsim.reconstruct.splat.ordered import Fit
-from ctsim.reconstruct.splat.response import Response, basis_functions, evaluate, make_response, tangent
+from ctsim.reconstruct.splat.response import FILTER, Response, basis_functions, evaluate, make_response, tangent
 from ctsim.reconstruct.splat.volume import voxelise
 from ctsim.reconstruct.watch import Stopwatch
-from ctsim.spectrum import Tube
 from ctsim.types import Scan, Status, Volume
 
 OPEN = 5.0  # standard deviations of an open pixel below which a ray met nothing
@@ -40,55 +38,38 @@ VIEWS, SHORTEST = 12, 0.5  # views whose pixels stand for all, and the least pat
 DENSEST = 15.0  # times water, that is no metal: enamel 9, titanium 43
 AT_THE_END, FEW, FEWEST = 0.9, 1e-4, 10
 """Share of the curve's last attenuation, which no metal has; the share of the splats, or how many, that may have it."""
-RESPONSES = ("tube", "known")
 Image = NDArray[np.float32]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """What the preset "fast" may be told.
+Passes = Annotated[int, msgspec.Meta(ge=0, le=1000)]
+Excess = Annotated[float, msgspec.Meta(ge=0, le=100)]
 
-    `passes` over the views are those of each coarser level and of the finest; None makes them 3 and 9, or fewer, at
-    least one, where the passes over a level times its views times its voxels would be more than 6e10, minutes of two
-    cores. `tv` is the threshold of denoising in units of water a hundred views, more in the first passes and on coarser
-    levels. The finest grid is `fineness` times that of the volume, at most as fine as the detector's pixels at the
-    isocentre. Its splats are projected by EWA, or if `exact` by their exact line integrals. `response` "tube" is a tube
-    behind `filtration` mm of aluminium, seen by a scintillator; "known" takes `tube` and `detector`, tables of a scene
-    file, whole or in part. `readout`, of the volume that is returned, is an energy in keV, or "hardened": by the
-    object's own water; `Volume.at_energy` gives the volume at any other. After `seconds`, those before an interruption
-    included, it returns what there is. `checkpoints` is a folder where an unfinished fit is kept each minute and goes
-    on from, "" for none. `scatter` is what every reading holds of it over the open field (S/I0); None has it found in
-    the pixels that no shadow reaches (`open_excess`), 0 is for scans whose open pixels are brighter than their open
-    field for another reason. Raises InputError for values that make no sense.
+
+class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How a fit goes, what beam it assumes, and how its volume is read.
+
+    `passes` null makes them 3 and 9, or fewer, at least one, where the passes over a level times its views times its
+    voxels would be more than 6e10, minutes of two cores. `tv` is stronger in the first passes and on coarser levels.
+    The finest grid is at most as fine as the detector's pixels at the isocentre. `response` "tube" is a tube behind
+    `filtration`, seen by a scintillator. `readout` "hardened" is by the object's own water; `Volume.at_energy` gives
+    the volume at any energy. `scatter` null has it found in the pixels that no shadow reaches (`open_excess`); 0 is for
+    scans whose open pixels are brighter than their open field for another reason.
     """
 
-    passes: tuple[int, int] | None = None
-    tv: float = 0.025
-    fineness: float = 1.5
-    exact: bool = False
-    response: Literal["tube", "known"] = "tube"
-    filtration: float = 0.5
-    tube: Given | Tube = None
-    detector: Given | Detector = None
-    readout: float | Literal["hardened"] = "hardened"
-    seconds: float = math.inf
-    checkpoints: str = ""
-    scatter: float | None = None
+    passes: Annotated[tuple[Passes, Passes] | None, about("over the views: each coarser level's, the finest's")] = None
+    tv: Annotated[float, about("threshold of denoising a hundred views", "of water", ge=0, le=1000)] = 0.025
+    fineness: Annotated[float, about("the finest grid over the volume's", ge=1, le=16)] = 1.5
+    exact: Annotated[bool, about("project splats by their exact line integrals, not by EWA")] = False
+    response: Annotated[Literal["tube", "known"], about("beam: assumed, or that of tube and detector")] = "tube"
+    filtration: Annotated[float, about("filtration behind the assumed tube", "mm Al", ge=FILTER[0], le=FILTER[2])] = 0.5
+    readout: Annotated[Energy | Literal["hardened"], about("where the volume is read")] = "hardened"
+    scatter: Annotated[Excess | None, about("what every reading holds of it; null: found", "of the open field")] = None
 
     def __post_init__(self) -> None:
-        passes = PASSES if self.passes is None else self.passes
-        if not (len(passes) == 2 and min(passes) >= 0 and max(passes) > 0):
-            raise InputError(f"passes must be two counts, not both 0, got {passes}")
-        for name, least in (("tv", 0), ("seconds", 0), ("fineness", 1)):
-            if not getattr(self, name) >= least:
-                raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
-        if self.scatter is not None and not 0 <= self.scatter < math.inf:
-            raise InputError(f"scatter must be at least 0 times the open field, got {self.scatter}")
-        if self.response not in RESPONSES:
-            raise InputError(f"response of preset 'fast' must be one of {', '.join(RESPONSES)}, got {self.response!r}")
+        Common.__post_init__(self)
+        if self.passes == (0, 0):
+            raise InputError("passes: expected two counts that are not both 0, got (0, 0)")
         refuse_beam(self.response, self.tube, self.detector)
-        if self.readout != "hardened":
-            _refuse_unless_energy(self.readout, "readout must be 'hardened' or a positive energy in keV")
 
     def make_response(self, e_max: float) -> Response:
         """Build the response for a scan of greatest energy `e_max` (keV)."""
@@ -98,8 +79,12 @@ class Settings:
         return make_response("known", e_max=e_max, basis="klein-nishina", spectrum=seen)
 
 
+@keywords(Settings)
 def reconstruct(scan: Scan, settings: Settings) -> Volume:
-    """Reconstruct `scan`: attenuation in 1/mm; details hold the volumes "rho_a" and "rho_b" under "densities"."""
+    """Reconstruct `scan`, attenuation in 1/mm; keywords are those of `Settings`.
+
+    Details hold the volumes "rho_a" and "rho_b" under "densities".
+    """
     stopwatch = Stopwatch(limit=settings.seconds)
     p, clamped = line_integrals(scan, slice(None))
     valid = ~clamped.numpy()
@@ -166,7 +151,7 @@ def _fitted(course: Course, scan: Scan, settings: Settings, stopwatch: Stopwatch
 
 def _checkpoint(course: Course, scan: Scan, settings: Settings) -> Checkpoint:
     """Return where a fit is kept, named by what its state depends on: not by its end, its read-out, or the folder."""
-    told = dataclasses.replace(settings, seconds=math.inf, readout="hardened", checkpoints="")
+    told = msgspec.structs.replace(settings, seconds=math.inf, readout="hardened", checkpoints="")
     return Checkpoint(folder=Path(settings.checkpoints), identity=identity_of(scan, (told, course.passes)))
 
 

@@ -1,14 +1,14 @@
 """The published splat methods: R²-Gaussian (Zha et al. 2024), its polychromatic successor, and the steps between.
 
-A step projects the splats into one view by EWA and takes a step of Adam down L1 + 0.25 (1 − SSIM). What a preset says
-stands in `published_settings`, what a step does in `learner` and `objective`.
+A step projects the splats into one view by EWA and takes a step of Adam down L1 + 0.25 (1 − SSIM). Their settings
+stand in `published_settings`, what a step does in `learner` and `objective`.
 """
 
-import dataclasses
 import math
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from ctsim.errors import InputError
 from ctsim.geometry import few_views
 from ctsim.reconstruct.log import NO_SIGNAL, finite_or_not, is_blind
+from ctsim.reconstruct.settings import keywords
 from ctsim.reconstruct.splat.adam import Array
 from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
 from ctsim.reconstruct.splat.learner import LEAST_VALUE, Learner, seed_splats, splats_of
 from ctsim.reconstruct.splat.model import Splats
 from ctsim.reconstruct.splat.objective import Objective
-from ctsim.reconstruct.splat.published_settings import Changes, Settings, changed
+from ctsim.reconstruct.splat.published_settings import Baseline, Settings
 from ctsim.reconstruct.splat.response import Response, basis_functions, tangent
 from ctsim.reconstruct.splat.volume import voxelise
 from ctsim.reconstruct.watch import Stopwatch
@@ -31,26 +32,28 @@ VIEWS = 12  # that the hardening of the read-out is measured in
 BETTER = 1e-3  # share by which held-out views must be met better to count
 
 
-def reconstruct(scan: Scan, *, device: str = "cpu", preset: str = "paper", **changes: Unpack[Changes]) -> Volume:
-    """Reconstruct by a preset, "paper" or "r2", with `changes` of its settings; attenuation in 1/mm.
-
-    Raises InputError as `changed` and `fit_published` do.
-    """
-    return fit_published(scan, changed(preset, changes), device=device)
+@keywords(Settings)
+def paper(scan: Scan, settings: Settings) -> Volume:
+    """Reconstruct by the polychromatic method, attenuation in 1/mm; keywords are those of `Settings`."""
+    return fit_published(scan, settings)
 
 
-def fit_published(scan: Scan, settings: Settings, *, device: str = "cpu") -> Volume:
-    """Reconstruct `scan` with `settings`.
+@keywords(Baseline)
+def r2(scan: Scan, settings: Baseline) -> Volume:
+    """Reconstruct by R²-Gaussian, attenuation in 1/mm; keywords are those of `Baseline`."""
+    return fit_published(scan, settings)
+
+
+def fit_published(scan: Scan, settings: Settings) -> Volume:
+    """Reconstruct `scan` with settings that were checked.
 
     After the settings' seconds it returns what there is. `watch` is shown a volume each pass over the views, or at the
     times it asks for. The volume's details hold "densities": the volumes of ρa and ρb [z, y, x] in 1/mm as "rho_a" and
-    "rho_b", those there are. Raises InputError for another device than the CPU, for poses (FDK seeds the splats), for a
-    response that does not exist, and for a checkpoint that is damaged.
+    "rho_b", those there are. Raises InputError for poses (FDK seeds the splats), for a response that does not exist,
+    and for a checkpoint that is damaged.
     """
-    if torch.device(device).type != "cpu":
-        raise InputError(f"the published splat methods run on device 'cpu' only, got {device!r}")
     if settings.held_out >= scan.geometry.n_views:
-        raise InputError(f"held_out must be below the {scan.geometry.n_views} views, got {settings.held_out}")
+        raise InputError(f"held_out: expected fewer than the {scan.geometry.n_views} views, got {settings.held_out}")
     stopwatch = Stopwatch(limit=settings.seconds)
     objective = Objective.of(scan, settings)
     response = settings.make_response(scan.e_max)
@@ -76,7 +79,7 @@ def fit_published(scan: Scan, settings: Settings, *, device: str = "cpu") -> Vol
 
 def _identity(scan: Scan, settings: Settings) -> str:
     """Hash what the state of a run depends on, which its end, its read-out and where it is kept are not."""
-    return identity_of(scan, dataclasses.replace(settings, seconds=math.inf, readout=None, checkpoints=""))
+    return identity_of(scan, msgspec.structs.replace(settings, seconds=math.inf, readout=None, checkpoints=""))
 
 
 class _Run:

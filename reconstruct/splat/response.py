@@ -38,11 +38,11 @@ TOLERANCE = 1e-4  # of P, to which a known spectrum is reduced
 START = (0.2, 1.0)  # the paper's r and Ē_th
 SCINTILLATOR = Detector(kind="gos", thickness=0.2)
 ELECTRON_REST = 510.998950  # keV
-_MOST_NODES = 64
+MOST_NODES = 64
 _SMOOTH = 0.05  # width in Ē of the hinge
 _PEAKS = 5
 _RELATIVE_WIDTH = 0.5  # ε of "sinh"; ρb/ε is all that the data know, so that no other value fits better
-_FILTER = (0.1, 1.0, 20.0)  # mm of aluminium: least, start, most; the nodes are those of Gauss behind the least
+FILTER = (0.1, 1.0, 20.0)  # mm of aluminium: least, start, most; the nodes are those of Gauss behind the least
 _NODES: dict[Name, int] = {"paper": 15, "hinge": 10, "tube": 14, "mono": 1, "sinh": 16, "gmm": 15, "free": 15}
 
 
@@ -196,7 +196,7 @@ def _check_call(name: str, e_max: float, basis: str, nodes: int | None, given: b
         raise InputError(f"response 'known' needs a spectrum and no other takes one, got response {name!r}")
     if name == "sinh" and basis != "paper":
         raise InputError(f"basis must be 'paper' for response 'sinh', whose a is the same everywhere, got {basis!r}")
-    low, high = (1, 1) if name == "mono" else (2, _MOST_NODES)
+    low, high = (1, 1) if name == "mono" else (2, MOST_NODES)
     if nodes is not None and not low <= nodes <= high:
         raise InputError(f"nodes must be within {low} … {high} for response {name!r}, got {nodes}")
 
@@ -229,10 +229,10 @@ def _quadrature(name: Name, e_max: float, n: int) -> tuple[Array, Array]:
     if name == "mono":
         return np.array([center]), np.ones(1)
     if name == "tube":
-        behind = Tube(kvp=e_max, model="finkelshtein-pavlova", filters=(Filter(material="Al", thickness=_FILTER[0]),))
+        behind = Tube(kvp=e_max, model="finkelshtein-pavlova", filters=(Filter(material="Al", thickness=FILTER[0]),))
         rule = gauss_rule(tube_spectrum(behind), SCINTILLATOR, n)
         mu = _aluminium(rule.energies)
-        return rule.energies, rule.w1 * np.exp(_FILTER[0] * mu)
+        return rule.energies, rule.w1 * np.exp(FILTER[0] * mu)
     if name in ("hinge", "sinh"):
         x, w = np.polynomial.legendre.leggauss(n)
         share = 1 + half * x if name == "hinge" else (1 + _RELATIVE_WIDTH * x) ** (-1 / 3)
@@ -270,7 +270,7 @@ def _reduced(signal: Spectrum, basis: Basis, e_max: float, nodes: int | None) ->
     exact, _, _ = response_reference.evaluate(a, b, signal.weights, la, lb)
     seen = exact <= P_MAX
     la, lb, exact = la[seen], lb[seen], exact[seen]
-    for n in range(1, min(_MOST_NODES, signal.energies.size) + 1):
+    for n in range(1, min(MOST_NODES, signal.energies.size) + 1):
         rule = gauss_rule(photons, SCINTILLATOR, n)
         p, _, _ = response_reference.evaluate(*basis_functions(rule.energies, basis, e_max), rule.w1, la, lb)
         if np.abs(p - exact).max() <= TOLERANCE:
@@ -290,7 +290,7 @@ def _start(name: Name, energies: Array, e_max: float) -> tuple[float, ...]:
     if name in ("paper", "hinge"):
         return START
     if name == "tube":
-        return (_FILTER[1],)
+        return (FILTER[1],)
     half = _half_range(e_max)
     if name == "free":
         h, _ = _hinge(energies / _center(e_max), 1 - half, *START)
@@ -307,7 +307,7 @@ def _bounds(name: Name, n_nodes: int, e_max: float) -> Array:
     if name in ("paper", "hinge"):
         return np.array([[0.0, 1.0], [1 - 0.9 * half, 1 + half]])
     if name == "tube":
-        return np.array([[_FILTER[0], _FILTER[2]]])
+        return np.array([[FILTER[0], FILTER[2]]])
     if name == "gmm":
         means, widths = [1 - half, 1 + half], [math.log(0.1 * half), math.log(2.0)]
         return np.array([[-20.0, 20.0]] * _PEAKS + [means] * _PEAKS + [widths] * _PEAKS)

@@ -64,11 +64,11 @@ def scan_for(method: Method, stored: Stored, variant: str) -> "Scan":
     return dataclasses.replace(found.scan, metal=torch.from_numpy(metal & (variant == "metal")))
 
 
-def run_here(stored: Stored, variant: str, method: Method, device: str, warm_up_seconds: float) -> Outcome:
+def run_here(stored: Stored, variant: str, method: Method, warm_up_seconds: float) -> Outcome:
     """Run a method in this process on a view of the scan that is its own; that it changed its input is its error."""
     try:
         scan = scan_for(method, stored, variant)
-        outcome = attempt(method, scan, device, warm_up_seconds)
+        outcome = attempt(method, scan, warm_up_seconds)
         parts = ", ".join(changed(scan, scan_for(method, stored, variant)))
     except InputError as error:  # of the scan's files; a method's own are outcomes
         return Outcome(status="error", reason=describe(error))
@@ -104,13 +104,13 @@ def describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
-def attempt(method: Method, scan: "Scan", device: str, warm_up_seconds: float) -> Outcome:
+def attempt(method: Method, scan: "Scan", warm_up_seconds: float) -> Outcome:
     """Run a method in this process and turn whatever happens into an outcome; only Ctrl-C is passed on."""
     outcome, usage, view_updates = Outcome(status="error"), None, 0
     try:
         with restored():
             with measured() as usage:
-                volume = method.reconstruct(scan, device)
+                volume = method.reconstruct(scan)
             _check(volume)
             view_updates = int(volume.details.get("view_updates", scan.geometry.n_views))
             outcome.status, outcome.reason = str(volume.status), volume.reason
@@ -130,7 +130,7 @@ def attempt(method: Method, scan: "Scan", device: str, warm_up_seconds: float) -
         cpu=usage.cpu,
         peak_bytes=usage.peak_bytes,
         view_updates=view_updates,
-        device=device,
+        device="cpu",
         warm_up=warm_up_seconds,
     )
     return checked(outcome, scan.geometry.n_voxel)
@@ -202,22 +202,22 @@ def _array(volume: "torch.Tensor") -> NDArray[np.float32]:
     return np.array(volume.detach().cpu().numpy(), np.float32)
 
 
-def warm_up(method: Method, scan: "Scan", device: str) -> float:
+def warm_up(method: Method, scan: "Scan") -> float:
     """Run the method on a tiny scan of the same kind, so that compiling is not timed; return its seconds.
 
     A method that can be told how many seconds it may take gets one, again until it needs no more: what it did not get
     to while it was compiled would be compiled in the timed run. It keeps nothing that a later run would go on from.
     Its own complaint about the tiny scan is not its result and is only logged.
     """
-    told = {"seconds": WARM, "checkpoints": None}
-    told = {name: value for name, value in told.items() if name in method.params}
-    method = dataclasses.replace(method, overrides={**method.overrides, **told})
+    told = {"seconds": WARM} if "seconds" in method.params else {}
+    others = {name: value for name, value in method.overrides.items() if name != "checkpoints"}
+    method = dataclasses.replace(method, overrides=others | told)
     with measured() as usage:
         for _ in range(WARM_UPS):
             began = time.perf_counter()
             try:
                 with restored():
-                    method.reconstruct(tiny(scan), device)
+                    method.reconstruct(tiny(scan))
             except KeyboardInterrupt:
                 raise
             except BaseException as error:

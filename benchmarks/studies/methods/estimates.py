@@ -12,8 +12,7 @@ from ctsim.benchmarks.studies.methods.plan import Job
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.splat.course import PASSES, affordable
-from ctsim.reconstruct.splat.fast import Settings, finer
-from ctsim.reconstruct.splat.published_settings import PRESETS
+from ctsim.reconstruct.splat.fast import finer
 from ctsim.types import Scan
 
 FDKS = {
@@ -31,8 +30,8 @@ FDKS = {
     "asd-pocs": 2.3,
     "awpcsd": 3.7,
     "splat": 2.9,
-    "splat paper": 0.49,
-    "splat r2": 1.27,
+    "splat-paper": 0.49,
+    "splat-r2": 1.27,
 }
 """Cost in FDKs, of an iteration or a step where a method has those, as measured on lung-Fe of `quick`.
 
@@ -46,16 +45,14 @@ SMALL = 64  # voxels along an axis and views, at most, of the scan on which FDK 
 
 def in_fdks(method: Method, geometry: Geometry) -> float | None:
     """Return about how many times FDK's time a run takes, None for a method or a count that is not known here."""
-    name, params, default = method.name, method.params, 1.0
+    name, params = method.name, method.params
     try:
-        if name == "splat" and params["preset"] in PRESETS:
-            name, default = f"splat {params['preset']}", PRESETS[params["preset"]].steps
-        elif name == "splat":
-            fine = finer(geometry, params["fineness"] or Settings().fineness)
+        if name == "splat":
+            fine = finer(geometry, params["fineness"])
             coarse, finest = params["passes"] or (PASSES[0], min(PASSES[1], affordable(fine)))
             passes = finest + coarse / 15  # Σ 16⁻ⁿ: a coarser grid has an eighth of the voxels and half of the views
             return FDKS[name] * passes * math.prod(fine.n_voxel) / math.prod(geometry.n_voxel)
-        told = next((params[key] for key in AMOUNTS if params.get(key) is not None), default)
+        told = next((params[key] for key in AMOUNTS if params.get(key) is not None), 1.0)
         return FDKS[name] * float(told)
     except (KeyError, IndexError, TypeError, ValueError):  # what is wrong with a parameter the method says better
         return None

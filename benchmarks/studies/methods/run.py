@@ -44,7 +44,7 @@ class Runner:
 
     def __init__(self, given: Flags) -> None:
         self._given, self._results = given, given.results
-        self._warm: dict[tuple[str, str, str], float] = {}
+        self._warm: dict[tuple[str, str], float] = {}
         self._judge: tuple[str, Judge] | None = None
         self._twin: tuple[Job, Outcome] | None = None
 
@@ -69,17 +69,17 @@ class Runner:
         outcome = skip(method, stored, job.variant)
         if outcome is None and (given.isolate or given.seconds is not None):
             limit = given.seconds
-            if limit is not None and method.overrides.get("seconds") == limit:
+            if limit is not None and method.params.get("seconds") == limit:
                 limit += LATE
-            return _isolated(job, given.device, limit)
+            return _isolated(job, limit)
         if outcome is None:
             # also before the twin: without metal a method may take another way, and not be compiled
             scan = scan_for(method, stored, METAL)
-            key = (method.label, str(scan.counts.dtype), given.device)
+            key = (method.label, str(scan.counts.dtype))
             if key not in self._warm:
-                self._warm[key] = warm_up(method, scan, given.device)
+                self._warm[key] = warm_up(method, scan)
             del scan
-            outcome = run_here(stored, job.variant, method, given.device, self._warm[key])
+            outcome = run_here(stored, job.variant, method, self._warm[key])
         return outcome
 
     def _pair(self, job: Job) -> Twin:
@@ -125,11 +125,11 @@ class Runner:
         )
 
 
-def _isolated(job: Job, device: str, seconds: float | None) -> Outcome:
+def _isolated(job: Job, seconds: float | None) -> Outcome:
     """Run a job in a new process and wait at most `seconds` for it, its start and compilation included."""
     with Process() as process:
         try:
-            return process.run(_alone, job.task, device, seconds=seconds)
+            return process.run(_alone, job.task, seconds=seconds)
         except Stopped as end:
             if end.exit_code == -signal.SIGKILL:
                 reason = "the process was killed, as the system does when memory is short"
@@ -137,11 +137,11 @@ def _isolated(job: Job, device: str, seconds: float | None) -> Outcome:
             return Outcome(status=end.status, reason=str(end))
 
 
-def _alone(task: RunTask, device: str) -> Outcome:
+def _alone(task: RunTask) -> Outcome:
     """Be the process of an isolated run."""
     job = job_of(task)
-    warm = warm_up(job.method, scan_for(job.method, job.stored, METAL), device)
-    outcome = run_here(job.stored, job.variant, job.method, device, warm)
+    warm = warm_up(job.method, scan_for(job.method, job.stored, METAL))
+    outcome = run_here(job.stored, job.variant, job.method, warm)
     if outcome.cost is not None:
         outcome.cost = msgspec.structs.replace(outcome.cost, isolated=True)
     return outcome

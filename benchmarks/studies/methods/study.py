@@ -12,7 +12,6 @@ import tyro
 
 from ctsim.benchmarks import methods
 from ctsim.benchmarks.engine import study
-from ctsim.benchmarks.engine.devices import check_device
 from ctsim.benchmarks.engine.record import Task
 from ctsim.benchmarks.scores.protocol import Stored
 from ctsim.benchmarks.studies.methods import plan, tables
@@ -45,11 +44,9 @@ class Flags(study.Options):
     method: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
     """A method's name, such as fdk, or module:function of your own; may be given several times (default: fdk)."""
     set: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="METHOD.PARAMETER=VALUE")] = ()
-    """A method's parameter; may be given several times."""
+    """A method's parameter, one of those that `run-benchmark methods` lists; may be given several times."""
     scene: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
     """Only this scene; may be given several times (default: all)."""
-    device: str = "cpu"
-    """Where methods compute: cpu, cuda, cuda:1, ..."""
     isolate: tyro.conf.FlagCreatePairsOff[bool] = False
     """Run each method in a process of its own: exact peak memory, and a crash ends only that run. Implied by
     --seconds."""
@@ -74,11 +71,6 @@ class Methods(study.Study[RunRecord, Flags]):
 
     def __reduce__(self) -> tuple[type, tuple[()]]:
         return Methods, ()  # a worker opens scans itself
-
-    def check(self, given: Flags) -> None:
-        """Check the device, which is the workers' where a scheduler has them."""
-        if given.scheduler is None:
-            check_device(given.device)
 
     def tasks(self, given: Flags) -> list[RunTask]:
         """List all methods on the scans that were asked for, each on the metal-free twin first."""
@@ -155,8 +147,7 @@ def _estimated(task: RunTask) -> float | None:
 
 def _methods(given: Flags) -> list[methods.Method]:
     names = tuple(dict.fromkeys(given.method)) or ("fdk",)
-    overrides = methods.parse_overrides(given.set, names)
-    return [methods.within(methods.find(name, overrides[name]), given.seconds) for name in names]
+    return methods.chosen(names, given.set, given.seconds)
 
 
 def _scans(given: Flags) -> list[Stored]:

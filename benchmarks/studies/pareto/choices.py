@@ -68,6 +68,8 @@ def efforts(suite: Suite, name: str) -> list[Effort]:
         _effort(name, run.set, run.label, curve=run.curve, default=False, watched=True, stops=stops)
         for run in listed.run
     ]
+    if not listed.default:
+        return more
     if listed.parameter:
         return _by_value(usual, listed) + more
     count, times = usual.params.get("iterations"), listed.times

@@ -42,7 +42,7 @@ class Bench:
     def warm_up(self, effort: Effort) -> float:
         """Run the method on a few views and slices, so that compiling is not timed; return its seconds."""
         method = find(effort.method, effort.changes)
-        return warm_up(method, scan_for(method, self.stored, "metal"), "cpu")
+        return warm_up(method, scan_for(method, self.stored, "metal"))
 
     def run(self, effort: Effort) -> tuple[Mark, ...]:
         """Time one run; return a mark at each stop, the default and the end, or one if the method cannot be watched.
@@ -56,7 +56,7 @@ class Bench:
         stops = frozenset({*effort.stops, usual, method.params.get("iterations")})
         marks = Marks(began=time.perf_counter(), score=self.values, stops=stops)
         with watch(marks) if effort.watched else contextlib.nullcontext():
-            volume = method.reconstruct(scan, "cpu")
+            volume = method.reconstruct(scan)
         ended = time.perf_counter()
         if volume.status is not Status.OK:
             raise Ended(str(volume.status), volume.reason)

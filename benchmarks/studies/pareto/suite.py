@@ -39,15 +39,21 @@ class Run(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 
 class Listed(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A method and its effort: values of a parameter, or how many times its default iterations; and further runs."""
+    """A method and its effort: values of a parameter, or how many times its default iterations; and further runs.
+
+    With `default` off there are the further runs alone.
+    """
 
     name: str
     times: Count | None = None
     parameter: str = ""
     values: tuple[Any, ...] = ()
     run: tuple[Run, ...] = ()
+    default: bool = True
 
     def __post_init__(self) -> None:
+        if not self.default and (self.parameter or self.times is not None or not self.run):
+            raise InputError("default: off is for a method with runs of its own, and without parameter and times")
         if bool(self.parameter) != bool(self.values):
             raise InputError("parameter and values: expected both or neither")
         if self.parameter and self.times is not None:

@@ -94,7 +94,7 @@ def chosen(trace: Trace, scan: Scan, first: torch.Tensor) -> Choice:
 
 def corrected(method: Method, scan: Scan) -> torch.Tensor:
     """Correct a scan by a method as it is."""
-    return method.reconstruct(scan, "cpu").values
+    return method.reconstruct(scan).values
 
 
 def regardless(scan: Scan, name: str) -> torch.Tensor:

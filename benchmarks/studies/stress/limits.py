@@ -11,13 +11,14 @@ SAME_BY_DESCENT = 0.03
 BOUNDS = {"ibhc": 10.0}  # adds to P what its own volume says of hardening, streaks included
 PROJECTED, VOXELISED, RESPONDED = 1e-5, 1e-5, 2e-6  # splats: of the peak, of the greatest voxel, of the response
 
+SPLATS = ("splat", "splat-paper", "splat-r2")
 GROUPS: dict[str, tuple[str, ...]] = {
     "by-mask": ("limar", "nmar", "bhc-poly"),
     # their steps are of one length whatever the gradient of TV, in flat regions rounding
     "descent": ("asd-pocs", "awpcsd"),
-    "ordered": ("sart", "os-sart", "asd-pocs", "awpcsd", "splat"),  # a view that comes twice moves them twice
+    "ordered": ("sart", "os-sart", "asd-pocs", "awpcsd", *SPLATS),  # a view that comes twice moves them twice
     "sampled": ("bhc-poly",),  # fits in 64 views, other ones where there are twice as many
-    "physical": ("splat", "ibhc"),  # take materials from tables in 1/mm
+    "physical": (*SPLATS, "ibhc"),  # take materials from tables in 1/mm
 }
 """Methods that have something in common, by the names that a scene's `unlike` may give."""
 

@@ -58,7 +58,7 @@ def on_scene(name: str, settings: dict[str, Any], scene: Scene, side: int, found
     """Run a method on a scene and judge what it returns."""
     method, given, other = find(name, settings), example(scene, side), other_example(scene, side)
     if _refuses(method, given.scan.e_max):
-        found.refused("kvp must be within", lambda: method.reconstruct(given.scan, "cpu"))
+        found.refused("kvp must be within", lambda: method.reconstruct(given.scan))
         return
     if reason := method.skip(given.scan):
         found.say(f"skipped: {reason}")
@@ -80,7 +80,7 @@ def on_scene(name: str, settings: dict[str, Any], scene: Scene, side: int, found
 
 def _volume(method: Method, scan: Scan) -> Volume:
     """Run a method, with the true mask only where it declares to be given it."""
-    return method.reconstruct(scan if method.mask == "oracle" else dataclasses.replace(scan, metal=None), "cpu")
+    return method.reconstruct(scan if method.mask == "oracle" else dataclasses.replace(scan, metal=None))
 
 
 def _refuses(method: Method, e_max: float) -> bool:

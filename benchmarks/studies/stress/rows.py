@@ -17,7 +17,9 @@ SIMULATOR, SPLATS = "simulator", "splat kernels"  # subjects that are no methods
 MODULES = {name: f"ctsim.benchmarks.studies.stress.{name}" for name in ("simulator", "splats", "methods")}
 STEPS = 100  # of the published methods, whose own 20000 are hours; they add splats from the 500th on
 VARIANTS: dict[str, tuple[dict[str, Any], ...]] = {
-    "splat": ({}, {"response": "known"}, {"preset": "paper", "steps": STEPS}, {"preset": "r2", "steps": STEPS})
+    "splat": ({}, {"response": "known"}),
+    "splat-paper": ({"steps": STEPS},),
+    "splat-r2": ({"steps": STEPS},),
 }
 """Parameters with which a method runs where those are not its defaults alone."""
 

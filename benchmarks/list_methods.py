@@ -1,0 +1,50 @@
+"""`run-benchmark methods`: the methods with their inputs, and what --set may say to each."""
+
+import sys
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import tyro
+
+WIDEST = 24  # characters of a default; longer ones have the next column on a line of its own
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """List the methods, what they need, and their parameters with defaults, bounds and units."""
+
+    method: tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME ...]")]] = ()
+    """Only these methods, or module:function of your own (default: all of the table)."""
+
+
+def main(arguments: list[str]) -> int:
+    """Print the list; return 0."""
+    from ctsim.benchmarks.methods import TABLE
+
+    given = tyro.cli(Arguments, prog="run-benchmark methods", args=arguments)
+    sys.stdout.write("\n".join(described(name) for name in given.method or TABLE))
+    return 0
+
+
+def described(name: str) -> str:
+    """Describe a method: a line with its inputs, and one for each parameter."""
+    from ctsim.benchmarks.methods import find, parameters, resolve
+
+    method = find(name)
+    known = parameters(name, resolve(method.target))
+    rows = [(key, _default(method.params[key]), known[key]) for key in known]
+    widths = [max((len(row[k]) for row in rows if len(row[k]) <= WIDEST), default=0) for k in (0, 1)]
+    lines = [f"{name}: {method.inputs}"]
+    for key, default, parameter in rows:
+        meaning = f"; {parameter.meaning}" if parameter.meaning else ""
+        lines.append(f"  {key:{widths[0]}}  {default:{widths[1]}}  {parameter.expected}{meaning}")
+    return "\n".join(lines) + "\n"
+
+
+def _default(value: Any) -> str:
+    """Write a default as --set takes it."""
+    import msgspec
+
+    if value == float("inf"):
+        return "no limit"
+    return value or '""' if isinstance(value, str) else msgspec.json.encode(value).decode()

@@ -1,0 +1,26 @@
+"""Settings that both kinds of splat fits have: what is known of the beam, and how long a fit may take."""
+
+import math
+from typing import Annotated
+
+import msgspec
+
+from ctsim.reconstruct.beam import DetectorTable, TubeTable, check_tables
+from ctsim.reconstruct.settings import about
+
+Energy = Annotated[float, about("", "keV", gt=0, le=1000)]
+Seconds = Annotated[
+    float, about("the fit ends after these with what it has, those before an interruption included", "s", ge=0)
+]
+
+
+class Common(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is known of the beam (for the response "known"), and how long a fit may take."""
+
+    tube: TubeTable = None
+    detector: DetectorTable = None
+    seconds: Seconds = math.inf
+    checkpoints: Annotated[str, about("folder where an unfinished fit is kept each minute and goes on from")] = ""
+
+    def __post_init__(self) -> None:
+        check_tables(self.tube, self.detector)
