@@ -18,14 +18,14 @@ from ctsim.errors import InputError
 from ctsim.reconstruct.fdk import reconstruct as fdk
 
 
-def reconstruct(scan, *, device, preset="fast", steps=None, response=None, basis=None, nodes=None, e_max=None):
+def reconstruct(scan, *, steps=0, response="", basis="", nodes=0, e_max=0.0):
     if response == "gmm":
         raise InputError("this one has no mixtures")
-    return fdk(scan, device=device)
+    return fdk(scan)
 """
 TABLES = {'name = "smallest"': "[defaults]", "[phantom]": "[defaults.phantom]", "[scanner]": "[defaults.scanner]"}
 LUNG, BROCCOLI = "ablation-lung-Fe", "ablation-broccoli-Al"
-BASE = {"preset": "paper", "steps": 2000}
+BASE = {"steps": 2000}
 
 
 @pytest.fixture
@@ -39,7 +39,8 @@ def command(tmp_path, monkeypatch, capsys):
     (tmp_path / "tiny.toml").write_text(defaults + tiny, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
-    monkeypatch.setitem(methods.TABLE, "splat", ("stub_splat:reconstruct", methods.COUNTS_ONLY))
+    for name in ("splat-paper", "splat-r2"):
+        monkeypatch.setitem(methods.TABLE, name, ("stub_splat:reconstruct", methods.COUNTS_ONLY))
     monkeypatch.setattr(make_dataset, "load", lambda suite: load_suite("tiny.toml" if suite == "ablation" else suite))
     yield lambda *more: run(monkeypatch, capsys, more)
     sys.modules.pop("stub_splat", None)
@@ -52,7 +53,7 @@ def run(monkeypatch, capsys, more):
 
 
 def label(**params):
-    return methods.Method(name="splat", target="", inputs="", params={}, overrides={**BASE, **params}).label
+    return methods.Method(name="splat-paper", target="", inputs="", params={}, overrides={**BASE, **params}).label
 
 
 def test_a_run_that_rows_share_is_listed_once_with_all_of_them():
@@ -72,15 +73,15 @@ def test_every_row_runs_and_no_two_are_the_same(smallest):
     stored = open_scan(list_scans(smallest)[0])
     found: dict[bytes, str] = {}
     for method in ablation.methods_of(ablation.variants()).values():
-        short = methods.find("splat", {**method.overrides, "steps": 3, "n_splats": 200})
-        volume = short.reconstruct(stored.scan, "cpu")
+        short = methods.find(method.name, {**method.overrides, "steps": 3, "n_splats": 200})
+        volume = short.reconstruct(stored.scan)
         assert volume.status == "ok" and volume.values.any()
         assert found.setdefault(volume.values.numpy().tobytes(), method.label) == method.label
 
 
 def test_one_table_needs_its_own_rows_only():
     (baseline, *_) = ablation.variants((7,))
-    assert baseline.params == {"preset": "r2", "steps": 3000} and baseline.scene == BROCCOLI
+    assert (baseline.method, baseline.params) == ("splat-r2", {"steps": 3000}) and baseline.scene == BROCCOLI
     assert len(ablation.variants((7,))) == 6
     assert {v.scene for v in ablation.variants((9,))} == {BROCCOLI, *(f"{BROCCOLI}-{k}kV" for k in (60, 120, 150))}
 
@@ -137,7 +138,7 @@ def test_runs_are_the_workers_where_some_are_asked_for(command, tmp_path, monkey
 def test_a_dry_run_prints_rows_and_cost_and_writes_nothing(command, tmp_path):
     code, shown = command("--dry-run", "--table", "7")
     assert code == 0 and not (tmp_path / "data").exists() and not (tmp_path / "results").exists()
-    seconds = 3 * (2000 * ablation.SECONDS["paper"] + 3000 * ablation.SECONDS["r2"])
+    seconds = 3 * (2000 * ablation.SECONDS["splat-paper"] + 3000 * ablation.SECONDS["splat-r2"])
     assert f"total: 6 of 6 runs, {ablation.human_time(seconds)}" in shown.out
     assert "scans to be made first: ablation-broccoli-Al ablation-lung-Fe ablation-teeth-Ti" in shown.out
     assert shown.out.count(" to run ") == 6
@@ -151,10 +152,10 @@ def test_a_dry_run_prints_rows_and_cost_and_writes_nothing(command, tmp_path):
 def test_the_cost_of_a_step_is_what_records_say():
     from test_paper_tables import record
 
-    found = [record("splat", LUNG, wall=50.0, params=BASE), record("splat", LUNG, wall=70.0, params=BASE)]
+    found = [record("splat-paper", LUNG, wall=50.0, params=BASE), record("splat-paper", LUNG, wall=70.0, params=BASE)]
     found[0] = msgspec.structs.replace(found[0], cost=msgspec.structs.replace(found[0].cost, warm_up=30.0))
     # (50 + 30) and 70 s for 2000 steps, the median between them
-    assert ablation._rates(found) == ablation.SECONDS | {"paper": pytest.approx(75 / 2000)}
+    assert ablation._rates(found) == ablation.SECONDS | {"splat-paper": pytest.approx(75 / 2000)}
 
 
 def test_a_time_limit_ends_a_run_with_a_record(command, tmp_path):

@@ -1,4 +1,4 @@
-"""How the commands end: by a signal, or at once where the device is not there."""
+"""How the commands end: by a signal, or at once where an argument is wrong."""
 
 import io
 import signal
@@ -12,9 +12,7 @@ from run_records import append
 from test_paper_tables import record
 
 from ctsim.benchmarks import cli, make_dataset
-from ctsim.benchmarks.engine.devices import check_device
 from ctsim.benchmarks.studies.methods import records
-from ctsim.errors import InputError
 from ctsim.store import list_scans, open_scan
 
 WAITING = """
@@ -26,7 +24,7 @@ def reconstruct(scan, *, device):
     if not Path("go").exists():
         Path("waiting").touch()
         time.sleep(60)
-    return fdk(scan, device=device)
+    return fdk(scan)
 """
 
 
@@ -77,22 +75,6 @@ def test_the_signals_handler_is_put_back(smallest, tmp_path, monkeypatch, capsys
     before = signal.getsignal(signal.SIGTERM)
     assert cli.run_benchmark() == 2  # there are no records
     assert signal.getsignal(signal.SIGTERM) is before
-
-
-@pytest.mark.parametrize("device", ["cuda:99", "gpu", "meta", "cuda:x", "mps"])
-def test_a_device_that_is_not_there_is_one_sentence_before_any_run(smallest, tmp_path, monkeypatch, capsys, device):
-    monkeypatch.setattr(sys, "argv", ["run-benchmark", str(smallest), str(tmp_path / "r"), "--device", device])
-    assert cli.run_benchmark() == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"run-benchmark: --device {device}") or f"--device '{device}'" in said
-    assert said.count("\n") == 1 and "expected cpu" in said and len(said) < 300
-    assert not (tmp_path / "r").exists()
-
-
-def test_the_cpu_is_always_there():
-    check_device("cpu")
-    with pytest.raises(InputError, match="no such kind"):
-        check_device("abacus")
 
 
 def test_what_cannot_go_on_does_not_say_that_it_will(monkeypatch, capsys):

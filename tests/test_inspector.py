@@ -119,7 +119,7 @@ def test_clipping_is_closed_form():
 
 def spectral(scan, *, device):
     """FDK, and something else at 50 keV."""
-    volume = fdk(scan, device=device)
+    volume = fdk(scan)
     return dataclasses.replace(volume, at_energy=lambda kev: volume.values * (60 / kev))
 
 

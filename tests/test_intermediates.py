@@ -13,7 +13,7 @@ from ctsim.store import list_scans, open_scan
 def test_the_bridged_view_is_the_measured_one_but_for_the_trace(smallest, name):
     stored = open_scan(list_scans(smallest)[0])
     method = methods.find(name)
-    found = attempt.attempt(method, attempt.scan_for(method, stored, "metal"), "cpu", 0.0).intermediates
+    found = attempt.attempt(method, attempt.scan_for(method, stored, "metal"), 0.0).intermediates
     assert found.keys() == ({"view", "trace", "projection"} | ({"prior"} if name == "nmar" else set()))
     trace, bridged = found["trace"], found["projection"]
     measured = line_integrals(stored.scan, int(found["view"]))[0].numpy()
@@ -27,6 +27,6 @@ def test_the_bridged_view_is_the_measured_one_but_for_the_trace(smallest, name):
 def test_without_metal_nothing_is_attached(smallest):
     stored = open_scan(list_scans(smallest)[0])
     method = methods.find("nmar")
-    outcome = attempt.attempt(method, attempt.scan_for(method, stored, "metal_free"), "cpu", 0.0)
+    outcome = attempt.attempt(method, attempt.scan_for(method, stored, "metal_free"), 0.0)
     assert outcome.status == "ok" and outcome.intermediates == {}
     assert intermediates.taken({}, stored.geometry) == {}

@@ -68,7 +68,7 @@ def test_residual_falls_as_the_theory_says(name):
 
 def test_sirt_lowers_its_own_norm_in_each_iteration():
     scan = tiny()
-    system, norms = System(scan, "cpu"), []
+    system, norms = System(scan), []
     sums = system.forward(system.support.astype(np.float32))
     share = np.where(sums > 0.5 * min(TINY.d_voxel), 1 / np.maximum(sums, 1e-9), 0)
 
@@ -87,7 +87,7 @@ def test_sirt_lowers_its_own_norm_in_each_iteration():
 @pytest.mark.parametrize("iterations", [1, 2, 5, 8])
 def test_cgls_equals_lsqr(weights, iterations):
     scan = tiny()
-    system = System(scan, "cpu", weights)
+    system = System(scan, weights)
     assert system.support.all()
     root = np.sqrt(system.weights.astype(float)).ravel()
     expected = lsqr(root[:, None] * matrix(TINY), root * system.data.ravel(), iter_lim=iterations, atol=0, btol=0)[0]
@@ -100,7 +100,7 @@ def test_sart_by_hand():
     # One view, one update from zero: x = λ Aᵀ(p/A1)/Aᵀ1, in numbers of an explicit matrix.
     geometry = msgspec.structs.replace(TINY, n_views=1)
     scan, a = tiny(geometry), matrix(geometry)
-    p = System(scan, "cpu").data.ravel().astype(float)
+    p = System(scan).data.ravel().astype(float)
     sums = a.sum(1)
     met = sums > 0.5 * min(TINY.d_voxel)
     lacking = np.divide(p, sums, out=np.zeros_like(p), where=met)
@@ -124,7 +124,7 @@ def test_weightless_rays_change_nothing():
 
 def test_named_weights():
     scan = tiny()
-    data = torch.from_numpy(System(scan, "cpu").data)
+    data = torch.from_numpy(System(scan).data)
     by_name, by_hand = (os_sart(scan, weights=w).values for w in ("exp(-l)", torch.exp(-data.clamp(min=0))))
     torch.testing.assert_close(by_name, by_hand, rtol=0, atol=2e-6)  # two exponentials, values up to 1
 
@@ -221,7 +221,7 @@ def test_weights_by_trace_leave_out_the_shadow_of_metal():
     inner, r = 3.0, distance()
     truth = np.where(r < inner, 40 * MU, np.where(r < RADIUS, MU, 0)).astype(np.float32)
     scan = scan_of(forward(torch.from_numpy(truth), GEOMETRY), GEOMETRY)
-    system = System(scan, "cpu", "trace")
+    system = System(scan, "trace")
     shadow = forward(torch.from_numpy((r < inner).astype(np.float32)), GEOMETRY).numpy()
     assert system.about_weights["mask_status"] == "ok"
     assert set(np.unique(system.weights)) == {0, 1}
@@ -244,7 +244,6 @@ def test_visiting_order_visits_all_once_and_jumps():
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda scan: sart(scan, device="meta"), "cpu"),
         (lambda scan: sart(scan, iterations=0), "iterations"),
         (lambda scan: sart(scan, iterations=1.5), "iterations"),
         (lambda scan: os_sart(scan, subsets=0), "subsets"),

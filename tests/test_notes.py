@@ -186,5 +186,5 @@ def test_a_scan_of_an_older_version_is_looked_at_by_its_mask(data, tmp_path):
 
 @pytest.mark.parametrize("name", ["limar", "nmar", "bhc-poly"])
 def test_a_correction_without_metal_says_that_it_is_fdk_s(data, name):
-    volume = find(name).reconstruct(scan_for(find(name), open_scan(data / "above"), "metal"), "cpu")
+    volume = find(name).reconstruct(scan_for(find(name), open_scan(data / "above"), "metal"))
     assert volume.details["uncorrected_reason"] == "no metal in the mask: the volume is FDK's" and not volume.reason

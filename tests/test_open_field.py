@@ -10,7 +10,7 @@ from ctsim.benchmarks.scores.protocol import metal_score, tissue_score, truth_of
 from ctsim.errors import InputError
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reconstruct.scatter import open_excess
-from ctsim.reconstruct.splat.method import reconstruct
+from ctsim.reconstruct.splat.fast import reconstruct
 from ctsim.store import list_scans, open_scan
 
 SCENE = """
@@ -72,7 +72,7 @@ def test_the_simulators_scatter_is_found_in_its_scans(stored):
 
 def test_the_fit_undoes_scatter_that_it_finds_itself(stored):
     truth = truth_of(stored)
-    found, blind = (reconstruct(stored.scan, device="cpu", **told) for told in ({}, {"scatter": 0.0}))
+    found, blind = (reconstruct(stored.scan, **told) for told in ({}, {"scatter": 0.0}))
     assert found.details["scatter"] > 0
     assert blind.details["scatter"] == 0
     tissue, metal = (
@@ -84,8 +84,8 @@ def test_the_fit_undoes_scatter_that_it_finds_itself(stored):
 
 @pytest.mark.parametrize("scatter", [-0.1, float("inf"), float("nan")])
 def test_scatter_that_makes_no_sense_is_refused(stored, scatter):
-    with pytest.raises(InputError, match="scatter must be at least 0 times the open field, got"):
-        reconstruct(stored.scan, device="cpu", scatter=scatter)
+    with pytest.raises(InputError, match=r"scatter: expected a number within 0 to 100 \(of the open field\)"):
+        reconstruct(stored.scan, scatter=scatter)
 
 
 def test_an_open_field_without_noise_has_none_and_warns_of_nothing():

@@ -68,7 +68,7 @@ def test_figures_that_the_paper_prints_more_than_once_agree():
         (found,) = (r.figures for r in TABLES[number].rows if r.stubs == stubs)
         return found
 
-    lung, teeth, broccoli = (row(3, "Ours (preset paper)")[k : k + 2] for k in (0, 2, 4))
+    lung, teeth, broccoli = (row(3, "Ours (splat-paper)")[k : k + 2] for k in (0, 2, 4))
     assert lung == row(1, "Our model") == row(5, "Baseline with both") == row(6, "15") == row(7, "Lung")[2:]
     assert (teeth, broccoli) == (row(7, "Teeth")[2:], row(7, "Broccoli")[2:])
     assert row(5, "Baseline") == row(7, "Lung")[:2]
@@ -82,7 +82,7 @@ def test_figures_that_the_paper_prints_more_than_once_agree():
 def test_the_paper_comes_out_best_where_it_prints_itself_bold():
     """It marks no more than its own column or row in tables 1, 3, 4, 5 and 7."""
     empty = paper_tables.Measured.of([], PAPER)
-    for number, ours in ((1, "Our model"), (3, "Ours (preset paper)"), (5, "Baseline with both")):
+    for number, ours in ((1, "Our model"), (3, "Ours (splat-paper)"), (5, "Baseline with both")):
         sheet = paper_tables.fill(TABLES[number], empty, "paper")
         best = [
             r.stubs[0] for r, c in zip(TABLES[number].rows, sheet.cells["paper"], strict=True) if c[0].place == "best"
@@ -111,11 +111,10 @@ def broccolis(text):
 
 def test_a_scene_of_the_same_name_fills_no_cell_and_is_counted():
     """Table 4 has the broccoli of core and that of real, whose times are 16 m 08 s and 16 m 16 s in the paper."""
-    preset = {"overrides": {"preset": "paper"}}
     found = [
-        record("splat", "broccoli-Al", suite="core", wall=60.0, scan="core", **preset),
-        record("splat", "broccoli-Al", suite="quick", wall=3.0, scan="quick", **preset),
-        record("splat", "lung-Fe", suite="quick", wall=4.0, scan="quick", **preset),
+        record("splat-paper", "broccoli-Al", suite="core", wall=60.0, scan="core"),
+        record("splat-paper", "broccoli-Al", suite="quick", wall=3.0, scan="quick"),
+        record("splat-paper", "lung-Fe", suite="quick", wall=4.0, scan="quick"),
         record("fdk", "lung-Fe", suite="quick", wall=5.0, scan="quick"),  # in no cell of table 4
     ]
     text = paper_tables.text_of(found, "md", "paper", (4,))
@@ -125,7 +124,7 @@ def test_a_scene_of_the_same_name_fills_no_cell_and_is_counted():
     said = f"(scene_id {quick}); expected {core} or {repeated} (seed 1), which `make-dataset core` makes"
     assert f"- core/lung-Fe: 1 record is left out, of another scene of this name {said}\n" in text
     assert "- core/broccoli-Al: 1 record is left out" in text and "- real/broccoli-Al: 1 record is left out" in text
-    found.append(record("splat", "broccoli-Al", suite="real", wall=120.0, scan="real", **preset))
+    found.append(record("splat-paper", "broccoli-Al", suite="real", wall=120.0, scan="real"))
     text = paper_tables.text_of(found, "md", "paper", (4,))
     assert broccolis(text) == {"Synthetic": "1m 00s", "Real": "2m 00s"}
 
@@ -158,7 +157,7 @@ def test_cells_hold_mean_and_spread_and_compete_within_their_side():
     assert lines(text, "FDK")[0][1:5] == ["19.04", "21.00 ± 1.41", "0.924", "0.500 ± 0.000"]
     assert lines(text, "LIMAR")[0][1:3] == ["19.83", "**30.00**"]
     assert lines(text, "NMAR")[0][1:3] == ["<u>20.49</u>", "<u>25.00</u>"]
-    assert lines(text, "Ours (preset paper)")[0][1:3] == ["**29.19**", "–"]
+    assert lines(text, "Ours (splat-paper)")[0][1:3] == ["**29.19**", "–"]
 
 
 def test_the_caption_states_what_a_number_means():
@@ -181,7 +180,7 @@ def test_the_caption_states_what_a_number_means():
 
 def test_times_are_written_as_the_paper_does_and_the_fastest_wins():
     found = [
-        record("splat", "broccoli-Al", wall=3725.4, overrides={"preset": "paper"}),
+        record("splat-paper", "broccoli-Al", wall=3725.4),
         record("splat", "broccoli-Al", wall=9.0),
     ]
     text = paper_tables.text_of(found, "md", "paper", (4,))
@@ -198,10 +197,8 @@ def test_a_missing_cell_names_the_command_that_makes_it():
     text = paper_tables.text_of([record("fdk", s) for s in ("lung-Fe", "teeth-Ti", "broccoli-Al")], "md", "paper")
     table = dict(enumerate(text.split("## Table ")[1:], 1))
     core = "`make-dataset core data/`, then `run-benchmark data/ results/ --scene lung-Fe --scene teeth-Ti"
-    assert (
-        f"{core} --scene broccoli-Al --method limar --method nmar --method splat --set splat.preset=paper`" in table[3]
-    )
-    assert "--method fdk" not in table[3] and "--set splat.preset=r2`" in table[3]
+    assert f"{core} --scene broccoli-Al --method limar --method nmar --method splat-paper`" in table[3]
+    assert "--method fdk" not in table[3] and "--method splat-r2`" in table[3]
     assert "there is no method acdnet, dicdnet" in table[3]
     assert "`run-benchmark ablation data/ results/ --table 5`" in table[5]
     assert "A run has 2000 or 3000 steps here" in table[5] and "steps here" not in table[3]

@@ -200,7 +200,7 @@ def test_a_method_that_can_be_told_its_seconds_ends_by_itself(tmp_path):
 
 def test_a_warm_up_goes_on_until_nothing_is_left_to_compile(tmp_path):
     CALLS.clear()
-    seconds = attempt.warm_up(methods.find("test_run:compiling"), double(tmp_path).scan, "cpu")
+    seconds = attempt.warm_up(methods.find("test_run:compiling"), double(tmp_path).scan)
     assert CALLS == [attempt.WARM] * 3 and seconds > 4 * attempt.WARM
 
 
@@ -303,14 +303,14 @@ def test_a_rerun_without_a_volume_at_50_kev_leaves_none_of_an_earlier_one(tmp_pa
 )
 def test_a_volume_at_50_kev_that_is_none_is_the_runs_failure(tmp_path, flaw, status):
     method = methods.find("test_run:spectral", {"flaw": flaw})
-    outcome = attempt.attempt(method, double(tmp_path).scan, "cpu", 0.0)
+    outcome = attempt.attempt(method, double(tmp_path).scan, 0.0)
     assert outcome.status == status and "volume at 50 keV" in outcome.reason
     assert outcome.at_50kev is None or status == "nonfinite"
     assert outcome.cost is not None and outcome.cost.view_updates == 12
 
 
 def test_reading_at_50_kev_is_no_time_of_the_method(tmp_path):
-    outcome = attempt.attempt(methods.find("test_run:spectral", {"flaw": "slow"}), double(tmp_path).scan, "cpu", 0.0)
+    outcome = attempt.attempt(methods.find("test_run:spectral", {"flaw": "slow"}), double(tmp_path).scan, 0.0)
     assert outcome.status == "ok" and outcome.cost is not None and outcome.cost.wall < 0.5
 
 
@@ -367,7 +367,7 @@ def test_panels_hold_what_each_method_gave():
 )
 def test_intermediates_that_cannot_be_drawn_are_an_error(tmp_path, entries, words):
     method = methods.find("test_run:shows", {"entries": entries})
-    outcome = attempt.attempt(method, double(tmp_path).scan, "cpu", 0.0)
+    outcome = attempt.attempt(method, double(tmp_path).scan, 0.0)
     assert outcome.status == "error" and words in outcome.reason
     for wrong in ({"view": 6}, {"view": -1}, {"prior": np.zeros((2, 2, 2))}, {"view": 0, "trace": np.zeros((5, 5))}):
         with pytest.raises(InputError):

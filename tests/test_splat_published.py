@@ -13,11 +13,12 @@ import torch
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.beam import detected
+from ctsim.reconstruct.settings import parameters_of
 from ctsim.reconstruct.splat import adam, densify
 from ctsim.reconstruct.splat.learner import LEAST_VALUE, Learner, seed_splats
 from ctsim.reconstruct.splat.objective import Objective
-from ctsim.reconstruct.splat.published import fit_published, read_out, reconstruct
-from ctsim.reconstruct.splat.published_settings import PRESETS, Settings, changed
+from ctsim.reconstruct.splat.published import fit_published, paper, r2, read_out
+from ctsim.reconstruct.splat.published_settings import Baseline, Settings
 from ctsim.reconstruct.splat.response import evaluate
 from ctsim.reconstruct.splat.volume import voxelise
 from ctsim.reconstruct.watch import Progress, listen, watch
@@ -34,7 +35,7 @@ GEOMETRY = Geometry(
 )
 RADIUS, MU = 10.0, 0.03  # mm, 1/mm
 SCHEDULE = densify.Schedule(first=20_000)
-PAPER, R2 = (dataclasses.replace(PRESETS[name], steps=200, n_splats=400, schedule=SCHEDULE) for name in ("paper", "r2"))
+PAPER, R2 = (kind(steps=200, n_splats=400, schedule=SCHEDULE) for kind in (Settings, Baseline))
 
 
 @pytest.fixture(autouse=True)
@@ -77,23 +78,23 @@ def test_the_loss_falls_and_the_same_seed_gives_the_same_bits(settings):
     inside, outside = volume.values.numpy()[distance < 8], volume.values.numpy()[distance > 13]
     assert inside.mean() > 5 * abs(outside.mean())
     often = densify.Schedule(first=5, every=7, last=20_000, most=600)
-    short = dataclasses.replace(settings, steps=30, schedule=often, schedule_steps=30)
+    short = msgspec.structs.replace(settings, steps=30, schedule=often, schedule_steps=30)
     first, again = (fit_published(sphere(), short) for _ in range(2))
-    other = fit_published(sphere(), dataclasses.replace(short, seed=1))
+    other = fit_published(sphere(), msgspec.structs.replace(short, seed=1))
     assert torch.equal(first.values, again.values) and not torch.equal(first.values, other.values)
     assert first.details["splats"] > 400
 
 
 def test_progress_says_where_the_fit_stands():
-    _, seen = course(sphere(), dataclasses.replace(PAPER, steps=30))
+    _, seen = course(sphere(), msgspec.structs.replace(PAPER, steps=30))
     assert [p.share for p in seen] == [k / 30 for k in range(1, 31)]
     assert all(a.seconds < b.seconds for a, b in itertools.pairwise(seen))
     assert seen[9].remaining == pytest.approx(2 * seen[9].seconds) and seen[-1].remaining == 0
 
 
 def test_the_response_is_learned_only_where_it_is_to_be():
-    def theta(**changes):
-        found = reconstruct(sphere(), steps=20, n_splats=200, **changes).details["response"]
+    def theta(method=paper, **changes):
+        found = method(sphere(), steps=20, n_splats=200, **changes).details["response"]
         assert changes.get("response", found["name"]) == found["name"] and sum(found["eta"]) == pytest.approx(1)
         return found["theta"]
 
@@ -103,8 +104,8 @@ def test_the_response_is_learned_only_where_it_is_to_be():
     assert theta(theta=[0.5, 0.9]) != [0.5, 0.9]
     assert theta(response="flat") == [1.0, 1.0]
     assert theta(basis="constant") == [0.2, 1.0]
-    assert theta(preset="r2") == [] == theta(response="known")
-    volumes = [reconstruct(sphere(), steps=2, n_splats=200, e_max=e_max).values for e_max in (60.0, None)]
+    assert theta(r2) == [] == theta(response="known")
+    volumes = [paper(sphere(), steps=2, n_splats=200, e_max=e_max).values for e_max in (60.0, None)]
     assert not torch.equal(*volumes)
 
 
@@ -112,7 +113,7 @@ def test_a_response_matters_only_where_attenuation_depends_on_energy():
     """Shares of the response sum to 1, so that P = La for a constant density, whatever they are."""
 
     def run(**changes):
-        return reconstruct(sphere(), steps=3, n_splats=200, **changes).values
+        return paper(sphere(), steps=3, n_splats=200, **changes).values
 
     assert torch.equal(run(basis="constant", response="mono"), run(basis="constant", response="paper"))
     for basis in ("paper", "klein-nishina", "photoelectric"):
@@ -121,7 +122,7 @@ def test_a_response_matters_only_where_attenuation_depends_on_energy():
 
 def test_a_known_spectrum_is_the_one_that_is_told():
     def run(**changes):
-        return reconstruct(sphere(), steps=3, n_splats=200, response="known", **changes).values
+        return paper(sphere(), steps=3, n_splats=200, response="known", **changes).values
 
     copper = {"filters": [{"material": "Cu", "thickness": 2.0}]}
     assert not torch.equal(run(), run(tube=copper)) and not torch.equal(run(), run(detector={"kind": "csi"}))
@@ -134,17 +135,17 @@ def test_a_known_spectrum_is_the_one_that_is_told():
 
 
 def test_nothing_seen_and_no_time_give_what_there_is():
-    for preset in ("paper", "r2"):
-        empty = reconstruct(sphere(mu=0.0), preset=preset, steps=5)
+    for method in (paper, r2):
+        empty = method(sphere(mu=0.0), steps=5)
         assert empty.status is Status.OK and not empty.reason
         assert not empty.values.any() and "no voxel" in empty.details["limitation"]
-    volume = reconstruct(sphere(), seconds=0.0)
+    volume = paper(sphere(), seconds=0.0)
     assert volume.details["view_updates"] == 0 and volume.values.any()
 
 
 def test_densities_are_handed_over_and_read_at_any_energy():
-    def run(**changes):
-        return reconstruct(sphere(), steps=20, n_splats=400, **changes)
+    def run(method=paper, **changes):
+        return method(sphere(), steps=20, n_splats=400, **changes)
 
     at_centre = run()
     a, b = (at_centre.details["densities"][name] for name in ("rho_a", "rho_b"))
@@ -156,7 +157,7 @@ def test_densities_are_handed_over_and_read_at_any_energy():
     weight = ((hardened.values.numpy() - a).sum() / b.sum()).item()
     np.testing.assert_allclose(hardened.values, a + weight * b, rtol=1e-4, atol=1e-7)
     assert 1.8**-3 < weight < 0.2**-3 and hardened.details["read-out"].startswith("hardened")
-    assert list(run(preset="r2").details["densities"]) == ["rho_a"]
+    assert list(run(r2).details["densities"]) == ["rho_a"]
     assert list(run(basis="photoelectric").details["densities"]) == ["rho_b"]
 
 
@@ -173,7 +174,7 @@ def test_the_hardened_read_out_knows_no_gauge():
         weights, _ = read_out(splats, response, objective)
         return voxelise(splats, GEOMETRY, splats.densities @ weights[:, None])
 
-    hard = dataclasses.replace(objective, settings=dataclasses.replace(PAPER, readout="hardened"))
+    hard = dataclasses.replace(objective, settings=msgspec.structs.replace(PAPER, readout="hardened"))
     first, second = read(hard, splats, response), read(hard, moved, other)
     np.testing.assert_allclose(first, second, rtol=1e-4, atol=1e-7)
     assert np.abs(read(objective, moved, other) - read(objective, splats, response)).max() > 0.01 * first.max()
@@ -187,8 +188,8 @@ class Interrupted(Exception):
 def test_an_interrupted_fit_goes_on_to_the_same_bits(held_out, tmp_path, monkeypatch):
     monkeypatch.setattr("ctsim.reconstruct.splat.checkpoint.EVERY", 0.0)
     often = densify.Schedule(first=5, every=7, last=20_000, most=600)
-    whole = dataclasses.replace(PAPER, steps=40, schedule=often, schedule_steps=40, held_out=held_out)
-    kept = dataclasses.replace(whole, checkpoints=str(tmp_path))
+    whole = msgspec.structs.replace(PAPER, steps=40, schedule=often, schedule_steps=40, held_out=held_out)
+    kept = msgspec.structs.replace(whole, checkpoints=str(tmp_path))
     steps: list[int] = []
 
     def interrupt(progress: Progress) -> None:
@@ -207,18 +208,18 @@ def test_an_interrupted_fit_goes_on_to_the_same_bits(held_out, tmp_path, monkeyp
 
 
 def test_time_that_ran_out_can_be_given_later(tmp_path):
-    settings = dataclasses.replace(PAPER, steps=30, checkpoints=str(tmp_path))
-    early = fit_published(sphere(), dataclasses.replace(settings, seconds=1e-9))
+    settings = msgspec.structs.replace(PAPER, steps=30, checkpoints=str(tmp_path))
+    early = fit_published(sphere(), msgspec.structs.replace(settings, seconds=1e-9))
     assert early.details["view_updates"] == 0 and len(list(tmp_path.iterdir())) == 1
     late = fit_published(sphere(), settings)
     assert late.details["view_updates"] == 30 and not list(tmp_path.iterdir())
 
 
 def test_a_damaged_checkpoint_is_refused_and_another_scan_s_not_taken(tmp_path):
-    settings = dataclasses.replace(PAPER, steps=30, checkpoints=str(tmp_path), seconds=0.0)
+    settings = msgspec.structs.replace(PAPER, steps=30, checkpoints=str(tmp_path), seconds=0.0)
     fit_published(sphere(), settings)
     fit_published(sphere(mu=0.02), settings)
-    fit_published(sphere(), dataclasses.replace(settings, seed=1))
+    fit_published(sphere(), msgspec.structs.replace(settings, seed=1))
     files = sorted(tmp_path.iterdir())
     assert len(files) == 3
     for file in files:
@@ -226,11 +227,11 @@ def test_a_damaged_checkpoint_is_refused_and_another_scan_s_not_taken(tmp_path):
     with pytest.raises(InputError, match="delete it"):
         fit_published(sphere(), settings)
     with pytest.raises(InputError, match="cannot be read"):
-        fit_published(sphere(), dataclasses.replace(settings, checkpoints=str(files[0])))
+        fit_published(sphere(), msgspec.structs.replace(settings, checkpoints=str(files[0])))
 
 
 def test_a_fit_ends_when_views_it_does_not_see_gain_no_more():
-    settings = dataclasses.replace(PAPER, steps=2000, held_out=4, patience=2)
+    settings = msgspec.structs.replace(PAPER, steps=2000, held_out=4, patience=2)
     scan, passes = sphere(i0=30.0), {}
     noisy = torch.from_numpy(np.random.default_rng(5).poisson(scan.counts.numpy())).float()  # to be fitted in vain
     with watch(lambda updates, seconds, values: passes.update({updates: values})):
@@ -247,14 +248,14 @@ def test_a_loss_that_is_not_finite_ends_the_fit_and_says_so(monkeypatch):
     lost = fit_published(sphere(), PAPER)
     assert steps == list(range(26)) and lost.status is Status.NONFINITE and "not finite" in lost.reason
     # what met the views that were held out best was kept before
-    kept = fit_published(sphere(), dataclasses.replace(PAPER, held_out=2))
+    kept = fit_published(sphere(), msgspec.structs.replace(PAPER, held_out=2))
     assert kept.status is Status.OK and kept.details["held_out"]["step"] == 18
 
 
 def test_a_fit_can_be_watched():
     seen = []
     with watch(lambda updates, seconds, volume: seen.append((updates, volume))):
-        volume = fit_published(sphere(), dataclasses.replace(PAPER, steps=40))
+        volume = fit_published(sphere(), msgspec.structs.replace(PAPER, steps=40))
     assert [updates for updates, _ in seen] == [20, 40]
     np.testing.assert_allclose(seen[-1][1], volume.values, rtol=1e-4, atol=1e-8)
 
@@ -263,7 +264,7 @@ def test_counts_that_are_not_finite_say_nothing():
     scan = sphere()
     counts = scan.counts.clone()
     counts[:, 17:19, 17:19], counts[3, :4, :4] = torch.nan, torch.inf
-    volume, seen = course(dataclasses.replace(scan, counts=counts), dataclasses.replace(PAPER, steps=40))
+    volume, seen = course(dataclasses.replace(scan, counts=counts), msgspec.structs.replace(PAPER, steps=40))
     assert volume.details["clamped_pixels"] == 20 * 4 + 16
     assert volume.status is Status.OK and torch.isfinite(volume.values).all()
     assert all(math.isfinite(step.loss) for step in seen)
@@ -296,7 +297,7 @@ def test_the_response_has_the_whole_loss_s_finite_differences():
 
 @pytest.mark.parametrize("basis", ["paper", "klein-nishina", "constant", "photoelectric"])
 def test_densities_have_the_whole_loss_s_finite_differences(basis):
-    settings = dataclasses.replace(PAPER, basis=basis)
+    settings = msgspec.structs.replace(PAPER, basis=basis)
     scan = sphere()
     scan.counts[:, 10:20, 15:25] = torch.nan  # what does not count pulls at nothing
     objective, parameters, response = problem(scan, settings)
@@ -312,9 +313,9 @@ def test_densities_have_the_whole_loss_s_finite_differences(basis):
 
 
 def test_tv_pulls_at_densities_as_its_finite_difference_says():
-    settings = dataclasses.replace(R2, tv_share=50.0)
+    settings = msgspec.structs.replace(R2, tv_share=50.0)
     objective, parameters, response = problem(sphere(), settings)
-    plain = dataclasses.replace(objective, settings=dataclasses.replace(settings, tv_share=0.0))
+    plain = dataclasses.replace(objective, settings=msgspec.structs.replace(settings, tv_share=0.0))
     step = 0.01
 
     def tv(shift):
@@ -337,44 +338,39 @@ def test_splats_are_seeded_as_published():
     apart = np.linalg.norm(given.positions[:, None] - given.positions, axis=2)
     nearest = np.sort(apart, axis=1)[:, 1:4]
     np.testing.assert_allclose(given.scales[:, 1], np.sqrt((nearest**2).mean(1)), rtol=1e-5)
-    few = seed_splats(objective.p, GEOMETRY, dataclasses.replace(PAPER, n_splats=2), response)
+    few = seed_splats(objective.p, GEOMETRY, msgspec.structs.replace(PAPER, n_splats=2), response)
     assert len(few) == 2 and np.all(few.scales == 1.0)
 
 
 def test_one_density_begins_with_the_same_line_integrals_whatever_its_energy():
     def start(basis):
-        objective, parameters, response = problem(sphere(mu=1e-4, i0=1e9), dataclasses.replace(PAPER, basis=basis))
+        objective, parameters, response = problem(sphere(mu=1e-4, i0=1e9), msgspec.structs.replace(PAPER, basis=basis))
         return objective.line_integrals(objective.paths(objective.activation.splats(parameters), 0), response)[0]
 
     assert not start("constant").any()  # nothing is above 0.005 1/mm
-    objective, parameters, response = problem(sphere(), dataclasses.replace(PAPER, basis="photoelectric"))
+    objective, parameters, response = problem(sphere(), msgspec.structs.replace(PAPER, basis="photoelectric"))
     splats = objective.activation.splats(parameters)
     # ρb times its mean b is what the other basis begins with
-    constant = problem(sphere(), dataclasses.replace(PAPER, basis="constant"))
+    constant = problem(sphere(), msgspec.structs.replace(PAPER, basis="constant"))
     other = constant[0].activation.splats(constant[1]).densities
     np.testing.assert_allclose(splats.densities * (response.eta @ response.b), other, rtol=1e-5)
 
 
 def test_a_short_run_begins_to_densify_as_late_as_a_long_one_and_small_grids_take_fewer():
-    long, short = (dataclasses.replace(PRESETS["paper"], steps=n).densification((256,) * 3) for n in (20_000, 2000))
+    long, short = (Settings(steps=n).densification((256,) * 3) for n in (20_000, 2000))
     assert (long.first, long.last, long.every, long.most) == (500, 15_000, 100, 500_000)
     assert (short.first, short.last, short.every) == (500, 1500, 100) and short.pull == long.pull == 5e-5
-    assert PRESETS["paper"].densification((64, 64, 64)).most == 65_536
-    assert PRESETS["paper"].densification((32, 32, 32)).most == 50_000
+    assert Settings().densification((64, 64, 64)).most == 65_536
+    assert Settings().densification((32, 32, 32)).most == 50_000
 
 
-def test_presets_change_as_told_and_none_leaves_them():
-    assert changed("paper", {}) == PRESETS["paper"] == Settings()
-    r2 = changed("r2", {"steps": None, "response": None, "seed": 3})
-    assert r2 == dataclasses.replace(PRESETS["r2"], seed=3) and (r2.steps, r2.channels, r2.tv_share) == (
-        30000,
-        "a",
-        0.05,
-    )
-    with pytest.raises(InputError, match="preset must be one of paper, r2"):
-        changed("fast", {})
-    with pytest.raises(InputError, match="no 'stepps'"):
-        reconstruct(sphere(), stepps=3)
+def test_the_baseline_is_the_method_with_other_defaults():
+    found = parameters_of(Baseline)
+    assert list(found) == list(parameters_of(Settings))
+    differ = {name for name, p in parameters_of(Settings).items() if found[name].default != p.default}
+    assert differ == {"steps", "schedule_steps", "response", "basis", "tv_share"}
+    assert (Baseline().steps, Baseline().channels, Baseline().tv_share) == (30_000, "a", 0.05)
+    assert {found[name].expected for name in differ} == {parameters_of(Settings)[name].expected for name in differ}
 
 
 @pytest.mark.parametrize(
@@ -384,26 +380,26 @@ def test_presets_change_as_told_and_none_leaves_them():
         ({"seconds": -1.0}, "seconds"),
         ({"held_out": -1}, "held_out"),
         ({"patience": 0}, "patience"),
-        ({"basis": "water"}, "basis must be one of"),
-        ({"response": "tubes"}, "response must be one of"),
-        ({"response": "mono"}, "basis must be 'constant'"),
-        ({"response": "flat", "theta": (1.0, 1.0)}, "no theta"),
+        ({"basis": "water"}, "basis: expected one of"),
+        ({"response": "tubes"}, "response: expected one of"),
+        ({"response": "mono"}, "basis: expected constant"),
+        ({"response": "flat", "theta": (1.0, 1.0)}, "theta: expected null"),
         ({"tube": {"kvp": 60.0}}, "for response 'known'"),
         ({"response": "known", "tube": {"kvpp": 60.0}}, "tube: "),
         ({"readout": "soft"}, "hardened"),
-        ({"readout": 0.0}, "positive energy"),
-        ({"held_out": 20}, "below the 20 views"),
+        ({"readout": 0.0}, "readout: expected a number above 0"),
+        ({"held_out": 20}, "fewer than the 20 views"),
         ({"theta": (2.0, 1.0)}, "theta"),
-        ({"device": "cuda"}, "device"),
+        ({"stepps": 3}, "stepps: unknown parameter; did you mean steps"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(changes, message):
     with pytest.raises(InputError, match=message):
-        reconstruct(sphere(), **changes)
+        paper(sphere(), **changes)
 
 
 def test_poses_are_refused_in_a_sentence():
     poses = tuple(tuple(row) for row in GEOMETRY.pose_array().tolist())
     scan = dataclasses.replace(sphere(), geometry=msgspec.structs.replace(GEOMETRY, poses=poses))
     with pytest.raises(InputError, match="FDK"):
-        reconstruct(scan, steps=1)
+        paper(scan, steps=1)

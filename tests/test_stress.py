@@ -214,7 +214,7 @@ def scan_of(*rods, side=SMALLEST, **scanner):
 
 
 def error(given):
-    return given.error(find("splat").reconstruct(given.scan, "cpu").values.numpy())
+    return given.error(find("splat").reconstruct(given.scan).values.numpy())
 
 
 def everywhere(monkeypatch, name, value):
@@ -284,7 +284,7 @@ def test_the_step_is_that_of_a_majoriser(monkeypatch):
     given, move, diagonals = scan_of("water", side=8).scan, ordered.Fit._move, {}
 
     def misfit():
-        return find("splat", {"passes": (6, 6), "tv": 0.0}).reconstruct(given, "cpu").details["misfit"]
+        return find("splat", {"passes": (6, 6), "tv": 0.0}).reconstruct(given).details["misfit"]
 
     def diagonal(fit):
         """Σ w·a² of every splat, a its line integrals at density 1, in the unit of the fit's gradient."""
@@ -315,7 +315,7 @@ def test_a_fit_begins_on_one_side_of_waters_kink(monkeypatch):
 
     monkeypatch.setattr(course.Course, "_fit", spied)
     for kvp in (60.0, 70.0, 80.0, 90.0, 100.0, 110.0):
-        find("splat", {"passes": (1, 0)}).reconstruct(scan_of("water", side=8, tube=Tube(kvp=kvp)).scan, "cpu")
+        find("splat", {"passes": (1, 0)}).reconstruct(scan_of("water", side=8, tube=Tube(kvp=kvp)).scan)
     assert began == [True] * 6
 
 

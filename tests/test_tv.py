@@ -16,7 +16,7 @@ from ctsim.reconstruct.tv import Denoiser, axis_ratios, descend, total_variation
 def test_fista_keeps_its_promise():
     # Beck and Teboulle, theorem 4.4: F(x_k) − F(x*) ≤ 2 L ‖x*‖² / (k + 1)² from x_0 = 0.
     scan, tv = tiny(), 0.01
-    system, ratios, values, volumes = System(scan, "cpu"), axis_ratios(TINY), [], []
+    system, ratios, values, volumes = System(scan), axis_ratios(TINY), [], []
     best = fista_tv(scan, iterations=400, tv=tv, tv_iterations=60)
     tau, curvature = best.details["tau"], 1 / best.details["step_sizes"][0]
 
@@ -40,7 +40,7 @@ def test_fista_keeps_its_promise():
 def test_fista_by_hand():
     scan, a = tiny(), matrix(TINY)
     volume = fista_tv(scan, iterations=7, tv=0.0, positivity=False)
-    p, step = System(scan, "cpu").data.ravel().astype(float), volume.details["step_sizes"][0]
+    p, step = System(scan).data.ravel().astype(float), volume.details["step_sizes"][0]
     x = ahead = np.zeros(a.shape[1])
     t = 1.0
     for _ in range(7):
