@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import tyro
 
-WIDEST = 24  # characters of a default; longer ones have the next column on a line of its own
+WIDEST = 24  # characters of a default that others are aligned with
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,12 @@ def described(name: str) -> str:
 
     method = find(name)
     known = parameters(name, resolve(method.target))
-    rows = [(key, _default(method.params[key]), known[key]) for key in known]
-    widths = [max((len(row[k]) for row in rows if len(row[k]) <= WIDEST), default=0) for k in (0, 1)]
+    defaults = {key: _default(method.params[key]) for key in known}
+    widths = [max((len(t) for t in texts if len(t) <= WIDEST), default=0) for texts in (known, defaults.values())]
     lines = [f"{name}: {method.inputs}"]
-    for key, default, parameter in rows:
+    for key, parameter in known.items():
         meaning = f"; {parameter.meaning}" if parameter.meaning else ""
-        lines.append(f"  {key:{widths[0]}}  {default:{widths[1]}}  {parameter.expected}{meaning}")
+        lines.append(f"  {key:{widths[0]}}  {defaults[key]:{widths[1]}}  {parameter.expected}{meaning}")
     return "\n".join(lines) + "\n"
 
 

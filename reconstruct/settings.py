@@ -21,12 +21,20 @@ if TYPE_CHECKING:
 S = TypeVar("S", bound=msgspec.Struct)
 
 
-def about(what: str, unit: str = "", *, also: type | None = None, **bounds: float) -> msgspec.Meta:
-    """Annotate a parameter: what it is, its unit, and its bounds (`ge`, `gt`, `le`, `lt`).
+def about(
+    what: str,
+    unit: str = "",
+    *,
+    ge: float | None = None,
+    gt: float | None = None,
+    le: float | None = None,
+    also: type | None = None,
+) -> msgspec.Meta:
+    """Annotate a parameter: what it is, its unit, and its bounds.
 
     `also` is a type that Python callers may pass beside what the annotated type says.
     """
-    return msgspec.Meta(description=what, extra={"unit": unit, "also": also}, **bounds)
+    return msgspec.Meta(description=what, extra={"unit": unit, "also": also}, ge=ge, gt=gt, le=le)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,7 +165,7 @@ def _words(kind: kinds.Type, unit: str = "") -> str:
         texts = [_words(t, unit) for t in kind.types if not isinstance(t, kinds.NoneType)]
         return " or ".join(texts) + (", or null" if null else "")
     if isinstance(kind, kinds.TupleType):
-        return f"a list of {len(kind.item_types)}, each {_words(kind.item_types[0], unit)}"
+        return f"a list of {len(kind.item_types)}, each {_words(next(iter(kind.item_types)), unit)}"
     if isinstance(kind, kinds.VarTupleType | kinds.ListType):
         return f"a list, each {_words(kind.item_type, unit)}"
     if isinstance(kind, kinds.StructType):

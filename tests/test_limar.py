@@ -345,7 +345,7 @@ def test_water_is_measured_in_the_scan(iron):
 
 def test_reinsertion_refuses_what_it_does_not_know():
     metal = Metal(mask=np.ones((2, 2, 2), bool), source="oracle")
-    with pytest.raises(InputError, match="insert: expected one of"):
+    with pytest.raises(InputError, match="insert must be one of"):
         reinsert(torch.zeros(2, 2, 2), np.zeros((2, 2, 2), np.float32), metal, "x")
 
 
