@@ -34,7 +34,8 @@ def about(
 
     `also` is a type that Python callers may pass beside what the annotated type says.
     """
-    return msgspec.Meta(description=what, extra={"unit": unit, "also": also}, ge=ge, gt=gt, le=le)
+    bounds: dict[str, Any] = {"ge": ge, "gt": gt, "le": le}
+    return msgspec.Meta(description=what, extra={"unit": unit, "also": also}, **bounds)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,7 +159,8 @@ def _words(kind: kinds.Type, unit: str = "") -> str:
     if isinstance(kind, kinds.IntType | kinds.FloatType):
         word = "a whole number" if isinstance(kind, kinds.IntType) else "a number"
         return f"{word}{_bounds(kind)}" + (f" ({unit})" if unit else "")
-    if isinstance(kind, kinds.LiteralType):
+        values = cast("tuple[Any, ...]", kind.values)
+        return f"one of {', '.join(map(str, values))}" if len(values) > 1 else repr(values[0])
         return f"one of {', '.join(map(str, kind.values))}" if len(kind.values) > 1 else repr(kind.values[0])
     if isinstance(kind, kinds.UnionType):
         null = any(isinstance(t, kinds.NoneType) for t in kind.types)

@@ -5,6 +5,7 @@ import math
 import subprocess
 import sys
 import typing
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -20,6 +21,9 @@ from ctsim.reconstruct import fdk
 from ctsim.reconstruct.settings import parameters_of
 from ctsim.reconstruct.splat import fast
 from ctsim.store import list_scans, open_scan
+
+
+SCAN = cast("Any", "scan")
 
 
 @pytest.fixture
@@ -147,7 +151,7 @@ def mine(tmp_path, monkeypatch):
 
 def test_a_method_of_ones_own_has_its_annotations_for_types(mine, command):
     found = methods.find(f"{mine}:typed", {"steps": 5, "rate": 2, "size": 7})
-    assert found.reconstruct("scan") == ("scan", 5, "a", 2.0, 7, {}) and found.overrides == {
+    assert found.reconstruct(SCAN) == ("scan", 5, "a", 2.0, 7, {}) and found.overrides == {
         "steps": 5,
         "rate": 2.0,
         "size": 7,
@@ -165,8 +169,8 @@ def test_a_method_of_ones_own_has_its_annotations_for_types(mine, command):
 
 
 def test_without_annotations_values_are_passed_on_and_a_device_is_the_cpu(mine):
-    assert methods.find(f"{mine}:loose", {"steps": "many"}).reconstruct("scan") == ("scan", "cpu", "many")
-    assert methods.find(f"{mine}:strange", {"net": "x.pt"}).reconstruct("scan") == ("scan", "x.pt", 3)
+    assert methods.find(f"{mine}:loose", {"steps": "many"}).reconstruct(SCAN) == ("scan", "cpu", "many")
+    assert methods.find(f"{mine}:strange", {"net": "x.pt"}).reconstruct(SCAN) == ("scan", "x.pt", 3)
     assert methods.within(methods.find(f"{mine}:typed"), 9.0) == methods.find(f"{mine}:typed")
 
 

@@ -89,7 +89,7 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     simulator: Choices
 
     def __post_init__(self) -> None:
-        curves = [m.name for m in self.method] + [run.curve for m in self.method for run in m.run]
+        curves = [m.name for m in self.method if m.default] + [run.curve for m in self.method for run in m.run]
         if twice := [curve for curve in curves if curves.count(curve) > 1]:
             raise InputError(f"method: two curves are called {twice[0]!r}; expected names that differ")
 
