@@ -22,7 +22,6 @@ from ctsim.reconstruct.settings import parameters_of
 from ctsim.reconstruct.splat import fast
 from ctsim.store import list_scans, open_scan
 
-
 SCAN = cast("Any", "scan")
 
 
