@@ -229,9 +229,9 @@ def test_a_named_metal_is_a_material_of_its_own(starving):
 @pytest.mark.parametrize(
     ("name", "setting", "words"),
     [
-        ("bhc-poly", {"mask": "somewhere.tif"}, "no file somewhere.tif"),
-        ("bhc-poly", {"insert": "gold"}, "insert must be one of"),
-        ("bhc-poly", {"prior": "x"}, "prior must be one of"),
+        ("bhc-poly", {"mask": "somewhere.tif"}, "no file 'somewhere.tif'"),
+        ("bhc-poly", {"insert": "gold"}, "insert: expected one of"),
+        ("bhc-poly", {"prior": "x"}, "prior: expected one of"),
         ("ibhc", {"iterations": 0}, "iterations: expected a whole number within 1 to 50, got 0"),
         ("ibhc", {"bone": "bonne"}, "bone: "),
         ("ibhc", {"bone": ""}, "bone: "),
