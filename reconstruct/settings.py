@@ -160,7 +160,7 @@ def _words(kind: kinds.Type, unit: str = "") -> str:
         word = "a whole number" if isinstance(kind, kinds.IntType) else "a number"
         return f"{word}{_bounds(kind)}" + (f" ({unit})" if unit else "")
     if isinstance(kind, kinds.LiteralType):
-        values = cast("tuple[Any, ...]", kind.values)
+        values = list(cast("tuple[Any, ...]", kind.values))
         return f"one of {', '.join(map(str, values))}" if len(values) > 1 else repr(values[0])
     if isinstance(kind, kinds.UnionType):
         null = any(isinstance(t, kinds.NoneType) for t in kind.types)
