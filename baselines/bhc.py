@@ -15,8 +15,8 @@ from ctsim.baselines.inpaint import Filled
 from ctsim.baselines.limar import finished, mended, uncorrected
 from ctsim.baselines.metal import Insert, Mask, Trace, check_mask, find_metal, reinsert
 from ctsim.baselines.morphology import dilate
-from ctsim.geometry import few_views
 from ctsim.baselines.prior import NO_BODY, RING, Prior, choose_prior
+from ctsim.geometry import few_views
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reconstruct.projector import forward_columns
