@@ -10,4 +10,5 @@ Array = NDArray[np.floating]
 def excess(lengths: Array, mu: Array, weights: Array, mono: Array) -> NDArray[np.float64]:
     """Return mono − poly [ray] of `lengths` [material, ray] (mm); `mu` is [material, energy] in 1/mm."""
     depth = mu.T.astype(np.float64) @ lengths.astype(np.float64)
-    return mono @ lengths.astype(np.float64) + logsumexp(-depth, axis=0, b=weights[:, None])
+    poly = np.asarray(logsumexp(-depth, axis=0, b=weights[:, None]))
+    return mono @ lengths.astype(np.float64) + poly
