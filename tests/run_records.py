@@ -11,7 +11,7 @@ from ctsim.benchmarks.engine.study import record_of
 from ctsim.benchmarks.methods import Method
 from ctsim.benchmarks.scores.protocol import VERSION
 from ctsim.benchmarks.studies.methods import plan
-from ctsim.benchmarks.studies.methods.records import Result, Run, RunRecord, task_of
+from ctsim.benchmarks.studies.methods.records import Result, Run, RunRecord, case_of, task_of
 from ctsim.benchmarks.studies.methods.run import Runner
 from ctsim.benchmarks.studies.methods.study import Flags, Methods
 
@@ -42,6 +42,7 @@ def changed(record: RunRecord, **fields: Any) -> RunRecord:
     of_task = {{"label": "subject"}.get(k, k): fields.pop(k) for k in ("label", "place") if k in fields}
     if "scene" in fields:
         of_task["settings"] = replace(record.run, scene=fields.pop("scene"))
+        of_task["case"] = case_of(of_task["settings"])
     found = replace(record.found[0], **fields)
     return replace(record, task=replace(record.task, **of_task), found=(found,))
 

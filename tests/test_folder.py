@@ -342,7 +342,7 @@ class KilledOnce:
 
 
 def test_a_worker_killed_when_its_scene_is_in_place_leaves_nothing_to_do(whole, suite, tmp_path, monkeypatch):
-    monkeypatch.setattr(command, "open_pool", lambda *_: KilledOnce())
+    monkeypatch.setattr(command, "open_jobs", lambda *_: KilledOnce())
     assert main([suite, str(tmp_path / "data"), "--workers", "2"]) == 0
     assert verify(tmp_path / "data") == [] and names(tmp_path / "data") == names(whole)
     assert (tmp_path / "data" / INDEX).read_bytes() == (whole / INDEX).read_bytes()

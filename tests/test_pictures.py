@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from run_records import changed
 from test_paper_tables import record
 from test_pareto_points import task, timed
 from test_run import GEOMETRY, Double, double, once
@@ -53,7 +54,7 @@ def test_a_picture_is_drawn_again_only_where_it_would_show_something_else(tmp_pa
     write_volume(tmp_path / second.volume, np.ones(GEOMETRY.n_voxel, np.float32), second.identity)  # by --force
     assert saved(tmp_path, first, second) == ["box.png"] and saved(tmp_path, first, second) == []
     scores = {"tissue": msgspec.structs.replace(first.scores["tissue"], values={"psnr3d": 1.0, "ssim3d": 0.5})}
-    assert saved(tmp_path, msgspec.structs.replace(first, scores=scores)) == ["box.png"]
+    assert saved(tmp_path, changed(first, scores=scores)) == ["box.png"]
     for damage in (b"", picture.read_bytes()[:20], b"no picture"):
         picture.write_bytes(damage)
         assert saved(tmp_path, first) == ["box.png"]
@@ -87,8 +88,7 @@ def test_records_are_sorted_out_once_whatever_the_number_of_scans(tmp_path, monk
 
 def scored(label, scene, psnr):
     found = record(psnr=psnr)
-    run = msgspec.structs.replace(found.run, scene=scene)
-    return msgspec.structs.replace(found, run=run, label=label, scores={"tissue": found.scores["paper"]})
+    return changed(found, scene=scene, label=label, scores={"tissue": found.scores["paper"]})
 
 
 @pytest.mark.parametrize("text", TEXTS)
