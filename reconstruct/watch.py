@@ -114,5 +114,7 @@ class Stopwatch:
             due = bool(self._at) and seconds >= self._at[0]
             self._at = [t for t in self._at if t > seconds]
         if due:
+            import torch  # loaded by every method already
+
             self._watcher.on_update(view_updates, seconds, torch.from_numpy(volume()))
             self._paused += self.seconds - seconds
