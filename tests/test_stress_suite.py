@@ -199,7 +199,7 @@ def test_a_scene_that_says_something_else_is_run_again(tmp_path):
 
 
 def test_the_example_in_the_docs_is_read_and_runs(tmp_path):
-    page = (Path(__file__).parents[1] / "docs" / "stability.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[1] / "docs" / "how-to" / "test-stability.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"^    \[\[scene\]\]\n(?:    .*\n|\n)*", page, re.M)
     for scene in read(tmp_path, re.sub(r"^    ", "", text, flags=re.M)):
         found = Findings()
@@ -208,7 +208,7 @@ def test_the_example_in_the_docs_is_read_and_runs(tmp_path):
 
 
 def test_the_page_names_every_key():
-    page = (Path(__file__).parents[1] / "docs" / "stability.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[1] / "docs" / "how-to" / "test-stability.md").read_text(encoding="utf-8")
     for kind in (Scene, Circle):
         for key in msgspec.structs.fields(kind):
             assert f"`{key.name}`" in page, key.name

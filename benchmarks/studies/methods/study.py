@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import tyro
 
 from ctsim.benchmarks import methods
@@ -96,6 +97,10 @@ class Methods(study.Study[RunRecord, Flags]):
     def measure(self, task: RunTask, given: Flags) -> Sequence[Result]:
         """Run a task in this process, on the scan that was opened for it or, on a worker, on one opened here."""
         return pkgutil.resolve_name(self.work)(task, given, self._jobs.get(task.identity))
+
+    def recorded(self, task: RunTask) -> RunTask:
+        """Leave out where this machine has the scan."""
+        return msgspec.structs.replace(task, hints={})
 
     def took(self, record: RunRecord, given: Flags) -> float | None:
         """Return the seconds of a run."""
