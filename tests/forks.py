@@ -130,7 +130,7 @@ def patient(scan: Any, *, device: str) -> Any:
     with contextlib.suppress(FileExistsError):
         Path(os.environ[RUN] + ".waits").touch(exist_ok=False)
         time.sleep(HANGS)
-    return reconstruct(scan, device=device)
+    return reconstruct(scan)
 
 
 def running(output: Path) -> list[int]:

@@ -53,7 +53,7 @@ def fatal_once(scan, *, device):
     from ctsim.reconstruct.fdk import reconstruct
 
     _die_once(Path(os.environ["CTSIM_TEST_MARK"]))
-    return reconstruct(scan, device=device)
+    return reconstruct(scan)
 
 
 def hang(scan, *, device):
