@@ -331,7 +331,7 @@ def test_workers_that_cannot_be_had_are_one_sentence(serial, tmp_path, monkeypat
     suite.write_text(SUITE, encoding="utf-8")
     for module, arguments in (
         ("make_dataset", [suite, tmp_path / "data", "--only", "bare"]),
-        ("cli_run", [serial / "data", tmp_path / "results"]),
+        ("studies.methods.study", [serial / "data", tmp_path / "results"]),
     ):
         assert cli.guarded("command", f"ctsim.benchmarks.{module}", [*map(str, arguments), *flags]) == 2
         error = capsys.readouterr().err
