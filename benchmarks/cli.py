@@ -1,6 +1,7 @@
 """The commands `make-dataset` and `run-benchmark`: dispatch, and what the user's errors look like.
 
-Everything heavy is imported after the command line is understood, so that --help answers at once.
+A command is a module with `main(arguments)`. Where that module takes long to import, its package declares the flags
+(`Flags` in its `__init__`), so that --help answers at once.
 """
 
 import contextlib
@@ -11,6 +12,11 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
+
+import msgspec
+import tyro
+
+from ctsim.errors import InputError
 
 OTHERS = {
     "methods": "ctsim.benchmarks.list_methods",
@@ -46,13 +52,12 @@ def guarded(name: str, module: str, arguments: list[str], *, resumes: bool = Tru
     Ctrl-C ends with 130, and so does SIGTERM, by which schedulers stop a job; what was recorded until then
     stays, and the same command goes on from it where it `resumes`. Other exceptions are ours and keep their traceback.
     """
-    import msgspec
-
-    from ctsim.errors import InputError
-
     _write_anything()
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
+        package, _, _ = module.rpartition(".")
+        if flags := getattr(importlib.import_module(package), "Flags", None) if package else None:
+            tyro.cli(flags, prog=name, args=arguments)  # --help and unknown flags end here, before the heavy imports
         main: Callable[[list[str]], int] = importlib.import_module(module).main
         return main(arguments)
     except BrokenPipeError:  # the reader of a pipe, such as head, went away
