@@ -16,6 +16,7 @@ from pathlib import Path
 import msgspec
 import tyro
 
+from ctsim.benchmarks.engine.terminal import complain
 from ctsim.errors import InputError
 
 OTHERS = {
@@ -98,5 +99,5 @@ def _write_anything() -> None:
 
 
 def _complain(name: str, sentence: str) -> int:
-    print(f"{name}: {sentence}", file=sys.stderr)
+    complain(name, sentence)
     return EXIT_USER

@@ -73,10 +73,7 @@ class Forks:
 
 def serve() -> None:
     """Import, then answer requests from stdin until it closes."""
-    import tqdm
-
-    tqdm.tqdm.monitor_interval = 0  # a fork would lose its thread
-    import ctsim.benchmarks.make_dataset
+    import ctsim.benchmarks.make_dataset.work
     import ctsim.benchmarks.studies.methods.panels
     import ctsim.benchmarks.studies.methods.run
     import ctsim.benchmarks.studies.methods.study
@@ -87,7 +84,7 @@ def serve() -> None:
     assert all(
         (
             ctsim.benchmarks.studies.methods.study,
-            ctsim.benchmarks.make_dataset,
+            ctsim.benchmarks.make_dataset.work,
             ctsim.benchmarks.studies.methods.panels,
             ctsim.benchmarks.studies.methods.run,
             ctsim.phantoms.scene,
@@ -209,10 +206,10 @@ def be(
     os.environ[RUN] = command[2]
     try:
         if disk:
-            from ctsim.benchmarks import make_dataset
+            from ctsim.benchmarks.make_dataset import work
 
             if holds is None:
-                make_dataset._SPARE = -(2**40)  # else a disk that is too small would be refused before the first byte
+                work._SPARE = -(2**40)  # else a disk that is too small would be refused before the first byte
             disk = disk if small_disk(*disk) else None
             if holds is not None and disk is not None:
                 fill(Path(disk[0]), holds)

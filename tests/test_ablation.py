@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from conftest import SMALLEST
 
-from ctsim.benchmarks import cli, make_dataset, methods
+from ctsim.benchmarks import cli, methods
 from ctsim.benchmarks.engine import study as engine
 from ctsim.benchmarks.studies import ablation
 from ctsim.benchmarks.studies.methods import records
@@ -41,7 +41,10 @@ def command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
     for name in ("splat-paper", "splat-r2"):
         monkeypatch.setitem(methods.TABLE, name, ("stub_splat:reconstruct", methods.COUNTS_ONLY))
-    monkeypatch.setattr(make_dataset, "load", lambda suite: load_suite("tiny.toml" if suite == "ablation" else suite))
+    monkeypatch.setattr(
+        "ctsim.benchmarks.make_dataset.work.load",
+        lambda suite: load_suite("tiny.toml" if suite == "ablation" else suite),
+    )
     yield lambda *more: run(monkeypatch, capsys, more)
     sys.modules.pop("stub_splat", None)
 

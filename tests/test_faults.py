@@ -196,7 +196,11 @@ def test_make_dataset_survives_kills_of_a_clusters_workers(bench, tmp_path):
             time.sleep(0.1)  # else all are killed for one count
 
     with LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL", preload=[str(preload)]
+        n_workers=2,
+        threads_per_worker=1,
+        dashboard_address="127.0.0.1:0",
+        silence_logs="CRITICAL",
+        preload=[str(preload)],
     ) as cluster:
         killer = threading.Thread(target=kill)
         killer.start()

@@ -10,9 +10,9 @@ import pytest
 from small_scan import STACKS, content, one_view, write
 from test_writer import interrupt
 
-import ctsim.benchmarks.make_dataset as command
 from ctsim import folder, locks, manifest, sources
 from ctsim.benchmarks.make_dataset import main
+from ctsim.benchmarks.make_dataset import work as command
 from ctsim.benchmarks.suites import load
 from ctsim.errors import InputError
 from ctsim.folder import is_complete, remarks, unfinished
@@ -203,9 +203,9 @@ def test_a_worker_does_not_wait_for_ever_for_a_lock_of_which_nothing_is_known(su
     job = command.Job(
         scene=scene, plan=dataset.plan_scene(scene), out=tmp_path, force=False, code=sources.source_hash()
     )  # fmt: skip
-    monkeypatch.setattr("ctsim.phantoms.dataset.make_scene", busy)
+    monkeypatch.setattr(command, "make_scene", busy)
     monkeypatch.setattr(command.time, "sleep", lambda _: None)
-    monkeypatch.setattr(locks, "PATIENCE", 2 * command.TICK)
+    monkeypatch.setattr(command, "PATIENCE", 2 * command.TICK)
     with pytest.raises(locks.Busy):
         command.do(job)
     assert len(tried) == 3

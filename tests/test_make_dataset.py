@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import tifffile
 
-import ctsim.benchmarks.make_dataset as command
 from ctsim.benchmarks.make_dataset import main
+from ctsim.benchmarks.make_dataset import work as command
 from ctsim.benchmarks.suites import STUDY_SUITES, bundled, load, select
 from ctsim.errors import InputError
 from ctsim.human import human_bytes, human_time

@@ -296,17 +296,18 @@ TUBE = st.one_of(
     table({"kvp": st.floats(10, 500), "model": st.just("finkelshtein-pavlova")}, filters=SHEETS, **HEEL),
     table({"kvp": st.floats(2, 500), "model": st.just("mono")}, **HEEL),
 )
-NOISE = table(
-    {},
-    model=st.sampled_from(["compound", "tigre", "none"]),
-    electronic=st.sampled_from([0.0, 5.0, 1e6]),
-    adc_bits=st.just("null") | st.integers(4, 16),
-    adc_fill=st.floats(0.5, 1),
-    pedestal=st.floats(0, 0.4),
-    fixed_pattern=st.floats(0, 0.3),
-    pattern_residual=st.floats(0, 1),
-    dead_fraction=st.floats(0, 0.9),
-    n_flats=st.integers(0, 3),
+COUNTS = {
+    "electronic": st.sampled_from([0.0, 5.0, 1e6]),
+    "adc_bits": st.just("null") | st.integers(4, 16),
+    "adc_fill": st.floats(0.5, 1),
+    "pedestal": st.floats(0, 0.4),
+    "pattern_residual": st.floats(0, 1),
+    "n_flats": st.integers(0, 3),
+}
+PATTERN = {"fixed_pattern": st.floats(0, 0.3), "dead_fraction": st.floats(0, 0.9)}
+NOISE = st.one_of(
+    table({}, model=st.sampled_from(["compound", "none"]), **COUNTS, **PATTERN),
+    table({"model": st.just("tigre")}, **COUNTS),  # has no pattern
 )
 SCANNER = table(
     {"n_detector": st.tuples(*[st.integers(4, 12)] * 2), "n_views": st.integers(1, 3), "tube": TUBE, "noise": NOISE},

@@ -162,7 +162,9 @@ def cluster():
     # a job may be moved from a worker that is killed to the other before that is, too; twice that on a busy machine
     dask.config.set({"distributed.scheduler.allowed-failures": 4})
     with (
-        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL") as found,
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs="CRITICAL"
+        ) as found,
         Client(found, set_as_default=False) as client,
     ):
         yield found.scheduler_address, client

@@ -20,6 +20,7 @@ from ctsim.benchmarks.engine.dask import check_workers, open_jobs
 from ctsim.benchmarks.engine.process import Jobs, Lost, Process, Stopped, check_limit
 from ctsim.benchmarks.engine.record import OK, Found, Record, Store, Task, by_row, done, latest, provenance
 from ctsim.benchmarks.engine.table import Table
+from ctsim.benchmarks.engine.terminal import Bar
 from ctsim.durable import write_synced
 from ctsim.errors import InputError
 from ctsim.human import human_time
@@ -149,6 +150,10 @@ class Study(Generic[R, G]):
         """Return the line of --dry-run that a task counts in: a name and more."""
         return task.case, task.subject
 
+    def title(self, task: Any) -> str:
+        """Return what people call a task."""
+        return f"{task.case} {task.subject}".rstrip()
+
     def limit(self, task: Any, given: G) -> float | None:
         """Return the time limit of a task in seconds."""
         return given.seconds
@@ -261,26 +266,19 @@ def measure_all(study: Study[R, G], tasks: Sequence[Task], records: Sequence[R],
     Each record is on the disk before the next task begins. The tables follow as tasks end, and once more at the end,
     also after Ctrl-C. Raises OSError where results cannot be written.
     """
-    from tqdm import tqdm
-
     left, store, n_all = study.pending(tasks, records, given), study.store(given), _all(study, tasks, given)
     if len(left) < n_all:
         sys.stderr.write(f"{n_all - len(left)} of {n_all} {study.unit}s are recorded already (--force)\n")
-    failed, written, took, last = [], 0.0, 0.0, ""
+    failed, written, took = [], 0.0, 0.0
     with open_jobs(given.workers, given.scheduler) as jobs:
         store.folder.mkdir(parents=True, exist_ok=True)  # before anything is measured that could not be recorded
-        with (
-            tqdm(total=len(left), unit=study.unit, disable=not left, file=sys.stderr) as bar,
-            study.watched(lambda text: bar.set_postfix_str(f"{last}, {text}" if last else text)),
-        ):
+        with Bar(len(left), study.unit) as bar, study.watched(bar.note):
             try:
                 for record in _records(study, study.groups(left, records), given, jobs):
                     store.append([record])
                     if not all(one.ok for one in record.found):
                         failed.append(record)
-                    last = f"{record.task.case} {record.task.subject}: {_status(record)}"
-                    bar.set_postfix_str(last)
-                    bar.update()
+                    bar.advance(text=f"{study.title(record.task)}: {_status(record)}")
                     if study.follows and time.monotonic() > written + took / SHARE:
                         began = time.monotonic()
                         _follow(study, store, given)

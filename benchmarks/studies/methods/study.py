@@ -15,8 +15,8 @@ from ctsim.benchmarks import methods
 from ctsim.benchmarks.engine import study
 from ctsim.benchmarks.engine.record import Task
 from ctsim.benchmarks.scores.protocol import Stored
-from ctsim.benchmarks.studies.methods import plan, tables
-from ctsim.benchmarks.studies.methods.records import FILE, Result, RunRecord, RunTask
+from ctsim.benchmarks.studies.methods import overview, plan, tables
+from ctsim.benchmarks.studies.methods.records import FILE, METAL, Result, RunRecord, RunTask
 from ctsim.errors import InputError
 from ctsim.folder import mixture, other_code
 from ctsim.human import human_choice
@@ -26,6 +26,7 @@ from ctsim.sources import source_hash
 from ctsim.store import list_scans, open_scan
 
 log = logging.getLogger(__name__)
+DEFAULT = ("fdk", "limar", "nmar", "splat")
 FEW = 20  # scenes, all of which a message names
 
 
@@ -43,7 +44,8 @@ class Flags(study.Options):
     results: tyro.conf.Positional[Path]
     """Folder for records, tables, volumes and pictures; created if missing."""
     method: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
-    """A method's name, such as fdk, or module:function of your own; may be given several times (default: fdk)."""
+    """A method's name, such as fdk, or module:function of your own; may be given several times (default: fdk, limar, nmar
+    and splat)."""
     set: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="METHOD.PARAMETER=VALUE")] = ()
     """A method's parameter, one of those that `run-benchmark methods` lists; may be given several times."""
     scene: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
@@ -111,6 +113,10 @@ class Methods(study.Study[RunRecord, Flags]):
         known = self._costs.method(task.subject)
         return _estimated(task) if known is None else known
 
+    def title(self, task: RunTask) -> str:
+        """Return the method and the scan."""
+        return f"{task.subject} on {task.case}" + ("" if task.part == METAL else ", without metal")
+
     @contextlib.contextmanager
     def watched(self, say: Callable[[str], None]) -> Iterator[None]:
         """Tell how far the fit is that runs in this process, where a method tells."""
@@ -122,10 +128,9 @@ class Methods(study.Study[RunRecord, Flags]):
             yield
 
     def write(self, records: Sequence[RunRecord], given: Flags) -> str:
-        """Write table.md, .csv and .tex."""
+        """Write table.md, .csv and .tex; return a table that fits a terminal."""
         tables.write(records, given.results)
-        text = (given.results / "table.md").read_text(encoding="utf-8")
-        return f"{text}\nWritten: {given.results}/table.md, .csv, .tex; records in {FILE}.jsonl\n"
+        return overview.text(records, given.results, given.data)
 
     def draw(self, records: Sequence[RunRecord], given: Flags) -> None:
         """Draw a picture of every scene."""
@@ -151,7 +156,7 @@ def _estimated(task: RunTask) -> float | None:
 
 
 def _methods(given: Flags) -> list[methods.Method]:
-    names = tuple(dict.fromkeys(given.method)) or ("fdk",)
+    names = tuple(dict.fromkeys(given.method)) or DEFAULT
     return methods.chosen(names, given.set, given.seconds)
 
 

@@ -1,4 +1,4 @@
-"""make-dataset: from scene recipes to scans on disk, resumable at any moment."""
+"""What `make-dataset` does: check, plan or make the scenes of a suite, here or on workers."""
 
 import dataclasses
 import functools
@@ -6,58 +6,31 @@ import shutil
 import sys
 import time
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import tyro
+from typing import TypeVar
 
 from ctsim.benchmarks.engine.dask import open_jobs
 from ctsim.benchmarks.engine.process import TICK, Jobs, Lost
+from ctsim.benchmarks.engine.terminal import Bar
+from ctsim.benchmarks.make_dataset import Options
 from ctsim.benchmarks.suites import load, select
 from ctsim.errors import InputError
+from ctsim.folder import finished, is_complete, listing, other_code, partial_of, recover, remarks, tidy, unfinished
 from ctsim.human import human_bytes, human_time
+from ctsim.locks import PATIENCE, Busy
+from ctsim.manifest import Manifest, mend_index, read_index, verify
+from ctsim.phantoms.dataset import make_scene, plan_scene
+from ctsim.phantoms.scene import Scene, scene_id
+from ctsim.plan import Plan
+from ctsim.sources import source_hash
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from ctsim.manifest import Manifest
-    from ctsim.phantoms.scene import Scene
-    from ctsim.plan import Plan
-
+T = TypeVar("T")
 _SPARE = 64 * 2**20  # bytes left free for the file system's own needs
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Options:
-    """Simulate the scans of a suite, with their ground truth, into a data folder.
-
-    An interrupted run continues when it is started again; finished scenes are skipped. A message names finished scenes
-    that other code of the simulator made. An unfinished scene of other code starts again.
-    """
-
-    suite: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SUITE")]
-    """Name of a bundled suite (quick, core, paper …) or path of a TOML file; with --verify alone, the data folder."""
-    out: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")] = None
-    """Data folder."""
-    dry_run: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print what would be done, what is skipped and why, error, time and disk; write nothing."""
-    verify: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Only check the data folder against its checksums."""
-    force: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Make scenes again that are there, also where another scene has their name."""
-    only: tuple[str, ...] = ()
-    """Only these scenes of the suite."""
-    seeds: tuple[int, ...] = ()
-    """Make every scene once for each of these seeds, as NAME-sSEED."""
-    workers: int = 1
-    """Number of scenes made at once, each with its share of the cores."""
-    scheduler: Annotated[str | None, tyro.conf.arg(metavar="tcp://HOST:PORT")] = None
-    """Make the scenes on the workers of this Dask scheduler; OUT must be the same folder for them."""
-
-
-def main(argv: list[str]) -> int:
-    """Run the command; return 0, 2 for an error of the user's or damaged data, 130 when interrupted."""
-    options = tyro.cli(Options, prog="make-dataset", args=argv)
+def run(options: Options) -> int:
+    """Verify, plan or make what the flags ask for; return the exit code."""
     try:
         if options.verify:
             return _verify(options.out or Path(options.suite))
@@ -74,8 +47,6 @@ def main(argv: list[str]) -> int:
 
 
 def _verify(data_dir: Path) -> int:
-    from ctsim.folder import remarks
-    from ctsim.manifest import read_index, verify
 
     problems = verify(data_dir)
     for text in [*problems, *remarks(data_dir)]:
@@ -85,8 +56,7 @@ def _verify(data_dir: Path) -> int:
     return 2 if problems else 0
 
 
-def _dry_run(scenes: "tuple[Scene, ...]", options: Options) -> int:
-    from ctsim.phantoms.dataset import plan_scene
+def _dry_run(scenes: tuple[Scene, ...], options: Options) -> int:
 
     there = {} if options.out is None else _finished(scenes, options.out, options.force)
     seconds, size = 0.0, 0
@@ -103,26 +73,19 @@ def _dry_run(scenes: "tuple[Scene, ...]", options: Options) -> int:
     return 0
 
 
-def _finished(scenes: "tuple[Scene, ...]", out: Path, force: bool) -> "dict[str, Manifest]":
+def _finished(scenes: tuple[Scene, ...], out: Path, force: bool) -> dict[str, Manifest]:
     """Return the manifests of the scenes that are there and stay, by name; reads only."""
-    from ctsim.folder import finished
-    from ctsim.phantoms.scene import scene_id
-
     found = {} if force else {s.name: finished(out, s.name, scene_id(s)) for s in scenes}
     return {name: manifest for name, manifest in found.items() if manifest is not None}
 
 
-def _complete(manifest: "Manifest") -> str:
-    from ctsim.sources import source_hash
+def _complete(manifest: Manifest) -> str:
 
     return f"{manifest.name}: already complete" + (", by other code" if manifest.code != source_hash() else "")
 
 
-def _of_other_code(scenes: "tuple[Scene, ...]", there: "dict[str, Manifest]", out: Path | None) -> list[str]:
+def _of_other_code(scenes: tuple[Scene, ...], there: dict[str, Manifest], out: Path | None) -> list[str]:
     """Say what other code of the simulator made: finished scenes, which stay, and unfinished ones, which do not."""
-    from ctsim.folder import listing, other_code, unfinished
-    from ctsim.sources import source_hash
-
     code = source_hash()
     said = [other_code([m for m in there.values() if m.code != code], len(there))]
     left = unfinished(out) if out else {}
@@ -136,17 +99,14 @@ def _of_other_code(scenes: "tuple[Scene, ...]", there: "dict[str, Manifest]", ou
 class Job:
     """A scene to make, as it travels to a worker."""
 
-    scene: "Scene"
-    plan: "Plan"
+    scene: Scene
+    plan: Plan
     out: Path
     force: bool
     code: str
 
 
-def _make(scenes: "tuple[Scene, ...]", out: Path, options: Options) -> int:
-    from ctsim.folder import recover, tidy
-    from ctsim.manifest import mend_index
-    from ctsim.sources import source_hash
+def _make(scenes: tuple[Scene, ...], out: Path, options: Options) -> int:
 
     source_hash()  # of the code that is loaded, whatever becomes of its files meanwhile
     recover(out)
@@ -164,11 +124,8 @@ def _make(scenes: "tuple[Scene, ...]", out: Path, options: Options) -> int:
     return 0
 
 
-def _make_all(scenes: "list[Scene]", out: Path, options: Options) -> None:
+def _make_all(scenes: list[Scene], out: Path, options: Options) -> None:
     """Plan the scenes, then make them here or on workers."""
-    from ctsim.phantoms.dataset import plan_scene
-    from ctsim.sources import source_hash
-
     with open_jobs(options.workers, options.scheduler) as pool:
         plans = {scene.name: plan_scene(scene) for scene in scenes}  # all phantoms could be more than memory holds
         for name, plan in plans.items():
@@ -183,27 +140,26 @@ def _make_all(scenes: "list[Scene]", out: Path, options: Options) -> None:
         _make_apart(jobs, pool)
 
 
-def _make_here(scenes: "list[Scene]", plans: "dict[str, Plan]", out: Path, force: bool) -> None:
+def _make_here(scenes: list[Scene], plans: dict[str, Plan], out: Path, force: bool) -> None:
     """Make scenes one after another in this process; one that another process has finished meanwhile is there."""
-    from ctsim.folder import is_complete
-    from ctsim.phantoms.dataset import make_scene
-    from ctsim.phantoms.scene import scene_id
+    views = {scene.name: scene.resolve().geometry.n_views for scene in scenes}
+    with Bar(sum(views.values()), "view") as bar:
+        for number, scene in enumerate(scenes, 1):
+            title, before = f"{number}/{len(scenes)} {scene.name}", bar.done
+            if not force and is_complete(out, scene.name, scene_id(scene)):
+                say(f"{scene.name}: already complete")
+            else:
+                watch = functools.partial(_watch, bar, scene.name, title)
+                make_scene(scene, out, plan=plans[scene.name], force=force, watch=watch)
+            bar.at(before + views[scene.name], title)
 
-    for number, scene in enumerate(scenes, 1):
-        if not force and is_complete(out, scene.name, scene_id(scene)):
-            say(f"{scene.name}: already complete")
-            continue
-        watch = functools.partial(_watch, scene.name, f"{number}/{len(scenes)} {scene.name}")
-        make_scene(scene, out, plan=plans[scene.name], force=force, watch=watch)
 
-
-def _watch(name: str, title: str, views: "Iterable[Any]", first: int, n_views: int) -> "Iterable[Any]":
-    """Show a scene's views on a progress bar, which is hidden where nobody watches."""
-    from tqdm import tqdm
-
+def _watch(bar: Bar, name: str, title: str, views: Iterable[T], first: int, n_views: int) -> Iterable[T]:
+    """Show a scene's views on the bar."""
     if first:
         say(f"{name}: goes on from view {first} of {n_views}")
-    return tqdm(views, title, n_views, initial=first, unit="view", disable=None, file=sys.stderr)
+        bar.at(bar.done + first)
+    return bar.over(views, title)
 
 
 def say(text: str) -> None:
@@ -213,24 +169,20 @@ def say(text: str) -> None:
 
 def _make_apart(jobs: list[Job], pool: Jobs) -> None:
     """Make scenes on workers behind one progress bar, which follows the views that the workers noted as safe."""
-    from tqdm import tqdm
-
-    from ctsim.folder import unfinished
-
     views = [job.scene.resolve().geometry.n_views for job in jobs]
     left = set(range(len(jobs)))
-    with tqdm(total=sum(views), unit="view", disable=None, file=sys.stderr) as bar:
+    with Bar(sum(views), "view") as bar:
         for answer in pool.answers(do, jobs):
+            ended = ""
             if answer is not None:
                 number, end = answer
                 name = jobs[number].scene.name
                 if isinstance(end, Lost):
                     raise InputError(f"{name}: {end.reason}, as happens when memory is short; expected fewer workers")
                 left.discard(number)
-                bar.set_description(f"{len(jobs) - len(left)}/{len(jobs)} {name}")
+                ended = f"{len(jobs) - len(left)}/{len(jobs)} {name}"
             noted = {name: progress.views for name, progress in unfinished(jobs[0].out).items()}
-            bar.n = sum(noted.get(jobs[k].scene.name, 0) if k in left else n for k, n in enumerate(views))
-            bar.refresh()
+            bar.at(sum(noted.get(jobs[k].scene.name, 0) if k in left else n for k, n in enumerate(views)), ended)
 
 
 def do(job: Job) -> None:
@@ -239,12 +191,6 @@ def do(job: Job) -> None:
     Raises InputError where this process has other code than the command, whose plan it is, and where the scene's lock
     stays that a process of another machine has, which may have been killed.
     """
-    from ctsim.folder import is_complete
-    from ctsim.locks import PATIENCE, Busy
-    from ctsim.phantoms.dataset import make_scene
-    from ctsim.phantoms.scene import scene_id
-    from ctsim.sources import source_hash
-
     name, waited = job.scene.name, 0.0
     if source_hash() != job.code:
         raise InputError(f"{name}: a worker runs other code of the simulator than make-dataset; start the workers anew")
@@ -259,10 +205,8 @@ def do(job: Job) -> None:
         waited += TICK
 
 
-def _check_space(out: Path, plans: "dict[str, Plan]") -> None:
+def _check_space(out: Path, plans: dict[str, Plan]) -> None:
     """Refuse scenes that have no room, counting what unfinished ones have taken already."""
-    from ctsim.folder import partial_of
-
     need = sum(plan.disk_bytes for plan in plans.values())
     folder = out.absolute()
     while not folder.exists():
