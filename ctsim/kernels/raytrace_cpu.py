@@ -6,14 +6,18 @@ measured by several rays and averaged in *intensity*, as a detector does, and by
 differs between those rays is the solids, while the volume is always that of the central ray. Rows are done in strips,
 so that neighbours share their pixels' corners; a strip depends on no other, so results are bitwise equal for any
 number of threads. What runs once a ray is inlined: a call would count references of its arrays atomically, which
-costs more than the ray.
+costs more than the ray. What runs once a row is a part (`ctsim.kernels.parts`), so that it is compiled once. Arrays
+are copied in loops: Numba's assignment to a slice compiles an error message for each.
 """
+
+import functools
 
 import numpy as np
 from numba import njit, prange
 
 from ctsim.kernels.bricks_cpu import add_pieces, aim, walk
 from ctsim.kernels.exp_cpu import exp_minus
+from ctsim.kernels.parts import part
 from ctsim.kernels.solids_cpu import intersect
 from ctsim.shadow import MOST_TIMES
 
@@ -23,6 +27,14 @@ ALL_SUBRAYS = 8.5  # a pixel across which the solids' optical thickness changes 
 RANGE_SHARE = 0.5  # of the signal's range over the sub-rays: the error of their mean at least, where an edge crosses
 LATTICE_ORDER = 4 / 3  # at an edge the mean of n lattice points is off by about n^(-3/4)
 FAST = {"contract", "reassoc", "nsz", "arcp"}
+
+# Numba types of what the parts take, named as in `transmit_view`
+ADDRESSES = "UniTuple(int64, 4)"  # of _measure_strip, _corners, _centres and _edges
+VOLUME = "Tuple((uint16[:,:,:,::1], int32[:,:,::1], uint8[::1], float32[::1], float64[::1]))"
+PRIMS, SHADOW, ACTIVE, NEAR = "float64[:,::1]", "int64[:,::1]", "int64[::1]", "bool_[::1]"
+RULE = "Tuple((float32[:,::1], float32[::1], float32[::1]))"
+EDGE = "Tuple((float64[::1], float64, float64, int64, float64))"
+POSE, COLUMNS, BACKGROUND = "float64[::1]", "UniTuple(int64, 3)", "float32[:,:]"
 
 
 @njit(inline="always", error_model="numpy")
@@ -125,7 +137,7 @@ def _near(shadow, active, n_u):
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@part(PRIMS, SHADOW, ACTIVE, NEAR, POSE, "float64", "float64[::1]", "float64[::1]", "float64[::1]")
 def _corners(prims, shadow, active, near, pose, v, edge_mu, out, hit):
     """Fill `out` [u + 1] with the solids' thickness at the pixel corners at height v (from the detector's centre).
 
@@ -179,17 +191,22 @@ def _fill_open(rule, span, columns, m1, m2):
             m1[u], m2[u] = open1, open2
 
 
-@njit(cache=True, error_model="numpy")
+@part(
+    VOLUME,
+    f"Tuple(({PRIMS}, {SHADOW}, {ACTIVE}, {NEAR}, float64[::1]))",
+    *(POSE, "int64", COLUMNS, BACKGROUND, "float32[:,:]", "float64[::1]"),
+)
 def _centres(volume, solids, pose, v, columns, background, lengths, centre):
     """Fill `lengths` [material, column] with the central rays of a row and `centre` [u] with the solids' thickness."""
     prims, shadow, active, near, edge_mu = solids
     first, last, n_v = columns
     n_m, n_u = background.shape
     for m in range(1, n_m):
-        lengths[m, : last - first] = background[m, first:last]
+        for u in range(first, last):
+            lengths[m, u - first] = background[m, u]
     code, slot, pool, density, grid = volume
     ray, pair, hits = np.empty(7), np.empty(4), np.empty((2 * active.size + 1, 3))
-    covered, painted, pieces = np.empty(n_m), np.empty(n_m), np.empty((int(grid[:3].sum()) + 8, 3))
+    covered, painted, pieces = np.empty(n_m), np.empty(n_m), np.empty((int(grid[0] + grid[1] + grid[2]) + 8, 3))
     for u in range(first, last):
         if not near[u]:
             continue
@@ -197,7 +214,9 @@ def _centres(volume, solids, pose, v, columns, background, lengths, centre):
         n = _collect(prims, shadow, active, u, ray, pair, hits)
         centre[u] = _thickness(hits, n, edge_mu)
         if n > 0:
-            t, far = hits[:n, 0].min(), hits[:n, 1].max()
+            t, far = hits[0, 0], hits[0, 1]
+            for i in range(1, n):
+                t, far = min(t, hits[i, 0]), max(far, hits[i, 1])
             _paint(hits, n, pieces, walk(code, slot, pool, density, grid, ray, t, far, pieces), covered, painted)
             for m in range(1, n_m):
                 lengths[m, u - first] = max(background[m, u] - covered[m], 0.0) + painted[m]
@@ -256,11 +275,16 @@ def _cast(volume, solids, pose, at, count, background, edge_mu, work):
             for m in range(1, n_m):
                 lengths[m, i] = max(background[m, column] - covered[m], 0.0) + painted[m]
         else:
-            lengths[1:, i] = background[1:, column]
+            for m in range(1, n_m):
+                lengths[m, i] = background[m, column]
     return thinnest, thickest
 
 
-@njit(cache=True, error_model="numpy")
+@part(
+    VOLUME,
+    f"Tuple(({PRIMS}, {PRIMS}, {SHADOW}, {ACTIVE}, {NEAR}))",
+    *(POSE, "int64", COLUMNS, BACKGROUND, RULE, EDGE, "float64[::1]", "float64[:,::1]", "float32[::1]", "float32[::1]"),
+)
 def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, bounds, m1, m2):
     """Measure again, by several rays each, the pixels of a row that the edge of a solid crosses.
 
@@ -275,9 +299,12 @@ def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, bo
     lengths, hits = np.zeros((n_m, size), np.float32), np.empty((size, 2 * active.size + 1, 3))
     tau, s1, s2 = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
     ray, pair, found = np.empty(7), np.empty(4), np.empty(size, np.int64)
-    covered, painted, pieces = np.empty(n_m), np.empty(n_m), np.empty((int(volume[4][:3].sum()) + 8, 3))
+    grid = volume[4]
+    covered, painted, pieces = np.empty(n_m), np.empty(n_m), np.empty((int(grid[0] + grid[1] + grid[2]) + 8, 3))
     work = lengths, hits, found, ray, pair, covered, painted, pieces
-    thin = (fat[active, 0] >= 0).any()
+    thin = False
+    for p in active:
+        thin |= fat[p, 0] >= 0
     for u in range(first, last):
         if not near[u]:
             continue
@@ -301,7 +328,7 @@ def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, bo
 
 
 @njit(cache=True, error_model="numpy")
-def _measure_row(volume, solids, pose, v, span, background, rule, edge, skip, corners, m1, m2):
+def _measure_row(at, volume, solids, pose, v, span, background, rule, edge, skip, corners, m1, m2):
     """Measure columns span[0]…span[1] of row v; `corners` [4, u + 1] are those below and above once it is done."""
     prims, fat, shadows = solids
     shadow = shadows[v]
@@ -310,11 +337,11 @@ def _measure_row(volume, solids, pose, v, span, background, rule, edge, skip, co
     active = _active(shadow)
     near = _near(shadow, active, n_u)
     edges = active.size > 0 and edge[3] > 1
-    corners[0], corners[2] = corners[1], corners[3]
+    for u in range(n_u + 1):
+        corners[0, u], corners[2, u] = corners[1, u], corners[3, u]
+        corners[1, u], corners[3, u] = 0.0, 0.0
     if edges:
-        _corners(prims, shadow, active, near, pose, v + 0.5 - (n_v - 1) / 2, edge[0], corners[1], corners[3])
-    else:
-        corners[1], corners[3] = 0.0, 0.0
+        _corners(at[1], prims, shadow, active, near, pose, v + 0.5 - (n_v - 1) / 2, edge[0], corners[1], corners[3])
     row = background[:, v]
     first, last = _trim(row, span, near, skip)
     _fill_open(rule, span, (first, last), m1[v], m2[v])
@@ -323,9 +350,10 @@ def _measure_row(volume, solids, pose, v, span, background, rule, edge, skip, co
     size, columns = last - first, (first, last, n_v)
     lengths, centre = np.zeros((n_m, size), np.float32), np.zeros(n_u)
     tau, s1, s2 = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    _centres(volume, (prims, shadow, active, near, edge[0]), pose, v, columns, row, lengths, centre)
+    _centres(at[2], volume, (prims, shadow, active, near, edge[0]), pose, v, columns, row, lengths, centre)
     _signal(lengths, size, mu, w1, w2, tau, s1, s2)
-    m1[v, first:last], m2[v, first:last] = s1, s2
+    for u in range(size):
+        m1[v, first + u], m2[v, first + u] = s1[u], s2[u]
     if edges:
         bounds = np.empty((2, n_u))
         for u in range(first, last):
@@ -337,12 +365,17 @@ def _measure_row(volume, solids, pose, v, span, background, rule, edge, skip, co
             # where a solid begins the change is not linear, and less of it matters
             limit = edge[1] if a == b and b == c and c == d else edge[2]
             centre[u] = change if change > limit else 0.0
-        parts = (prims, fat, shadow, active, near)
-        _edges(volume, parts, pose, v, columns, row, rule, edge, centre, bounds, m1[v], m2[v])
+        found = (prims, fat, shadow, active, near)
+        _edges(at[3], volume, found, pose, v, columns, row, rule, edge, centre, bounds, m1[v], m2[v])
 
 
-@njit(cache=True, error_model="numpy")
-def _measure_strip(volume, solids, pose, first, spans, background, rule, edge, skip, m1, m2):
+@part(
+    ADDRESSES,
+    VOLUME,
+    f"Tuple(({PRIMS}, {PRIMS}, int64[:,:,::1]))",
+    *(POSE, "int64", "int64[:,::1]", "float32[:,:,::1]", RULE, EDGE, "boolean", "float32[:,::1]", "float32[:,::1]"),
+)
+def _measure_strip(at, volume, solids, pose, first, spans, background, rule, edge, skip, m1, m2):
     n_v, n_u = m1.shape
     corners = np.zeros((4, n_u + 1))
     shadow = solids[2][first]
@@ -350,12 +383,17 @@ def _measure_strip(volume, solids, pose, first, spans, background, rule, edge, s
     if active.size > 0 and edge[3] > 1:
         near = _near(shadow, active, n_u)
         v = first - 0.5 - (n_v - 1) / 2
-        _corners(solids[0], shadow, active, near, pose, v, edge[0], corners[1], corners[3])
+        _corners(at[1], solids[0], shadow, active, near, pose, v, edge[0], corners[1], corners[3])
     for v in range(first, min(first + STRIP, n_v)):
-        _measure_row(volume, solids, pose, v, spans[v], background, rule, edge, skip, corners, m1, m2)
+        _measure_row(at, volume, solids, pose, v, spans[v], background, rule, edge, skip, corners, m1, m2)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
+def _measure_strips(at, volume, solids, pose, order, spans, background, rule, edge, skip, m1, m2):
+    for index in prange(order.size):
+        _measure_strip(at[0], at, volume, solids, pose, order[index] * STRIP, spans, background, rule, edge, skip, m1, m2)
+
+
 def transmit_view(volume, solids, pose, order, spans, background, rule, edge, skip, m1, m2):
     """Measure one view: mean signal `m1` and second moment `m2` [v, u] relative to the open field.
 
@@ -368,22 +406,30 @@ def transmit_view(volume, solids, pose, order, spans, background, rule, edge, sk
     relative error of its signal above which it gets up to `MOST_TIMES` as many). Without `skip`, rays that
     meet nothing are traced, too.
     """
-    for index in prange(order.size):
-        _measure_strip(volume, solids, pose, order[index] * STRIP, spans, background, rule, edge, skip, m1, m2)
+    _measure_strips(_addresses(), volume, solids, pose, order, spans, background, rule, edge, skip, m1, m2)
+
+
+@functools.cache
+def _addresses():
+    return _measure_strip.address(), _corners.address(), _centres.address(), _edges.address()
 
 
 @njit(cache=True, error_model="numpy")
-def _replace_row(volume, solids, pose, v, background, lengths):
+def _replace_row(centres, volume, solids, pose, v, background, lengths):
     prims, _, shadows = solids
     shadow = shadows[v]
     _, n_v, n_u = background.shape
     active = _active(shadow)
-    parts = (prims, shadow, active, _near(shadow, active, n_u), np.zeros(lengths.shape[0]))
-    _centres(volume, parts, pose, v, (0, n_u, n_v), background[:, v], lengths[:, v], np.zeros(n_u))
+    found = (prims, shadow, active, _near(shadow, active, n_u), np.zeros(lengths.shape[0]))
+    _centres(centres, volume, found, pose, v, (0, n_u, n_v), background[:, v], lengths[:, v], np.zeros(n_u))
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
+def _replace_rows(centres, volume, solids, pose, order, background, lengths):
+    for index in prange(order.size):
+        _replace_row(centres, volume, solids, pose, order[index], background, lengths)
+
+
 def replace_view(volume, solids, pose, order, background, lengths):
     """Fill `lengths` [material, v, u] (mm) of the central rays: `background`, but for the solids."""
-    for index in prange(order.size):
-        _replace_row(volume, solids, pose, order[index], background, lengths)
+    _replace_rows(_centres.address(), volume, solids, pose, order, background, lengths)
