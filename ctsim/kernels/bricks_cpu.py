@@ -46,7 +46,7 @@ def reach(kind):
     return code
 
 
-@njit(inline="always", error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def walk(code, slot, pool, density, grid, ray, t_from, t_to, pieces):
     """List what a ray crosses between t_from and t_to (mm along it) as pieces (end, label, density); return how many.
 

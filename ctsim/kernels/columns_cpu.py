@@ -12,6 +12,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from ctsim.kernels.once import compiled_once
+
 LANES = 16  # detector columns done together: their sums fill vector registers, their results cache lines
 FIXED = 2.0**50
 TINY = 1e-12  # a horizontal direction (voxels) below this counts as parallel to the axis
@@ -140,7 +142,7 @@ def _lengths(sums, pose, u_0, lengths):
                 lengths[m, v, u_0 + lane] = total[m, lane] * longest[lane]
 
 
-@njit(cache=True, error_model="numpy")
+@compiled_once("Tuple((int32[:,::1], uint32[::1]))", "float64[::1]", "float64[::1]", "int64", "float32[:,:,::1]")
 def _block(columns, grid, pose, u_0, lengths):
     n_m, n_v, n_u = lengths.shape
     sums = np.zeros((n_m, n_v + 2, LANES), np.int64)
@@ -150,6 +152,11 @@ def _block(columns, grid, pose, u_0, lengths):
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
+def _blocks(block, columns, grid, pose, order, lengths):
+    for index in prange(order.size):
+        _block(block, columns, grid, pose, order[index] * LANES, lengths)
+
+
 def fill_view(columns, grid, pose, order, lengths):
     """Fill `lengths` [material, v, u] (mm, float32) of one view with what the central rays cross in the volume.
 
@@ -157,5 +164,4 @@ def fill_view(columns, grid, pose, order, lengths):
     u step horizontal, v step along +z. `order` [block] is the order of work on blocks of LANES detector columns.
     Material 0 is left alone.
     """
-    for index in prange(order.size):
-        _block(columns, grid, pose, order[index] * LANES, lengths)
+    _blocks(_block.address(), columns, grid, pose, order, lengths)

@@ -6,8 +6,8 @@ measured by several rays and averaged in *intensity*, as a detector does, and by
 differs between those rays is the solids, while the volume is always that of the central ray. Rows are done in strips,
 so that neighbours share their pixels' corners; a strip depends on no other, so results are bitwise equal for any
 number of threads. What runs once a ray is inlined: a call would count references of its arrays atomically, which
-costs more than the ray. What runs once a row is a part (`ctsim.kernels.parts`), so that it is compiled once. Arrays
-are copied in loops: Numba's assignment to a slice compiles an error message for each.
+costs more than the ray. What runs once a row is called by address (`ctsim.kernels.once`), so that it is compiled
+once. Arrays are copied in loops, since assigning to a slice compiles the making of an error message.
 """
 
 import functools
@@ -17,7 +17,7 @@ from numba import njit, prange
 
 from ctsim.kernels.bricks_cpu import add_pieces, aim, walk
 from ctsim.kernels.exp_cpu import exp_minus
-from ctsim.kernels.parts import part
+from ctsim.kernels.once import compiled_once
 from ctsim.kernels.solids_cpu import intersect
 from ctsim.shadow import MOST_TIMES
 
@@ -28,7 +28,7 @@ RANGE_SHARE = 0.5  # of the signal's range over the sub-rays: the error of their
 LATTICE_ORDER = 4 / 3  # at an edge the mean of n lattice points is off by about n^(-3/4)
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
-# Numba types of what the parts take, named as in `transmit_view`
+# Numba types of arguments, named as in `transmit_view`
 ADDRESSES = "UniTuple(int64, 4)"  # of _measure_strip, _corners, _centres and _edges
 VOLUME = "Tuple((uint16[:,:,:,::1], int32[:,:,::1], uint8[::1], float32[::1], float64[::1]))"
 PRIMS, SHADOW, ACTIVE, NEAR = "float64[:,::1]", "int64[:,::1]", "int64[::1]", "bool_[::1]"
@@ -137,7 +137,7 @@ def _near(shadow, active, n_u):
     return out
 
 
-@part(PRIMS, SHADOW, ACTIVE, NEAR, POSE, "float64", "float64[::1]", "float64[::1]", "float64[::1]")
+@compiled_once(PRIMS, SHADOW, ACTIVE, NEAR, POSE, "float64", "float64[::1]", "float64[::1]", "float64[::1]")
 def _corners(prims, shadow, active, near, pose, v, edge_mu, out, hit):
     """Fill `out` [u + 1] with the solids' thickness at the pixel corners at height v (from the detector's centre).
 
@@ -191,7 +191,7 @@ def _fill_open(rule, span, columns, m1, m2):
             m1[u], m2[u] = open1, open2
 
 
-@part(
+@compiled_once(
     VOLUME,
     f"Tuple(({PRIMS}, {SHADOW}, {ACTIVE}, {NEAR}, float64[::1]))",
     *(POSE, "int64", COLUMNS, BACKGROUND, "float32[:,:]", "float64[::1]"),
@@ -222,7 +222,7 @@ def _centres(volume, solids, pose, v, columns, background, lengths, centre):
                 lengths[m, u - first] = max(background[m, u] - covered[m], 0.0) + painted[m]
 
 
-@njit(inline="always", error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _uncertainty(signal, count, seen, bounds):
     """Estimate the relative error of the mean of `count` sub-rays.
 
@@ -280,7 +280,7 @@ def _cast(volume, solids, pose, at, count, background, edge_mu, work):
     return thinnest, thickest
 
 
-@part(
+@compiled_once(
     VOLUME,
     f"Tuple(({PRIMS}, {PRIMS}, {SHADOW}, {ACTIVE}, {NEAR}))",
     *(POSE, "int64", COLUMNS, BACKGROUND, RULE, EDGE, "float64[::1]", "float64[:,::1]", "float32[::1]", "float32[::1]"),
@@ -369,7 +369,7 @@ def _measure_row(at, volume, solids, pose, v, span, background, rule, edge, skip
         _edges(at[3], volume, found, pose, v, columns, row, rule, edge, centre, bounds, m1[v], m2[v])
 
 
-@part(
+@compiled_once(
     ADDRESSES,
     VOLUME,
     f"Tuple(({PRIMS}, {PRIMS}, int64[:,:,::1]))",
@@ -391,7 +391,9 @@ def _measure_strip(at, volume, solids, pose, first, spans, background, rule, edg
 @njit(parallel=True, cache=True, error_model="numpy")
 def _measure_strips(at, volume, solids, pose, order, spans, background, rule, edge, skip, m1, m2):
     for index in prange(order.size):
-        _measure_strip(at[0], at, volume, solids, pose, order[index] * STRIP, spans, background, rule, edge, skip, m1, m2)
+        _measure_strip(
+            at[0], at, volume, solids, pose, order[index] * STRIP, spans, background, rule, edge, skip, m1, m2
+        )
 
 
 def transmit_view(volume, solids, pose, order, spans, background, rule, edge, skip, m1, m2):
@@ -406,6 +408,7 @@ def transmit_view(volume, solids, pose, order, spans, background, rule, edge, sk
     relative error of its signal above which it gets up to `MOST_TIMES` as many). Without `skip`, rays that
     meet nothing are traced, too.
     """
+    rule = np.ascontiguousarray(rule[0]), *rule[1:]  # a slice of the nodes, too
     _measure_strips(_addresses(), volume, solids, pose, order, spans, background, rule, edge, skip, m1, m2)
 
 

@@ -8,6 +8,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from ctsim.kernels.once import compiled_once
 from ctsim.solids import BOX, CAPSULE, ELLIPSOID, FRUSTUM
 
 
@@ -136,7 +137,74 @@ def mark(prims, start, pitch, touched):
                         touched[k, j, i] = 1
 
 
+@compiled_once(
+    *("int64", "float64[:,::1]", "int64[::1]", "float64[::1]", "float64[::1]", "UniTuple(int64, 3)"),
+    *("UniTuple(int64, 3)", "int64[::1]", "int64[::1]", "float32[:,::1]"),
+)
+def _cover_slice(k, prims, channel, start, pitch, cells, shape, index, first, out):
+    _, ny, nx = shape
+    reach = 0.5 * math.sqrt(pitch[0] ** 2 + pitch[1] ** 2 + pitch[2] ** 2)
+    dz, dy, dx = pitch[0] / cells[0], pitch[1] / cells[1], pitch[2] / cells[2]
+    width = (dz * dy * dx) ** (1 / 3)
+    unit = 1.0 / (cells[0] * cells[1] * cells[2])
+    row_prims = np.empty(prims.shape[0], np.int64)
+    crossing = np.empty(prims.shape[0], np.int64)
+    total = np.empty(out.shape[1])
+    z, row, n_row = start[0] + k * pitch[0], -1, 0
+    for m in range(first[k], first[k + 1]):
+        j, i = (index[m] // nx) % ny, index[m] % nx
+        y, x = start[1] + j * pitch[1], start[2] + i * pitch[2]
+        if j != row:
+            row, n_row = j, 0
+            for p in range(prims.shape[0] - 1, -1, -1):
+                gap_z = max(abs(z - prims[p, 20]) - 0.5 * pitch[0], 0.0)
+                gap_y = max(abs(y - prims[p, 19]) - 0.5 * pitch[1], 0.0)
+                if gap_z * gap_z + gap_y * gap_y <= prims[p, 21] ** 2:
+                    row_prims[n_row] = p
+                    n_row += 1
+        n, full = 0, -1
+        for r in range(n_row):
+            p = row_prims[r]
+            if abs(x - prims[p, 18]) > prims[p, 21] + 0.5 * pitch[2]:
+                continue
+            distance = bound(prims[p], x, y, z)
+            if distance <= -reach:
+                full = channel[p]
+                break
+            if distance < reach:
+                crossing[n] = p
+                n += 1
+        if n == 0:
+            if full >= 0:
+                out[m, full] = 1.0
+            continue
+        total[:] = 0.0
+        for kk in range(cells[0]):
+            sz = z - 0.5 * pitch[0] + (kk + 0.5) * dz
+            for jj in range(cells[1]):
+                sy = y - 0.5 * pitch[1] + (jj + 0.5) * dy
+                for ii in range(cells[2]):
+                    sx = x - 0.5 * pitch[2] + (ii + 0.5) * dx
+                    left = unit
+                    for r in range(n):
+                        p = crossing[r]
+                        part = left * share(prims[p], sx, sy, sz, width)
+                        total[channel[p]] += part
+                        left -= part
+                        if left <= 0:
+                            break
+                    if full >= 0:
+                        total[full] += left
+        for r in range(total.size):  # not by a slice: its error message takes a second to compile
+            out[m, r] = total[r]
+
+
 @njit(parallel=True, cache=True)
+def _cover_slices(slice_, prims, channel, start, pitch, cells, shape, index, first, out):
+    for k in prange(shape[0]):
+        _cover_slice(slice_, k, prims, channel, start, pitch, cells, shape, index, first, out)
+
+
 def cover(prims, channel, start, pitch, cells, shape, index, first, out):
     """Fill `out` [k, channel] with the share of each listed voxel that each channel is seen in.
 
@@ -144,58 +212,4 @@ def cover(prims, channel, start, pitch, cells, shape, index, first, out):
     `channel` [primitive] and `cells` (z, y, x) the sub-cells of a voxel. A later primitive covers an
     earlier one in every sub-cell.
     """
-    nz, ny, nx = shape
-    reach = 0.5 * math.sqrt(pitch[0] ** 2 + pitch[1] ** 2 + pitch[2] ** 2)
-    dz, dy, dx = pitch[0] / cells[0], pitch[1] / cells[1], pitch[2] / cells[2]
-    width = (dz * dy * dx) ** (1 / 3)
-    unit = 1.0 / (cells[0] * cells[1] * cells[2])
-    for k in prange(nz):
-        row_prims = np.empty(prims.shape[0], np.int64)
-        crossing = np.empty(prims.shape[0], np.int64)
-        total = np.empty(out.shape[1])
-        z, row, n_row = start[0] + k * pitch[0], -1, 0
-        for m in range(first[k], first[k + 1]):
-            j, i = (index[m] // nx) % ny, index[m] % nx
-            y, x = start[1] + j * pitch[1], start[2] + i * pitch[2]
-            if j != row:
-                row, n_row = j, 0
-                for p in range(prims.shape[0] - 1, -1, -1):
-                    gap_z = max(abs(z - prims[p, 20]) - 0.5 * pitch[0], 0.0)
-                    gap_y = max(abs(y - prims[p, 19]) - 0.5 * pitch[1], 0.0)
-                    if gap_z * gap_z + gap_y * gap_y <= prims[p, 21] ** 2:
-                        row_prims[n_row] = p
-                        n_row += 1
-            n, full = 0, -1
-            for r in range(n_row):
-                p = row_prims[r]
-                if abs(x - prims[p, 18]) > prims[p, 21] + 0.5 * pitch[2]:
-                    continue
-                distance = bound(prims[p], x, y, z)
-                if distance <= -reach:
-                    full = channel[p]
-                    break
-                if distance < reach:
-                    crossing[n] = p
-                    n += 1
-            if n == 0:
-                if full >= 0:
-                    out[m, full] = 1.0
-                continue
-            total[:] = 0.0
-            for kk in range(cells[0]):
-                sz = z - 0.5 * pitch[0] + (kk + 0.5) * dz
-                for jj in range(cells[1]):
-                    sy = y - 0.5 * pitch[1] + (jj + 0.5) * dy
-                    for ii in range(cells[2]):
-                        sx = x - 0.5 * pitch[2] + (ii + 0.5) * dx
-                        left = unit
-                        for r in range(n):
-                            p = crossing[r]
-                            part = left * share(prims[p], sx, sy, sz, width)
-                            total[channel[p]] += part
-                            left -= part
-                            if left <= 0:
-                                break
-                        if full >= 0:
-                            total[full] += left
-            out[m, :] = total
+    _cover_slices(_cover_slice.address(), prims, channel, start, pitch, cells, shape, index, first, out)

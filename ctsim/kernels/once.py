@@ -1,9 +1,9 @@
-"""Parts of kernels that are compiled once and called by their address.
+"""Functions that kernels call by address, so that they are compiled once.
 
 Numba links every compiled function into its caller and optimises it again there: what a parallel kernel calls is
-optimised once for each level of calls and three more times for the parallel loop. A part is behind an address, which
-compiled callers are given as an integer, and so is optimised once, however deep it lies. A call costs some
-nanoseconds and is never inlined: parts are for rows and blocks, not for rays.
+optimised once for each level of calls and three more times for the parallel loop. A function that callers know by its
+address only, an integer argument, is optimised once, however deep it lies. Such a call is never inlined and costs some
+nanoseconds, so it is for rows and blocks, not for rays.
 """
 
 import functools
@@ -12,10 +12,11 @@ from typing import Any
 
 from numba import njit, types
 from numba.core import cgutils, sigutils
+from numba.core.errors import TypingError
 from numba.extending import intrinsic
 
 
-def part(*arguments: str, **options: Any) -> Callable[[Callable], Any]:
+def compiled_once(*arguments: str, **options: Any) -> Callable[[Callable], Any]:
     """Compile the decorated function, which returns nothing, for these Numba types of its arguments.
 
     It has one specialisation. Compiled code calls it as `f(address, *arguments)`; the address is `f.address()`, which
@@ -33,7 +34,7 @@ def part(*arguments: str, **options: Any) -> Callable[[Callable], Any]:
         def call(typingctx, address, *given):
             wanted = declared()
             if len(given) != len(wanted) or not all(map(typingctx.can_convert, given, wanted)):
-                raise TypeError(f"{function.__name__} takes {wanted}, got {given}")
+                raise TypingError(f"{function.__name__} takes {wanted}, got {given}")
             return types.void(types.int64, types.BaseTuple.from_types(wanted)), _by_address
 
         @functools.cache
