@@ -14,6 +14,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from ctsim.kernels.once import compiled_once
+
 LANES = 16  # detector columns done together, written as whole cache lines
 PLANES = 4  # planes of voxels that share one reading of the views
 CHUNK_BYTES = 1 << 26
@@ -109,14 +111,21 @@ def _length(line, size, v, u):
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _fill_columns(volume, filled, shape, lines, size, rows, views, projections):
+def _fill_blocks(fill_block, volume, filled, shape, lines, size, rows, views, projections):
     blocks = (projections.shape[2] + LANES - 1) // LANES
     for index in prange(views.size * blocks):
         view, u = views[index // blocks], index % blocks * LANES
-        _fill_block(volume, filled, shape, lines, size, rows, view, u, projections)
+        _fill_block(fill_block, volume, filled, shape, lines, size, rows, view, u, projections)
 
 
-@njit(cache=True, error_model="numpy")
+def _fill_columns(*arguments):
+    _fill_blocks(_fill_block.address(), *arguments)
+
+
+@compiled_once(
+    *("float32[::1]", "boolean[::1]", "int64[::1]", "float64[:,::1]", "float64[::1]", "int64[:,::1]"),
+    *("int64", "int64", "float32[:,:,::1]"),
+)
 def _fill_block(volume, filled, shape, lines, size, rows, view, u_0, projections):
     _, n_v, n_u = projections.shape
     total = np.zeros((LANES, n_v), np.float32)

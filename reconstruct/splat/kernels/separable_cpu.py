@@ -20,6 +20,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from ctsim.kernels.once import compiled_once
 from ctsim.reconstruct.splat.kernels.lanes import (
     WIDTH,
     add,
@@ -53,6 +54,7 @@ from ctsim.reconstruct.splat.kernels.splat_cpu import (
 )
 
 RUNS = 256  # in a task of the transpose
+RUNS_TYPE = "Tuple((float64[:,::1], int64[::1], float32[:,::1], int64))"  # of `runs`, in Numba's words
 SLACK = 1e-3  # of a splat and of a row: ranges are wider by that, so that the cutoff alone decides, not rounding
 HALF_LOG2E = 0.5 * math.log2(math.e)  # exponents are of 2, which saves a product each
 ROW, FALLING, PEAKS, FIRST, SECOND = range(5)  # of a run's table [5, splat]: row, −HALF_LOG2E/S_vv, peak, two channels
@@ -167,7 +169,7 @@ def _weighted(values, bounds, table):
         table[SECOND, k] = values[bounds[0] + k, 1] * table[PEAKS, k]
 
 
-@njit(cache=True, error_model="numpy")
+@compiled_once(RUNS_TYPE, "float32[:,::1]", "float64", "float64[::1]", "float32[:,::1]")
 def _forward_view(runs, values, scale, camera, image):
     xy, starts, z, tallest = runs
     n_u, n_v = image.shape[0] // 2, image.shape[1] - WIDTH
@@ -201,10 +203,14 @@ def _forward_view(runs, values, scale, camera, image):
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
+def _forward_views(forward_view, runs, values, scale, cameras, images):
+    for view in prange(cameras.shape[0]):
+        _forward_view(forward_view, runs, values, scale, cameras[view], images[view])
+
+
 def forward(runs, values, scale, cameras, images):
     """Project values [splat, 2] onto views, one a thread: images [view, 2 · u, v + 8] must be zero."""
-    for view in prange(cameras.shape[0]):
-        _forward_view(runs, values, scale, cameras[view], images[view])
+    _forward_views(_forward_view.address(), runs, values, scale, cameras, images)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -221,7 +227,7 @@ def _add_runs_own(table, bounds, sums):
         sums[bounds[0] + k, 1] += table[SECOND, k]
 
 
-@njit(cache=True, error_model="numpy")
+@compiled_once("UniTuple(int64, 2)", RUNS_TYPE, "float64", "float64[::1]", "float32[:,::1]", "float32[:,::1]")
 def _backward_runs(chosen, runs, scale, camera, image, sums):
     xy, starts, z, tallest = runs
     n_u, n_v = image.shape[0] // 2, image.shape[1] - WIDTH
@@ -260,12 +266,16 @@ def _backward_runs(chosen, runs, scale, camera, image, sums):
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
-def backward(runs, scale, cameras, images, sums):
-    """Apply the transpose: write to sums [splat, 2] Σ w·images over all pixels of images [view, 2 · u, v + 8]."""
+def _backward_tasks(backward_runs, runs, scale, cameras, images, sums):
     n, starts = runs[0].shape[0], runs[1]
     for task in prange((n + RUNS - 1) // RUNS):
         chosen = (task * RUNS, min((task + 1) * RUNS, n))
         for i in range(starts[chosen[0]], starts[chosen[1]]):
             sums[i, 0] = sums[i, 1] = 0
         for view in range(cameras.shape[0]):
-            _backward_runs(chosen, runs, scale, cameras[view], images[view], sums)
+            _backward_runs(backward_runs, chosen, runs, scale, cameras[view], images[view], sums)
+
+
+def backward(runs, scale, cameras, images, sums):
+    """Apply the transpose: write to sums [splat, 2] Σ w·images over all pixels of images [view, 2 · u, v + 8]."""
+    _backward_tasks(_backward_runs.address(), runs, scale, cameras, images, sums)
