@@ -37,7 +37,10 @@ def run(options: Options) -> int:
         if options.out is None:
             raise InputError("the data folder is missing: expected make-dataset SUITE OUT")
         scenes = select(load(options.suite), options.only, options.seeds)
-        return _dry_run(scenes, options) if options.dry_run else _make(scenes, options.out, options)
+        from ctsim.benchmarks.compiling import announced
+
+        with announced(say):
+            return _dry_run(scenes, options) if options.dry_run else _make(scenes, options.out, options)
     except (InputError, OSError, tomllib.TOMLDecodeError) as error:
         say(f"make-dataset: {_sentence(error)}")
         return 2

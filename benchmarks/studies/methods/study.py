@@ -12,6 +12,7 @@ import msgspec
 import tyro
 
 from ctsim.benchmarks import methods
+from ctsim.benchmarks.compiling import announced
 from ctsim.benchmarks.engine import study
 from ctsim.benchmarks.engine.record import Task
 from ctsim.benchmarks.scores.protocol import Stored
@@ -124,7 +125,7 @@ class Methods(study.Study[RunRecord, Flags]):
         def told(now: Progress) -> None:
             say(f"now {now.share:.0%}, loss {now.loss:.3g}, {now.remaining:.0f} s to go")
 
-        with listen(told):
+        with announced(), listen(told):
             yield
 
     def write(self, records: Sequence[RunRecord], given: Flags) -> str:
