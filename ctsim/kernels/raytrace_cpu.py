@@ -18,6 +18,7 @@ from numba import njit, prange
 from ctsim.kernels.bricks_cpu import add_pieces, aim, walk
 from ctsim.kernels.exp_cpu import exp_minus
 from ctsim.kernels.once import compiled_once
+from ctsim.kernels.rows_cpu import columns_near, fill_open, seen_in_row, trim
 from ctsim.kernels.solids_cpu import intersect
 from ctsim.shadow import MOST_TIMES
 
@@ -105,18 +106,6 @@ def _signal(lengths, n, mu, w1, w2, tau, s1, s2):
             s2[i] += w2[k] * e
 
 
-@njit(cache=True, error_model="numpy")
-def _active(shadow):
-    """Return the indices of the primitives that are seen in a row."""
-    out = np.empty(shadow.shape[0], np.int64)
-    n = 0
-    for p in range(shadow.shape[0]):
-        if shadow[p, 0] <= shadow[p, 1]:
-            out[n] = p
-            n += 1
-    return out[:n]
-
-
 @njit(inline="always", error_model="numpy")
 def _grazes(fat, shadow, active, u, ray, pair):
     """Return how many times the usual sub-rays a primitive needs that can hide between a pixel's corners."""
@@ -126,15 +115,6 @@ def _grazes(fat, shadow, active, u, ray, pair):
         if near and intersect(fat[p], ray[0], ray[1], ray[2], ray[3], ray[4], ray[5], pair) > 0:
             times = max(times, int(fat[p, 1]))
     return times
-
-
-@njit(cache=True, error_model="numpy")
-def _near(shadow, active, n_u):
-    """Mark the columns that the shadows of the active primitives may reach."""
-    out = np.zeros(n_u + 1, np.bool_)
-    for p in active:
-        out[max(shadow[p, 0], 0) : shadow[p, 1] + 2] = True
-    return out
 
 
 @compiled_once(PRIMS, SHADOW, ACTIVE, NEAR, POSE, "float64", "float64[::1]", "float64[::1]", "float64[::1]")
@@ -151,44 +131,6 @@ def _corners(prims, shadow, active, near, pose, v, edge_mu, out, hit):
             aim(pose, u - 0.5 - middle, v, ray)
             n = _collect(prims, shadow, active, u - 0.5, ray, pair, hits)
             out[u], hit[u] = _thickness(hits, n, edge_mu), n
-
-
-@njit(inline="always", error_model="numpy")
-def _is_open(background, u):
-    total = np.float32(0)
-    for m in range(1, background.shape[0]):
-        total += background[m, u]
-    return total == 0
-
-
-@njit(cache=True, error_model="numpy")
-def _trim(background, span, near, skip):
-    """Leave out the columns at both ends of a row in which nothing is met."""
-    first, last = span[0], span[1]
-    if not skip:
-        return first, last
-    while first < last and not near[first] and _is_open(background, first):
-        first += 1
-    while first < last and not near[last - 1] and _is_open(background, last - 1):
-        last -= 1
-    return first, last
-
-
-@njit(cache=True, error_model="numpy")
-def _fill_open(rule, span, columns, m1, m2):
-    """Write the open field's signal to a row's columns of `span` outside `columns`.
-
-    The images may hold another scan. Weights are summed in the order of `_signal`, so that a skipped ray equals a
-    traced one.
-    """
-    _, w1, w2 = rule
-    open1, open2 = np.float32(0), np.float32(0)
-    for k in range(w1.size):
-        open1 += w1[k]
-        open2 += w2[k]
-    for u in range(span[0], span[1]):
-        if u < columns[0] or u >= columns[1]:
-            m1[u], m2[u] = open1, open2
 
 
 @compiled_once(
@@ -334,8 +276,8 @@ def _measure_row(at, volume, solids, pose, v, span, background, rule, edge, skip
     shadow = shadows[v]
     mu, w1, w2 = rule
     n_m, n_v, n_u = background.shape
-    active = _active(shadow)
-    near = _near(shadow, active, n_u)
+    active = seen_in_row(shadow)
+    near = columns_near(shadow, active, n_u)
     edges = active.size > 0 and edge[3] > 1
     for u in range(n_u + 1):
         corners[0, u], corners[2, u] = corners[1, u], corners[3, u]
@@ -343,8 +285,8 @@ def _measure_row(at, volume, solids, pose, v, span, background, rule, edge, skip
     if edges:
         _corners(at[1], prims, shadow, active, near, pose, v + 0.5 - (n_v - 1) / 2, edge[0], corners[1], corners[3])
     row = background[:, v]
-    first, last = _trim(row, span, near, skip)
-    _fill_open(rule, span, (first, last), m1[v], m2[v])
+    first, last = trim(row, span, near, skip)
+    fill_open(rule, span, (first, last), m1[v], m2[v])
     if first >= last:
         return
     size, columns = last - first, (first, last, n_v)
@@ -379,9 +321,9 @@ def _measure_strip(at, volume, solids, pose, first, spans, background, rule, edg
     n_v, n_u = m1.shape
     corners = np.zeros((4, n_u + 1))
     shadow = solids[2][first]
-    active = _active(shadow)
+    active = seen_in_row(shadow)
     if active.size > 0 and edge[3] > 1:
-        near = _near(shadow, active, n_u)
+        near = columns_near(shadow, active, n_u)
         v = first - 0.5 - (n_v - 1) / 2
         _corners(at[1], solids[0], shadow, active, near, pose, v, edge[0], corners[1], corners[3])
     for v in range(first, min(first + STRIP, n_v)):
@@ -422,8 +364,8 @@ def _replace_row(centres, volume, solids, pose, v, background, lengths):
     prims, _, shadows = solids
     shadow = shadows[v]
     _, n_v, n_u = background.shape
-    active = _active(shadow)
-    found = (prims, shadow, active, _near(shadow, active, n_u), np.zeros(lengths.shape[0]))
+    active = seen_in_row(shadow)
+    found = (prims, shadow, active, columns_near(shadow, active, n_u), np.zeros(lengths.shape[0]))
     _centres(centres, volume, found, pose, v, (0, n_u, n_v), background[:, v], lengths[:, v], np.zeros(n_u))
 
 
