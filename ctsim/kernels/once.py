@@ -27,24 +27,26 @@ def compiled_once(*arguments: str, **options: Any) -> Callable[[Callable], Any]:
         compiled = njit(cache=True, error_model="numpy", **options)(function)
 
         @functools.cache
-        def declared() -> tuple[types.Type, ...]:
+        def declared() -> Any:
             return sigutils.normalize_signature(f"void({', '.join(arguments)})")[0]
 
         @intrinsic
         def call(typingctx, address, *given):
-            wanted = declared()
+            wanted: Any = declared()
             if len(given) != len(wanted) or not all(map(typingctx.can_convert, given, wanted)):
                 raise TypingError(f"{function.__name__} takes {wanted}, got {given}")
-            return types.void(types.int64, types.BaseTuple.from_types(wanted)), _by_address
+            packed: Any = types.BaseTuple.from_types(wanted)
+            return types.void(types.int64, packed), _by_address
 
         @functools.cache
         def address() -> int:
             compiled.compile(declared())
-            made = compiled.overloads[declared()]
-            return made.library.get_pointer_to_function(made.fndesc.llvm_func_name)
+            found = compiled.overloads[declared()]
+            return found.library.get_pointer_to_function(found.fndesc.llvm_func_name)
 
-        call.address, call.compiled = address, compiled
-        return call
+        made: Any = call
+        made.address, made.compiled = address, compiled
+        return made
 
     return decorate
 

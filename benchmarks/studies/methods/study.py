@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import pkgutil
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,6 @@ import msgspec
 import tyro
 
 from ctsim.benchmarks import methods
-from ctsim.benchmarks.compiling import announced
 from ctsim.benchmarks.engine import study
 from ctsim.benchmarks.engine.record import Task
 from ctsim.benchmarks.scores.protocol import Stored
@@ -125,7 +125,9 @@ class Methods(study.Study[RunRecord, Flags]):
         def told(now: Progress) -> None:
             say(f"now {now.share:.0%}, loss {now.loss:.3g}, {now.remaining:.0f} s to go")
 
-        with announced(), listen(told):
+        from ctsim.benchmarks.compiling import announced  # loads numba
+
+        with announced(lambda text: sys.stderr.write(f"{text}\n")), listen(told):
             yield
 
     def write(self, records: Sequence[RunRecord], given: Flags) -> str:
