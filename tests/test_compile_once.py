@@ -9,7 +9,7 @@ from numba.core.errors import TypingError
 from numba.core.event import end_event, start_event
 from test_simulate import EVERYTHING, phantom, run, scanner
 
-from ctsim.benchmarks import compiling
+from ctsim.benchmarks.engine import compiling
 from ctsim.kernels import raytrace_cpu
 from ctsim.kernels.once import compiled_once
 

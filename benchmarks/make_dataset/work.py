@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TypeVar
 
+from ctsim.benchmarks.engine.compiling import announced
 from ctsim.benchmarks.engine.dask import open_jobs
 from ctsim.benchmarks.engine.process import TICK, Jobs, Lost
 from ctsim.benchmarks.engine.terminal import Bar
@@ -37,8 +38,6 @@ def run(options: Options) -> int:
         if options.out is None:
             raise InputError("the data folder is missing: expected make-dataset SUITE OUT")
         scenes = select(load(options.suite), options.only, options.seeds)
-        from ctsim.benchmarks.compiling import announced
-
         with announced(say):
             return _dry_run(scenes, options) if options.dry_run else _make(scenes, options.out, options)
     except (InputError, OSError, tomllib.TOMLDecodeError) as error:

@@ -45,8 +45,8 @@ class Flags(study.Options):
     results: tyro.conf.Positional[Path]
     """Folder for records, tables, volumes and pictures; created if missing."""
     method: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
-    """A method's name, such as fdk, or module:function of your own; may be given several times (default: fdk, limar, nmar
-    and splat)."""
+    """A method's name, such as fdk, or module:function of your own; may be given several times (default: fdk, limar,
+    nmar and splat)."""
     set: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="METHOD.PARAMETER=VALUE")] = ()
     """A method's parameter, one of those that `run-benchmark methods` lists; may be given several times."""
     scene: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
@@ -125,7 +125,7 @@ class Methods(study.Study[RunRecord, Flags]):
         def told(now: Progress) -> None:
             say(f"now {now.share:.0%}, loss {now.loss:.3g}, {now.remaining:.0f} s to go")
 
-        from ctsim.benchmarks.compiling import announced  # loads numba
+        from ctsim.benchmarks.engine.compiling import announced  # loads numba
 
         with announced(lambda text: sys.stderr.write(f"{text}\n")), listen(told):
             yield
