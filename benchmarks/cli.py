@@ -12,6 +12,7 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import tyro
@@ -19,17 +20,25 @@ import tyro
 from ctsim.benchmarks.engine.terminal import complain
 from ctsim.errors import InputError
 
+
+class Command(NamedTuple):
+    """A sub-command of `run-benchmark`: the module with its `main`, and what it does."""
+
+    module: str
+    about: str
+
+
 OTHERS = {
-    "methods": "ctsim.benchmarks.list_methods",
-    "inspect": "ctsim.benchmarks.studies.inspect",
-    "pareto": "ctsim.benchmarks.studies.pareto.study",
-    "peers": "ctsim.benchmarks.studies.peers.study",
-    "reproduce": "ctsim.benchmarks.studies.claims",
-    "skipping": "ctsim.benchmarks.studies.skipping.study",
-    "report": "ctsim.reports.report",
-    "ablation": "ctsim.benchmarks.studies.ablation",
-    "paper-tables": "ctsim.benchmarks.studies.paper.tables",
-    "stress": "ctsim.benchmarks.studies.stress.study",
+    "methods": Command("ctsim.benchmarks.list_methods", "list the methods, what they need, and their parameters"),
+    "report": Command("ctsim.reports.report", "write results as one HTML page with the slices of every volume"),
+    "inspect": Command("ctsim.benchmarks.studies.inspect", "score one volume by other conventions of PSNR and SSIM"),
+    "pareto": Command("ctsim.benchmarks.studies.pareto.study", "error against run time, simulator and methods"),
+    "skipping": Command("ctsim.benchmarks.studies.skipping.study", "what ctsim leaves out: time saved, error made"),
+    "stress": Command("ctsim.benchmarks.studies.stress.study", "extreme scenes for the simulator and every method"),
+    "peers": Command("ctsim.benchmarks.studies.peers.study", "time and error against RTK and XCIST"),
+    "reproduce": Command("ctsim.benchmarks.studies.claims", "check what is claimed of FDK, LIMAR and NMAR"),
+    "paper-tables": Command("ctsim.benchmarks.studies.paper.tables", "the paper's tables next to measured numbers"),
+    "ablation": Command("ctsim.benchmarks.studies.ablation", "run the paper's ablations of its splat method"),
 }
 EXIT_USER, EXIT_INTERRUPTED = 2, 130
 
@@ -43,8 +52,13 @@ def run_benchmark() -> int:
     """Run `run-benchmark` or one of its subcommands, the keys of `OTHERS`; return the exit code."""
     arguments = sys.argv[1:]
     if arguments and arguments[0] in OTHERS:
-        return guarded(f"run-benchmark {arguments[0]}", OTHERS[arguments[0]], arguments[1:])
-    return guarded("run-benchmark", "ctsim.benchmarks.studies.methods.study", arguments)
+        return guarded(f"run-benchmark {arguments[0]}", OTHERS[arguments[0]].module, arguments[1:])
+    try:
+        return guarded("run-benchmark", "ctsim.benchmarks.studies.methods.study", arguments)
+    finally:
+        if {"-h", "--help"} & {*arguments}:
+            lines = "".join(f"  {name:14}{command.about}\n" for name, command in OTHERS.items())
+            sys.stdout.write(f"Other commands, each with its own --help (run-benchmark NAME --help):\n{lines}")
 
 
 def guarded(name: str, module: str, arguments: list[str], *, resumes: bool = True) -> int:

@@ -335,8 +335,18 @@ def test_a_dataset_of_other_scans_is_refused(case, results, monkeypatch):
 
 
 def test_every_subcommand_names_a_module_that_is_there():
-    for name, module in cli.OTHERS.items():
-        assert importlib.util.find_spec(module) is not None, name
+    for name, command in cli.OTHERS.items():
+        assert importlib.util.find_spec(command.module) is not None, name
+
+
+def test_help_lists_every_subcommand(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["run-benchmark", "--help"])
+    with pytest.raises(SystemExit) as end:
+        cli.run_benchmark()
+    lines = capsys.readouterr().out.splitlines()
+    assert not end.value.code
+    for name, command in cli.OTHERS.items():
+        assert f"  {name:14}{command.about}" in lines and len(command.about) < 66
 
 
 def test_the_readmes_command_is_understood():

@@ -27,7 +27,7 @@ def forms() -> dict[str, type]:
     from ctsim.benchmarks.cli import OTHERS
 
     names = {"make-dataset": "ctsim.benchmarks.make_dataset", "run-benchmark": "ctsim.benchmarks.studies.methods.study"}
-    names |= {f"run-benchmark {name}": module for name, module in sorted(OTHERS.items())}
+    names |= {f"run-benchmark {name}": command.module for name, command in sorted(OTHERS.items())}
     return {name: form_of(importlib.import_module(module)) for name, module in names.items()}
 
 
