@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ctsim.geometry import Geometry
 
-SIGMAS, LEAST = 5.0, 0.02  # a ray is attenuated above so many standard deviations of photon noise, and above this
+SIGMAS, LEAST = 5.0, 0.02  # a ray is attenuated above this many standard deviations of photon noise, and above this
 SHARE = 1e-3  # of a side's pixels; a tenth of that, of all rays, where they miss the grid
 
 

@@ -127,7 +127,7 @@ class Known(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 def water_precorrection(scan: Scan, settings: Known) -> Volume:
     """Reconstruct `scan` by FDK of line integrals that a table for water made linear in its length.
 
-    The scale is that of the effective spectrum. Keywords are those of `Known`. Exact for water alone; beside metal the
+    The scale is that of the effective spectrum. Keywords are those of `Known`. Exact for water alone; near metal the
     streaks become worse. Raises InputError as `Beam.of` and FDK do.
     """
     beam = Beam.of(scan, settings.tube, settings.detector)

@@ -99,7 +99,7 @@ def auto_mask(volume: NDArray[np.float32]) -> Metal:
     The metal's value is the 90th percentile of what exceeds a quarter of the maximum; half of it is the threshold.
     Components of fewer than 8 voxels are dropped, holes filled. A fixed multiple of water does not serve: the
     best was 20 for Fe, 10 for Ti and 4 for Al. Where the metal does not stand out from the densest of the body
-    the mask is doubted, since correcting beside bone does more harm than leaving it; so it is where most of it is
+    the mask is doubted, since correcting next to bone does more harm than leaving it; so it is where most of it is
     far from the metal's value (0.64 of the mask where enamel was in it, 0.08 and 0.17 with Fe and Al alone).
     """
     top = float(volume.max(initial=0.0))
@@ -178,7 +178,7 @@ class Trace:
 
     A pixel within `reach` of the shadow belongs to it where it is darker than all around that are out of reach, as
     metal only darkens. What the edge left out made up to all of NMAR's error on iron, while bridging pixels that hold
-    no metal cost up to a sixth of LIMAR's. `dilation` widens the shadow by so many pixels instead.
+    no metal cost up to a sixth of LIMAR's. `dilation` widens the shadow by this many pixels instead.
     """
 
     def __init__(self, metal: Metal, scan: Scan, dilation: int | None = None) -> None:

@@ -51,7 +51,7 @@ class Choice:
 
     @property
     def view_updates(self) -> int:
-        """How often each view was backprojected for it, beside FDK."""
+        """How often each view was backprojected for it, in addition to FDK."""
         return int("limar" in self.misfit)
 
 
@@ -126,6 +126,6 @@ def _beside(trace: Trace, view: int, q: Array) -> Array:
     v, u = reach(trace.geometry)
     window = around(shadow, (v + RING, u + RING))
     p, clamped = trace.logarithm.of(view)
-    inner = spread(shadow[window], (v, u))  # what little metal is left there would be held against both
+    inner = spread(shadow[window], (v, u))  # what little metal is left there would count against both
     ring = dilate(inner, RING) & ~inner & ~clamped[window]
     return (p - q)[window][ring]

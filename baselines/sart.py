@@ -27,7 +27,7 @@ from ctsim.types import Scan, Volume
 
 Relaxation = Annotated[float, about("share of what rays lack that a step adds; converges below 2", gt=0, le=10)]
 Positivity = Annotated[bool, about("cut negative values to zero")]
-CACHE_BYTES = 1 << 30  # voxel sums of the subsets are kept up to this size, else made anew on each visit
+CACHE_BYTES = 1 << 30  # voxel sums of the subsets are kept up to this size, else computed on each visit
 
 
 class Sart(Iterations, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -28,7 +28,7 @@ def read_array(path: Path, shape: tuple[int, ...] | None = None) -> NDArray[Any]
         return _npy(path, shape) if path.suffix == ".npy" else _tiff(path, shape)
     except (InputError, MemoryError):
         raise
-    except Exception as error:  # whatever a decoder says of a file that is not one
+    except Exception as error:  # decoders raise anything for a file that is not theirs
         said = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path} is no TIFF stack or .npy array: {said}") from None
 

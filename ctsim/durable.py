@@ -1,6 +1,6 @@
 """Files that survive: flushed, replaced whole, and finished folders put in their place.
 
-A file that is to replace another is written beside it, under a name that no other process uses, and renamed.
+A file that is to replace another is written next to it, under a name that no other process uses, and renamed.
 """
 
 import contextlib
@@ -65,7 +65,7 @@ def sync_tree(folder: Path) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a new, empty file beside `path`, which takes its place when the block ends, and is removed if it fails.
+    """Yield a new, empty file next to `path`, which takes its place when the block ends, and is removed if it fails.
 
     Processes that replace the same file do not meet: the last to end has its way. What killed ones left in the folder
     is removed. Raises OSError with the name of `path` where it cannot be written.
@@ -109,7 +109,7 @@ def sweep(folder: Path) -> None:
 def write_synced(path: Path, data: bytes) -> None:
     """Replace a small file whole: after a crash it holds the old or the new bytes.
 
-    Raises OSError with its name where it cannot be written, and leaves nothing beside it.
+    Raises OSError with its name where it cannot be written, and leaves no temporary file.
     """
     with replacing(path) as new, new.open("wb") as file:
         file.write(data)

@@ -1,4 +1,4 @@
-"""A data folder as the next run finds it: which scenes are finished, and what ended runs left beside them.
+"""A data folder as the next run finds it: which scenes are finished, and what ended runs left next to them.
 
 A scene is written in `.NAME.partial/` under the lock `.NAME.lock`; a scene that is replaced waits as `.NAME.old`.
 """
@@ -60,7 +60,7 @@ def unfinished(data_dir: Path) -> dict[str, Progress]:
 
 
 def finished(data_dir: Path, name: str, scene_id: str) -> mf.Manifest | None:
-    """Return the manifest of this very scene where it is there, finished, whatever code made it; reads only.
+    """Return the manifest of this very scene where it is there, finished, by any code; reads only.
 
     Raises
     ------
@@ -94,15 +94,15 @@ def recover(data_dir: Path) -> None:
 
 
 def tidy(data_dir: Path, scenes: Iterable[mf.Manifest]) -> list[str]:
-    """Remove what ended runs left beside finished scenes; return what is to be said of it.
+    """Remove what ended runs left next to finished scenes; return what is to be said of it.
 
     An unfinished replacement is removed where it would become what is already there. What somebody writes just now
     stays, and on a disk that cannot be written to all stays.
     """
-    beside = {path.name for path in data_dir.glob(".*")}
+    hidden = {path.name for path in data_dir.glob(".*")}
     said = []
     for scene in scenes:
-        left = any(f".{scene.name}{end}" in beside for end in (".partial", ".lock", ".old"))
+        left = any(f".{scene.name}{end}" in hidden for end in (".partial", ".lock", ".old"))
         if not left and not os.path.exists(f"{data_dir}/{scene.name}/{mf.PROGRESS}"):
             continue
         folder, partial = data_dir / scene.name, partial_of(data_dir, scene.name)
@@ -117,7 +117,7 @@ def tidy(data_dir: Path, scenes: Iterable[mf.Manifest]) -> list[str]:
 
 
 def _tidy(folder: Path, partial: Path, scene: mf.Manifest) -> list[str]:
-    """Tidy up beside a finished scene whose lock is held."""
+    """Remove what ended runs left of a finished scene; its lock is held."""
     durable.recover(folder)
     (folder / mf.PROGRESS).unlink(missing_ok=True)  # the run ended between the rename and this
     if not partial.is_dir():
@@ -147,7 +147,7 @@ def remarks(data_dir: Path) -> list[str]:
 
 
 def other_code(scenes: Sequence[mf.Manifest | mf.IndexLine], of: int) -> str:
-    """Say which of so many finished scenes were made by other code than this; empty where none was."""
+    """Say which of the `of` finished scenes were made by other code than this; empty where none was."""
     if not scenes:
         return ""
     names = listing([scene.name for scene in scenes])

@@ -164,7 +164,7 @@ def read_index(data_dir: Path) -> dict[str, IndexLine]:
 
 
 def append_index(data_dir: Path, *manifests: Manifest) -> None:
-    """Append the lines of finished scenes to the index, those apart that are already the last word on their name."""
+    """Append the lines of finished scenes to the index, except those that are already the last of their name."""
     entries = [IndexLine(name=m.name, scene_id=m.scene_id, content_hash=m.content_hash, code=m.code) for m in manifests]
     with locked(data_dir / INDEX) as handle:
         cut_torn(handle)

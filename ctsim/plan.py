@@ -53,7 +53,7 @@ class Output:
 class Plan:
     """The work for one scan. `seconds` is an estimate for this machine, the only entry that differs between runs.
 
-    `materials` are those that are met, air first. In P = −ln(signal/open), `error` is the greatest found of the
+    `materials` are the ones that rays meet, air first. In P = −ln(signal/open), `error` is the greatest found of the
     energy quadrature and `edge_error` is the largest found in eight windows at edges of inserts, in one view (see
     `ctsim.survey`); `l0` is the median water-equivalent path of the body in mm. `memory_bytes` estimates the arrays;
     Python and its libraries take a quarter of a gigabyte more. `notes` are those of `ctsim.notes`.

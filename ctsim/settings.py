@@ -1,4 +1,4 @@
-"""How a scan is simulated and which ground truth is written beside it."""
+"""How a scan is simulated and which ground truth is written with it."""
 
 from typing import Annotated
 

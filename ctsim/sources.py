@@ -15,7 +15,7 @@ TEXT, TABLES = ".py", ".npz"  # what a package's results depend on; `NOTICE.txt`
 
 @functools.cache
 def source_hash() -> str:
-    """Return 16 hexadecimal digits for the sources that make data, remembered as those that this process runs."""
+    """Return 16 hexadecimal digits for the sources that make data, remembered as this process runs them."""
     return hash_of(resources.files("ctsim"))
 
 

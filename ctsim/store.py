@@ -32,7 +32,7 @@ _TWIN = "metal_free/"
 class StoredScan:
     """A finished scan on disk. `scan` is what a method gets; the rest is ground truth for judging it.
 
-    It holds no open file: arrays are memory-mapped when they are asked for, each time anew and copy-on-write, so that
+    It holds no open file: arrays are memory-mapped when they are asked for, each time again and copy-on-write, so that
     nothing is read before it is used and neither the files nor another one's arrays ever change. `info` is scan.json;
     `code` hashes the code of the simulator that made it (empty: not noted); `metal_free` is the paired twin.
     """
@@ -49,7 +49,7 @@ class StoredScan:
 
     @property
     def scan(self) -> "Scan":
-        """Map the scan anew: what is written into it stays with the one who asked.
+        """Map the scan again: what is written into it stays with the one who asked.
 
         Raises
         ------

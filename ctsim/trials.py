@@ -1,6 +1,6 @@
 """Path lengths on which an energy rule is tried: in steps of a factor while they are thin, of P while they are thick.
 
-A signal is a sum of e^(−μL). Against log L each of these has the same shape, whatever its μ, so that steps of one
+A signal is a sum of e^(−μL). Against log L each of these has the same shape for every μ, so that steps of one
 factor resolve them all. Behind a thick path what differs between energies decides, over steps of P.
 """
 

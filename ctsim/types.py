@@ -135,7 +135,7 @@ class Scan:
         """Return the scan whose −log projections are `p` [view, v, u], for measurements that are no longer counts.
 
         `i0` is how many photons an open pixel saw: readings below half a photon, p above ln(2 i0), count as nothing
-        seen, as do those that are not finite. Raises InputError as `Scan` does.
+        seen, as do values that are not finite. Raises InputError as `Scan` does.
         """
         import torch
 

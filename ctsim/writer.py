@@ -1,4 +1,4 @@
-"""Writing a scan: view by view beside its final place, then renamed.
+"""Writing a scan: view by view next to its final place, then renamed.
 
 A scene is written into `DATA/.NAME.partial/`. Stacks are uncompressed TIFF files of full size from the
 start; views are written at their offset as they are made, so memory does not grow with their number.
@@ -48,7 +48,7 @@ class SceneWriter:
     """Writes one scene; a context manager that holds the scene's lock.
 
     `first_view` is the view to go on from. Leaving the context without `finish` keeps what is there. What other
-    code began is begun anew.
+    code began starts again.
 
     Raises
     ------

@@ -215,7 +215,7 @@ def _ribs(canvas: Canvas, rng: np.random.Generator, pairs: int, wall: Wall) -> N
     """Ribs from the spine around the cage, falling from back to front, with marrow; cartilage to the sternum."""
     a, b = wall.cage
     t = np.linspace(0.0, 1.0, 49)
-    turn = np.radians(12 + 150 * t)  # from beside the spine, round the flank, to the front
+    turn = np.radians(12 + 150 * t)  # from next to the spine, round the flank, to the front
     round_ = (np.abs(np.sin(turn)) ** POWER + np.abs(np.cos(turn)) ** POWER) ** (-1 / POWER)
     neck = 6  # points from the head at the vertebra over the transverse process to the cage
     for k in range(pairs):

@@ -139,7 +139,7 @@ def _inserts(hu: NDArray[np.float32], params: CtVolume, unit: float, rng: np.ran
         return []
     make, d = inserts(params, unit), diameter(params, min(WIDEST, WIDEST * 30 / unit), unit)
     limit = REACH * unit - LENGTH / 2 * d
-    places = np.array(params.at) if params.at else _drawn(hu, params, limit, (rng, n))
+    places = np.array(params.at) if params.at else _drawn(hu, params, limit, rng, n)
     if np.hypot(*places[:, :2].T).max() > limit or np.abs(places[:, 2]).max() > limit:
         raise InputError(
             f"at: inserts {LENGTH * d:.3g} mm long must be centred within {limit:.4g} mm of the axis and of the middle"
@@ -151,14 +151,13 @@ def _inserts(hu: NDArray[np.float32], params: CtVolume, unit: float, rng: np.ran
 
 
 def _drawn(
-    hu: NDArray[np.float32], params: CtVolume, limit: float, of: tuple[np.random.Generator, int]
+    hu: NDArray[np.float32], params: CtVolume, limit: float, rng: np.random.Generator, n: int
 ) -> NDArray[np.float64]:
-    """Draw so many places (x, y, z) in mm from the file's own voxels, whatever the label grid: bone, or else tissue."""
+    """Draw n places (x, y, z) in mm from the file's own voxels, independent of the label grid: bone, or else tissue."""
     z, y, x = ((np.arange(k) + 0.5 - k / 2) * d for k, d in zip(hu.shape, params.spacing, strict=True))
     near = (np.abs(z)[:, None, None] <= limit) & (np.hypot(y[:, None], x) <= limit)
     for least in (FROM_HU[-1], FROM_HU[0]):
         if (found := np.flatnonzero((hu >= least) & near)).size:
-            rng, n = of
             k, j, i = np.unravel_index(rng.choice(found, n, replace=n > found.size), hu.shape)
             return np.stack([x[i], y[j], z[k]], 1)
     raise InputError(

@@ -73,7 +73,7 @@ def _structs(spec: inspect.Type) -> list[inspect.StructType]:
 
 
 def _chosen(spec: inspect.Type, data: Any) -> inspect.Type:
-    """Return the member of a union that the data names, or the only one beside null, else the union."""
+    """Return the member of a union that the data names, or the only one that is not null, else the union."""
     if not isinstance(spec, inspect.UnionType):
         return spec
     members = [t for t in spec.types if not isinstance(t, inspect.NoneType)]

@@ -18,7 +18,7 @@ from ctsim.scatter import Scatter
 from ctsim.spectrum import Filter, Tube
 from ctsim.types import Scanner
 
-MARGIN = 1.06  # air beside the object's shadow, so that filters and flat-field checks see open pixels
+MARGIN = 1.06  # air around the object's shadow, so that filters and flat-field checks see open pixels
 
 
 class Machine(NamedTuple):

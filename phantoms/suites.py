@@ -1,4 +1,4 @@
-"""Files of `[[scene]]` tables over an optional `[defaults]`, whatever a scene is.
+"""Files of `[[scene]]` tables over an optional `[defaults]`, for any kind of scene.
 
 What is wrong is an `InputError` that names the file, the key's path and what was expected.
 """
@@ -79,7 +79,7 @@ def scenes_of(data: Mapping[str, Any], kind: type[S], where: str) -> tuple[S, ..
 
 
 def _check_names(names: Sequence[str], where: str) -> None:
-    """Refuse a name that is there twice, or twice but for its case, which some disks do not tell apart."""
+    """Refuse a name that is there twice, or twice but for its case, which some disks do not distinguish."""
     known: dict[str, str] = {}
     for name in names:
         if (other := known.get(name.casefold())) is not None:

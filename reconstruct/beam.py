@@ -45,7 +45,7 @@ def known_detector(given: Given | Detector) -> Detector:
 
 
 def check_tables(tube: Given, detector: Given) -> None:
-    """Raise InputError, as `known_tube` and `known_detector` do, for tables that are wrong whatever the scan."""
+    """Raise InputError, as `known_tube` and `known_detector` do, for tables that are wrong for every scan."""
     if tube is not None:
         known_tube(tube, Tube().kvp)
     if detector is not None:

@@ -101,7 +101,7 @@ def add_fdk(
     through: FDK is linear, so a correction of few rows need not reconstruct the rest again.
     """
     last = geometry.n_detector[0]
-    rows = slice(max(rows.start - 1, 0), min(rows.stop + 1, last))  # the 0 beside them belongs to their interpolation
+    rows = slice(max(rows.start - 1, 0), min(rows.stop + 1, last))  # the 0 next to them belongs to their interpolation
     planes = _planes(geometry, rows)
     if planes.stop <= planes.start:
         return

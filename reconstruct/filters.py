@@ -52,7 +52,7 @@ def window_gain(frequency: NDArray[np.float64], window: str = "ram-lak", cutoff:
 
 
 def ramp_response(n: int, spacing: float, window: str = "ram-lak", cutoff: float = 1.0) -> NDArray[np.float32]:
-    """Return the gain for the real FFT of rows of `n` samples `spacing` mm apart: [n//2 + 1], 1/mm.
+    """Return the gain for the real FFT of rows of `n` samples `spacing` mm from each other: [n//2 + 1], 1/mm.
 
     The sampling step of the convolution integral is included.
     """

@@ -25,7 +25,7 @@ def count_floor(scan: Scan) -> float:
 
 
 def is_blind(scan: Scan, clamped: int) -> bool:
-    """Say whether so many clamped pixels are all that a scan has, so that it shows nothing."""
+    """Say whether this many clamped pixels are all that a scan has, so that it shows nothing."""
     return clamped >= scan.counts.numel()
 
 

@@ -32,7 +32,7 @@ def about(
 ) -> msgspec.Meta:
     """Annotate a parameter: what it is, its unit, and its bounds.
 
-    `also` is a type that Python callers may pass beside what the annotated type says.
+    `also` is a type that Python callers may pass in addition to what the annotated type says.
     """
     bounds: dict[str, Any] = {"ge": ge, "gt": gt, "le": le}
     return msgspec.Meta(description=what, extra={"unit": unit, "also": also}, **bounds)

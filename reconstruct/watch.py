@@ -61,7 +61,7 @@ _listener: contextvars.ContextVar[tuple[OnProgress, float] | None] = contextvars
 
 @contextlib.contextmanager
 def listen(on_progress: OnProgress, *, every: float = 1.0) -> Iterator[None]:
-    """Call `on_progress` about every so many seconds of every splat fit run within, in this thread."""
+    """Call `on_progress` about every `every` seconds of every splat fit run within, in this thread."""
     token = _listener.set((on_progress, every))
     try:
         yield

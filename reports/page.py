@@ -35,7 +35,7 @@ TITLES = {
     "anchored": "Anchored scores and harm",
     "cost": "Cost",
 }
-_BOX = '<input type="checkbox" autocomplete="off"'  # a reloaded page starts anew
+_BOX = '<input type="checkbox" autocomplete="off"'  # a reloaded page starts again
 SIGNED_STOPS = 17  # of the error colours; the browser interpolates between them
 
 
@@ -171,7 +171,7 @@ def _caption(kept: Kept) -> str:
 
 
 def _images(case: Case, frame: slices.Frame, start: int, done: Callable[[], Any]) -> dict[str, Any]:
-    """Encode every slice of every volume; `said` is what stands beside the slider."""
+    """Encode every slice of every volume; `said` is the text next to the slider."""
     heights, total = case.stored.geometry.voxel_centres()[0], case.truth.metal.shape[0]
     stencils = [slices.metal_stencils(case, frame, z) for z in frame.z]
 

@@ -2,7 +2,7 @@
 
 The table holds, on kVp × take-off angle × E/kVp, the logarithm of the unfiltered continuum divided by
 (kvp/E − 1) and by Philibert's self-absorption, which takes the anode's absorption edges out of it, and
-the lines apart. No air. Needs the extra `spekpy`; the table is derived from SpekPy's (see the notice).
+the lines separately. No air. Needs the extra `spekpy`; the table is derived from SpekPy's (see the notice).
 """
 
 import math
@@ -31,7 +31,7 @@ def _spectrum(kvp: float, angle: float, dk: float, brem: bool) -> tuple[np.ndarr
 
 
 def main() -> None:
-    """Compute every node and write the table beside this file."""
+    """Compute every node and write the table next to this file."""
     log_g = np.zeros((KVP.size, ANGLES_DEG.size, U.size), np.float32)
     log_line = np.full((KVP.size, ANGLES_DEG.size, len(WINDOWS)), np.nan, np.float32)
     line_energy = np.zeros(len(WINDOWS))

@@ -46,7 +46,7 @@ def _tiles(shape: tuple[int, ...], grid: NDArray[np.float64]) -> NDArray[np.int6
     for n, d, off, size in ((n_y, grid[1], grid[4], TILE_Y), (n_x, grid[2], grid[5], TILE_X)):
         centres = (np.arange(n) + 0.5 - n / 2) * d + off
         nearest.append([float(np.min(centres[i : i + size] ** 2)) for i in range(0, n, size)])
-    # A lower bound on the distance: y and x minimised apart.
+    # A lower bound on the distance: y and x minimised separately.
     inside = np.add.outer(nearest[0], nearest[1]) <= grid[6] ** 2
     # argwhere gives Fortran order unless there is one tile; the kernel is compiled for one layout only.
     return np.ascontiguousarray(np.argwhere(inside) * np.array([TILE_Y, TILE_X]))

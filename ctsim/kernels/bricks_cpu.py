@@ -124,7 +124,7 @@ def walk(code, slot, pool, density, grid, ray, t_from, t_to, pieces):
                 last = label
                 pieces[n, 0], pieces[n, 1] = min(at, stop) * (1.0 / FIXED), label
                 pieces[n, 2] = density[cell] if dense else 1.0
-                # no branch tells the axes apart: a wrong guess costs more than the additions
+                # no branch distinguishes the axes: a wrong guess costs more than the additions
                 gx, gy, gz = -np.int64(cx == leave), -np.int64(cy == leave), -np.int64(cz == leave)
                 x += sx & gx
                 y += sy & gy

@@ -142,7 +142,7 @@ def _fill_block(volume, filled, shape, lines, size, rows, view, u_0, projections
 
 @njit(inline="always", error_model="numpy")
 def _cross(i, j, n_j, across, along):
-    """Return the two voxel columns beside place j on plane i, and their weights; a missing one weighs nothing."""
+    """Return the voxel columns at place j on plane i and at the next, and their weights, 0 for a missing one."""
     low = int(math.floor(j))
     part = j - low
     left, right = i * along + low * across, i * along + (low + 1) * across

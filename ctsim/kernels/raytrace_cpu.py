@@ -230,7 +230,7 @@ def _cast(volume, solids, pose, at, count, background, edge_mu, work):
 def _edges(volume, solids, pose, v, columns, background, rule, edge, changes, bounds, m1, m2):
     """Measure again, by several rays each, the pixels of a row that the edge of a solid crosses.
 
-    A pixel whose mean is uncertain by more than the tolerance is measured anew by more rays.
+    A pixel whose mean is uncertain by more than the tolerance is measured again by more rays.
     """
     prims, fat, shadow, active, near = solids
     mu, w1, w2 = rule

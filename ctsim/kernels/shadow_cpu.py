@@ -29,5 +29,5 @@ def cast_hulls(us, vs, behind, margin_v, margin_u, n_u, out):
                     out[v, p, 0] = min(out[v, p, 0], max(int(np.floor(left)) - margin_u, -1))
                     out[v, p, 1] = max(out[v, p, 1], min(int(np.ceil(right)) + margin_u, n_u))
         for v in range(n_v):
-            if out[v, p, 1] < 0 or out[v, p, 0] > n_u - 1:  # beside the detector
+            if out[v, p, 1] < 0 or out[v, p, 0] > n_u - 1:  # off the detector
                 out[v, p, 0], out[v, p, 1] = n_u, -1

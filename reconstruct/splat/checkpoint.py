@@ -72,7 +72,7 @@ class Checkpoint:
 
     def damaged(self, why: object) -> InputError:
         """Return the error of a file that holds no state to go on from."""
-        return InputError(f"checkpoint {self.path} is damaged ({why}): delete it to start anew")
+        return InputError(f"checkpoint {self.path} is damaged ({why}): delete it to start again")
 
     def remove(self) -> None:
         """Delete the file, if there is one, and what a run left that was killed while it wrote one."""

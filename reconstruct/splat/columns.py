@@ -31,8 +31,8 @@ class LatticeProjector:
         self.by_columns = not exact and _upright(self._projector.cameras)
         if self.by_columns:
             places = lattice.positions[:, :2]
-            apart = np.any(places[1:] != places[:-1], axis=1) | (np.diff(lattice.index) != 1)
-            starts = np.unique(np.concatenate([[0], np.flatnonzero(apart) + 1, [len(lattice)]])).astype(np.int64)
+            breaks = np.any(places[1:] != places[:-1], axis=1) | (np.diff(lattice.index) != 1)
+            starts = np.unique(np.concatenate([[0], np.flatnonzero(breaks) + 1, [len(lattice)]])).astype(np.int64)
             z = np.pad(lattice.positions[None, :, 2], [(0, 0), (0, WIDTH)])
             self._runs = (places[starts[:-1]].astype(np.float64), starts, z, int(np.diff(starts).max(initial=0)))
 

@@ -47,7 +47,7 @@ def densify(
     two of half the density at the same place, and a larger one two of half the density, scales by 1.6 down, at places
     drawn from itself. Then those fainter than `faint` in all channels, those whose centre has left the volume of
     `geometry`, and any that are not finite, are removed.
-    Where the cap allows fewer, those that are pulled most are chosen. `key` names the stream of random numbers.
+    Where the cap allows fewer, the ones that are pulled most are chosen. `key` names the stream of random numbers.
     """
     if splats.rotations is None:
         raise InputError("the published methods learn rotations; expected splats that have some")

@@ -26,7 +26,7 @@ from ctsim.reconstruct.splat.response import Response
 
 LEAST_VALUE = 0.005  # 1/mm, of a voxel that may be a seed
 NEIGHBOURS = 3  # whose distance is a splat's first scale
-LEAST_DENSITY = 1e-10  # per unit, to which densities are raised when they are learned anew
+LEAST_DENSITY = 1e-10  # per unit, to which densities are raised when learning starts again
 RESPONSE_RATE = 1e-3
 
 

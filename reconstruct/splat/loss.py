@@ -46,7 +46,7 @@ def total_variation(volume: Image) -> tuple[float, Image]:
 
 
 def brick(geometry: Geometry, scene: str, step: int, edge: int = BRICK) -> Geometry:
-    """Return `geometry` with a part of its grid, `edge` voxels a side where it has so many, at a random place.
+    """Return `geometry` with a part of its grid, `edge` voxels a side where it has that many, at a random place.
 
     The place depends on the scene's name and the step alone.
     """

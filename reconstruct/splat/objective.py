@@ -92,7 +92,7 @@ class Objective:
     def line_integrals(self, paths: Array, response: Response) -> tuple[Array, list[Array] | list[np.float32]]:
         """Return P [v, u + 8], and its derivative by each channel's path value."""
         if self.settings.basis == "constant":
-            return paths[0], [np.float32(1)]  # whatever the response, whose shares sum to 1
+            return paths[0], [np.float32(1)]  # for any response, whose shares sum to 1
         p, by_a, by_b = responses.evaluate(response, *self._both(paths))
         return p, [by_b] if self.settings.basis == "photoelectric" else [by_a, by_b]
 

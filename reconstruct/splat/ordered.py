@@ -29,7 +29,7 @@ SUBSET, LEAST_SUBSETS = 10, 8
 STEEPEST = 0.8
 """Greatest gain of the ramp, as a share of the views in a subset."""
 REST, A_PASS = 4, 6
-"""Denoisings are so many subsets apart, but six in a long pass; so are measurements of the curvature in the first."""
+"""Subsets between two denoisings, six in a long pass; in the first pass also between measurements of the curvature."""
 SMOOTHING = 8  # iterations of a denoising
 SETTLED = 4
 """The pass whose denoising is as asked for, or the last; from there back to the first it is twice as strong in each.
@@ -37,8 +37,7 @@ SETTLED = 4
 What is then smoothed away too far is regained from the data, while streaks come back slowly.
 """
 SHORTER = 2
-"""So many last passes, but one where there are three or fewer, shorten their steps as 1/(1 + t) after t passes: to 1/2
-after one, 1/3 after two.
+"""The last two passes, or one of three and fewer, shorten their steps as 1/(1 + t) after t passes: to 1/2, then 1/3.
 
 Subsets that disagree, by noise or by what no model explains, would keep the fit from settling.
 """
@@ -187,12 +186,12 @@ def n_subsets(n_views: int) -> int:
 
 
 def step_length(done: float, passes: int) -> float:
-    """Return the length of a step after `done` of so many passes."""
+    """Return the length of a step after `done` of the passes."""
     return 1 / (1 + max(done - passes + min(SHORTER, max(passes // 2, 1)), 0))
 
 
 def bit_reversed(n: int) -> list[int]:
-    """Return 0 … n − 1 in the order of their reversed bits, which keeps successive subsets far apart."""
+    """Return 0 … n − 1 in the order of their reversed bits, which keeps successive subsets far from each other."""
     bits = max(n - 1, 0).bit_length()
     order = (int(f"{k:0{bits}b}"[::-1], 2) if bits else 0 for k in range(1 << bits))
     return [k for k in order if k < n]

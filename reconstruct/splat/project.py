@@ -18,7 +18,7 @@ CUTOFF = 3.5
 """Mahalanobis radius beyond which a splat is zero."""
 TOLERANCE = 1e-3
 """A splat is projected exactly where EWA would leave out more than this share of its peak: 0 always, inf never."""
-MANY_VIEWS = 8  # from so many on a thread takes whole views
+MANY_VIEWS = 8  # from this many on a thread takes whole views
 TASKS = 2  # bands of rows a thread: splats over two bands are begun twice
 
 
@@ -101,7 +101,7 @@ class Projector:
     def gradient(self, splats: Splats, images: NDArray[np.float32], view: int) -> Gradient:
         """Return the gradient of a loss whose derivative by view `view` is `images` [channel, v, u + 8].
 
-        It is that of the EWA form whatever the tolerance is (a Projector of infinite tolerance has no other), and
+        It is that of the EWA form for every tolerance (a Projector of infinite tolerance has no other), and
         knows no cutoff. One channel a density. Raises InputError for wrong shapes, and a view that does not exist.
         """
         (chosen,), (n_v, n_u) = view_indices(self.geometry, [view]), self.geometry.n_detector

@@ -186,7 +186,7 @@ def read_out(splats: Splats, response: Response, objective: Objective) -> tuple[
     """Return by what each density counts in the volume, float32 [channel], and in words at which energy that is.
 
     "hardened" reads what one more mm adds to P behind the median path of the rays that meet something: attenuation in
-    the beam as the object leaves it, which the data fix whatever the response is.
+    the beam as the object leaves it, which the data fix for any response.
     """
     settings = objective.settings
     if settings.basis == "constant":

@@ -259,7 +259,7 @@ def _signal(spectrum: tuple[ArrayLike, ArrayLike], e_max: float) -> Spectrum:
 
 def _reduced(signal: Spectrum, basis: Basis, e_max: float, nodes: int | None) -> tuple[Array, Array]:
     """Return the Gauss nodes and weights of a detected spectrum: `nodes` of them, or the fewest for TOLERANCE."""
-    # the rule wants photons and a detector apart, so the latter's response is divided out first
+    # the rule wants photons and a detector separately, so the latter's response is divided out first
     deposited, _ = deposit(SCINTILLATOR, signal.energies)
     photons = Spectrum(energies=signal.energies, weights=_normalised(signal.weights / deposited))
     if nodes is not None:

@@ -13,7 +13,7 @@ from numba.extending import intrinsic
 from ctsim.kernels.exp_cpu import as_float, exp_minus
 
 BLOCK = 256  # pixels whose intermediate sums stay in the L1 cache
-CHUNK = 4096  # pixels of one task; sums over pixels are taken chunk by chunk, whatever the number of threads
+CHUNK = 4096  # pixels of one task; sums over pixels are taken chunk by chunk, for any number of threads
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 LN2 = np.float32(np.log(2.0))
 THIRD, FIFTH, SEVENTH, NINTH = (np.float32(1 / n) for n in (3, 5, 7, 9))
@@ -72,7 +72,7 @@ def _smallest(nodes, la, lb, n, low):
 def _block(nodes, offset, pixels, out, scratch):
     """Evaluate up to BLOCK pixels: `pixels` (la, lb) into `out` (p, dp_da, dp_db).
 
-    No loop writes more than two arrays: with three, LLVM gives up proving them apart and does not vectorise.
+    No loop writes more than two arrays: with three, LLVM gives up proving them distinct and does not vectorise.
     """
     da, db, cost = nodes
     a0, b0 = offset

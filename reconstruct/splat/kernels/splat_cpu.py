@@ -39,7 +39,7 @@ from ctsim.reconstruct.splat.kernels.lanes import (
 )
 
 CHUNKS = 16  # of splats at least, one a task
-ROWS = 32  # rows by multiplication before the exponentials are taken anew
+ROWS = 32  # rows by multiplication before the exponentials are computed again
 STEEP = 110.0  # −2 log of the faintest value that multiplication may start from
 CHANGE = 50.0  # −2 log of what multiplication may make of a fainter one: e^(25 − 55) of the peak is nothing
 UPRIGHT, NARROWEST = 0.1, 12.5  # C_uv/C_vv and C_vv up to which a change, (cutoff + 0.8 √C_vv)², stays below it
@@ -258,7 +258,7 @@ def _start(fp, column, dv, n_u):
 def add_splat(fp, values, i, cutoff, image, n_u, rows):
     """Add values[i, c]·w to the image of every channel, one or two, in the half-open range of rows.
 
-    Multiplication starts anew where rows are multiples of ROWS, which `rows` must be, too.
+    Multiplication starts again where rows are multiples of ROWS, which `rows` must be, too.
     """
     n_c = values.shape[1]
     n_v = image.shape[0] // n_c

@@ -41,7 +41,7 @@ def _along(wide, taps, out):
 def _similarity(means, moments, constants, parts, ssim):
     """Write SSIM of a row [u] and its derivatives by the blurs of x, x² and x·y into `parts` [3, u].
 
-    No loop writes more than two arrays: with three, LLVM gives up proving them apart and does not vectorise.
+    No loop writes more than two arrays: with three, LLVM gives up proving them distinct and does not vectorise.
     """
     mean_x, mean_y = means
     square_x, square_y, product = moments

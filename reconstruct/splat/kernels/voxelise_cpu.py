@@ -18,7 +18,7 @@ from numba import njit, prange
 from ctsim.reconstruct.splat.kernels.lanes import WIDTH, exp, fma, load, mul, ramp, spread, store, total
 from ctsim.reconstruct.splat.kernels.splat_cpu import CHUNKS, LARGEST
 
-SLABS = 16  # at most so many slabs of slices; a task adds splats to a slab in their order
+SLABS = 16  # at most this many slabs of slices; a task adds splats to a slab in their order
 HALF = np.float32(-0.5)
 # a blob: centre z, y, x in voxels, L by rows, peak
 Z0, Y0, X0, L_ZZ, L_YZ, L_YY, L_XZ, L_XY, L_XX, W0 = range(10)
