@@ -6,13 +6,16 @@ import msgspec
 
 from ctsim.errors import InputError
 
+Tolerance = Annotated[float, msgspec.Meta(ge=1e-7, le=1e-1)]
+Subrays = Annotated[int, msgspec.Meta(ge=1, le=256)]
+
 
 class Simulation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Accuracy of the simulation."""
 
-    tolerance: Annotated[float, msgspec.Meta(ge=1e-7, le=1e-1)] = 1e-4
+    tolerance: Tolerance = 1e-4
     """Largest error of P = −ln(signal/open) from replacing the fine spectrum by Gauss nodes."""
-    subrays: Annotated[int, msgspec.Meta(ge=1, le=256)] = 34
+    subrays: Subrays = 34
     """Largest number of rays that first measure a pixel on the edge of a solid; 1: central rays only."""
     edge_tolerance: Annotated[float, msgspec.Meta(ge=1e-3)] = 0.03
     """Estimated error in P above which such a pixel gets up to 16 times as many rays; infinity: never."""

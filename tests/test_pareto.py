@@ -1,13 +1,8 @@
 import math
-import multiprocessing
 import os
 import re
-import shlex
-import signal
 import subprocess
 import sys
-import threading
-import time
 from pathlib import Path
 
 import msgspec
@@ -15,7 +10,6 @@ import numpy as np
 import pareto_ends
 import pytest
 import torch
-import tyro
 from conftest import SMALLEST
 from test_pareto_points import task, timed
 
@@ -23,14 +17,11 @@ from ctsim.benchmarks import cli
 from ctsim.benchmarks.engine import host
 from ctsim.benchmarks.engine.process import Process, Stopped
 from ctsim.benchmarks.methods import TABLE
-from ctsim.benchmarks.oracles import relative
-from ctsim.benchmarks.studies.pareto import choices as pareto_choices
-from ctsim.benchmarks.studies.pareto import methods as pareto_methods
-from ctsim.benchmarks.studies.pareto import simulator as pareto_simulator
+from ctsim.benchmarks.oracles import measured_pixel, relative
+from ctsim.benchmarks.studies.pareto import measure
 from ctsim.benchmarks.studies.pareto import study as pareto
 from ctsim.benchmarks.studies.pareto import suite as pareto_suite
-from ctsim.benchmarks.studies.pareto import worker
-from ctsim.benchmarks.studies.pareto.choices import Choice
+from ctsim.benchmarks.studies.pareto.suite import Choice
 from ctsim.settings import Simulation
 from ctsim.types import Volume
 
@@ -55,7 +46,7 @@ def test_a_scene_is_opened_once_and_each_kind_of_choice_warmed_up_once():
     calls.clear()
     found = {}
     for label, kind in ("bx", "cy", "dy", "ax", "bx"):
-        found[label] = worker.timed(pareto_ends.Scene, ("rounds",), pareto_ends.Tried(label, kind))
+        found[label] = measure.timed(pareto_ends.Scene, ("rounds",), pareto_ends.Tried(label, kind))
         assert found[label].warm_up == (0.5 if len(calls) in (3, 5) else None)
     assert calls == ["open rounds", "warm x", "b", "warm y", "c", "d", "a", "b"]
     assert {label: (run.ok, run.status, run.reason) for label, run in found.items()} == {
@@ -68,7 +59,7 @@ def test_a_scene_is_opened_once_and_each_kind_of_choice_warmed_up_once():
 
 def test_the_run_after_one_that_overstayed_warms_up_again():
     def timed_there(process, label, seconds=60.0):
-        return process.run(worker.timed, pareto_ends.Scene, ("hung",), pareto_ends.Tried(label, "x"), seconds=seconds)
+        return process.run(measure.timed, pareto_ends.Scene, ("hung",), pareto_ends.Tried(label, "x"), seconds=seconds)
 
     with Process() as process:
         first, second = (timed_there(process, "a") for _ in range(2))
@@ -112,15 +103,15 @@ def tuned(scan, *, device, strength=2, iterations=4):
 def test_the_bundled_suite_has_every_method_and_the_defaults_of_all():
     assert [listed.name for listed in SUITE.method] == list(TABLE)
     for name in TABLE:
-        found = pareto_choices.efforts(SUITE, name)
+        found = pareto_suite.efforts(SUITE, name)
         published = name in ("splat-paper", "splat-r2")  # whose own steps are hours
         assert [e.curve for e in found if e.default is not published] == [name]
         assert len({(e.curve, e.label) for e in found}) == len(found), name
-    runs = pareto_choices.efforts(SUITE, "splat")
+    runs = pareto_suite.efforts(SUITE, "splat")
     assert len({e.kind for e in runs}) == len(runs)  # each is compiled before its clock starts
-    assert [e.label for e in pareto_choices.efforts(SUITE, "fdk")] == ["defaults"]
-    assert [e.changes for e in pareto_choices.efforts(SUITE, "cgls")] == [{"iterations": 30}]
-    choices = pareto_choices.choices(SUITE.simulator)
+    assert [e.label for e in pareto_suite.efforts(SUITE, "fdk")] == ["defaults"]
+    assert [e.changes for e in pareto_suite.efforts(SUITE, "cgls")] == [{"iterations": 30}]
+    choices = pareto_suite.choices(SUITE.simulator)
     for group in {c.group for c in choices}:
         assert any(c.default for c in choices if c.group == group), group
     assert len({(c.curve, c.label) for c in choices}) == len(choices)
@@ -140,17 +131,17 @@ def test_a_file_of_ones_own_says_what_is_measured_and_leaves_the_rest_as_it_is(t
     suite = pareto_suite.load(path)
     assert suite.simulator == SUITE.simulator
     assert suite.dataset.suite == str(tmp_path / "scenes.toml") and suite.dataset.scenes == ()
-    found = pareto_choices.efforts(suite, mine)
+    found = pareto_suite.efforts(suite, mine)
     assert [(e.curve, e.label, e.changes, e.default, e.watched) for e in found] == [
         (mine, "strength 2", {"strength": 2}, True, False),
         (mine, "strength 1", {"strength": 1}, False, False),
         (mine, "strength 3 + 4", {"strength": [3, 4]}, False, False),
         ("both", "long", {"strength": 9, "iterations": 50}, False, True),
     ]
-    assert [e.label for e in pareto_choices.efforts(suite, "cgls")] == ["75 iterations"]
+    assert [e.label for e in pareto_suite.efforts(suite, "cgls")] == ["75 iterations"]
     # what is not listed goes by its iterations
-    assert [e.label for e in pareto_choices.efforts(suite, "sirt")] == ["300 iterations"]
-    assert [e.label for e in pareto_choices.efforts(SUITE, mine)] == ["8 iterations"]
+    assert [e.label for e in pareto_suite.efforts(suite, "sirt")] == ["300 iterations"]
+    assert [e.label for e in pareto_suite.efforts(SUITE, mine)] == ["8 iterations"]
 
 
 @pytest.mark.parametrize(
@@ -180,7 +171,7 @@ def test_a_file_of_ones_own_says_what_is_measured_and_leaves_the_rest_as_it_is(t
         ("[[method]]\nname = 'fdk'\ntimes = 3", "mine.toml: method 'fdk' has no default iterations"),
         (
             "[[method]]\nname = 'ibhc'\nparameter = 'size'\nvalues = [1]",
-            "mine.toml: method 'ibhc' has no parameter 'size'",
+            "mine.toml: ibhc.size: unknown parameter; expected one of tube",
         ),
         (
             "[simulator]\nside = 16\nviews = 9\ntolerances = [1e-3, 1.0]\nsubrays = []\ngrids = []\nlevels = []",
@@ -224,14 +215,14 @@ def test_the_clock_leaves_out_scoring_and_counts_what_begins_and_ends_a_run(smal
     monkeypatch.setattr("time.perf_counter", lambda: CLOCK[0])
     monkeypatch.setitem(TABLE, "slow", (f"{__name__}:slow", "counts only"))
     (folder,) = (path for path in smallest.iterdir() if (path / "scene.toml").exists())
-    bench = pareto_methods.Bench(folder)
+    bench = measure.Stored(folder)
 
     def score(volume):
         CLOCK[0] += 100
         return {"rmse": float(volume.mean())}
 
     monkeypatch.setattr(bench, "values", score)
-    (effort,) = pareto_choices.efforts(SUITE, "slow")
+    (effort,) = pareto_suite.efforts(SUITE, "slow")
     effort = msgspec.structs.replace(effort, stops=(1, 2, 3))
     marks = bench.run(effort)
     told = bench.run(msgspec.structs.replace(effort, default=False))
@@ -281,38 +272,17 @@ def test_methods_end_to_end(tmp_path, monkeypatch, capsys):
     assert left() == {"fdk": 2, "cgls": 2, "limar": 2, "pareto_ends:fails": 2}
 
 
-def test_ctrl_c_ends_a_run_with_its_process_and_keeps_the_records(tmp_path, monkeypatch):
-    monkeypatch.setattr(host, "use_threads", lambda threads: None)
-    path = tmp_path / "out" / "pareto.jsonl"
-
-    def interrupt():
-        while not (path.exists() and path.read_bytes().endswith(b"\n")):
-            time.sleep(0.05)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    heard = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
-    threading.Thread(target=interrupt, daemon=True).start()
-    chosen = ["--part", "methods", "--method", "fdk", "--method", "pareto_ends:hangs", "--repeats", "1"]
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            pareto.main([str(path.parent), "--suite", str(suite_file(tmp_path)), *chosen])
-    finally:
-        signal.signal(signal.SIGINT, heard)
-    assert [r.task.settings["curve"] for r in read(path.parent)] == ["fdk"]
-    assert not multiprocessing.active_children()
-
-
 # --- simulator ---------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def bench():
-    return pareto_simulator.Bench(side=16, views=4)
+    return measure.Rods(side=16, views=4)
 
 
 def test_the_reference_is_converged_where_the_choices_are_not(bench):
-    best = bench.converged(pareto_simulator.FINER, pareto_simulator.FINEST)
-    half = bench.converged(pareto_simulator.FINER // 2, pareto_simulator.FINEST)
+    best, _ = bench.reference
+    half = measured_pixel(bench.phantom, bench.scanner, bench.checked, finer=measure.FINER // 2, subrays=measure.FINEST)
     plain, default, finest = (
         bench.run(Choice(curve="c", label=str(n), simulation=Simulation(subrays=n)))[0].values["rms"]
         for n in (1, Simulation().subrays, 233)
@@ -322,7 +292,7 @@ def test_the_reference_is_converged_where_the_choices_are_not(bench):
 
 
 def test_errors_are_those_of_p(bench):
-    exact, calm = bench._reference
+    exact, calm = bench.reference
     assert calm.any() and not calm.all()
     assert bench.errors(exact.astype(np.float32))["worst"] < 1e-6 * exact.max()  # float32
     scattered = -np.log(np.exp(-exact) + 0.02).astype(np.float32)
@@ -338,7 +308,7 @@ def test_errors_are_those_of_p(bench):
 
 def test_scatter_is_judged_with_scatter(bench):
     off, on = (
-        bench.run(Choice(group=pareto_choices.SCATTER, curve=pareto_choices.SCATTER, label=str(k), level=k))[0].values[
+        bench.run(Choice(group=pareto_suite.SCATTER, curve=pareto_suite.SCATTER, label=str(k), level=k))[0].values[
             "rms"
         ]
         for k in (0, pareto_suite.HIGHEST)
@@ -387,12 +357,8 @@ def test_bad_input_is_said_in_one_sentence(arguments, says, tmp_path, monkeypatc
     assert says in said and "\n" not in said and not (tmp_path / "out").exists()
 
 
-def test_the_page_gives_commands_and_a_file_that_work(tmp_path):
-    text = (Path(__file__).parents[1] / "docs" / "pareto.md").read_text(encoding="utf-8")
-    found = re.findall(r"^    run-benchmark pareto (.*)$", text, re.M)
-    assert len(found) >= 3
-    for line in found:
-        tyro.cli(pareto.Flags, args=shlex.split(line, comments=True))
+def test_the_page_gives_a_file_that_works(tmp_path):
+    page = Path(__file__).parents[1] / "docs" / "how-to" / "measure-time-against-error.md"
     path = tmp_path / "mine.toml"
-    path.write_text("\n".join(re.findall(r"^    (?!run-benchmark)(.*)$", text, re.M)), encoding="utf-8")
+    path.write_text("\n".join(re.findall(r"^    (.*)$", page.read_text(encoding="utf-8"), re.M)), encoding="utf-8")
     assert [listed.name for listed in pareto_suite.load(path).method] == ["splat", "my_lab.net:reconstruct"]

@@ -12,8 +12,19 @@ from ctsim.benchmarks.engine.host import host
 from ctsim.benchmarks.engine.record import Task
 from ctsim.benchmarks.studies.pareto import figure as pareto_figure
 from ctsim.benchmarks.studies.pareto import tables as pareto_tables
-from ctsim.benchmarks.studies.pareto.finding import Mark, Run, Timed, at_knee, enough, points, recommended
-from ctsim.benchmarks.studies.pareto.front import beaten_by, faster, front, knee
+from ctsim.benchmarks.studies.pareto.finding import (
+    Mark,
+    Point,
+    Run,
+    Timed,
+    enough,
+    faster,
+    front,
+    knee,
+    points,
+    recommended,
+    rivals,
+)
 from ctsim.benchmarks.studies.pareto.study import VERSION, Flags, Pareto
 from ctsim.errors import InputError
 
@@ -21,23 +32,31 @@ from ctsim.errors import InputError
 PAIRS = st.lists(st.tuples(st.integers(1, 6), st.integers(1, 6)), min_size=1, max_size=12)
 
 
+def made(pairs):
+    """Points of one group with these seconds and errors."""
+    names = {"task": task(), "part": "methods", "group": "g", "curve": "c", "default": False}
+    return [Point(label=str(k), seconds=(t,), values={"rmse": e}, **names) for k, (t, e) in enumerate(pairs)]
+
+
 @given(PAIRS)
 def test_the_front_is_what_no_other_point_beats(pairs):
     def beats(a, b):
         return a != b and a[0] <= b[0] and a[1] <= b[1]
 
-    found = front(pairs)
-    assert sorted(found) == [k for k, p in enumerate(pairs) if not any(beats(q, p) for q in pairs)]
-    assert [pairs[k] for k in found] == sorted(pairs[k] for k in found)
+    found = [p.pair for p in front(made(pairs))]
+    assert found == sorted(p for p in pairs if not any(beats(q, p) for q in pairs))
 
 
 @given(PAIRS)
-def test_what_beats_a_point_is_the_fastest_that_is_no_worse(pairs):
-    for k, (seconds, error) in enumerate(pairs):
-        best, share = beaten_by(pairs, k)
-        assert pairs[best][0] == min(s for s, e in pairs if e <= error)
-        assert share == pairs[best][0] / seconds
-        assert (pairs[best] == pairs[k]) == (k in front(pairs))
+def test_what_beats_a_point_is_no_slower_and_no_worse(pairs):
+    every = made(pairs)
+    on = front(every)
+    for p, (seconds, error) in zip(every, pairs, strict=True):
+        better = rivals(every, p, ["rmse"])
+        assert [q.pair for q in better] == [
+            (s, e) for s, e in pairs if s <= seconds and e <= error and (s < seconds or e < error)
+        ]
+        assert (p in on) == (not better)
 
 
 def test_runs_are_faster_where_the_intervals_of_their_medians_do_not_meet():
@@ -55,21 +74,27 @@ def curve(x, y):
     return [(math.exp(a), math.exp(b)) for a, b in zip(x, y, strict=True)]
 
 
+def at_knee(pairs):
+    """The index of the knee, None without one."""
+    found = knee(made(pairs))
+    return found and int(found.label)
+
+
 def test_the_knee_is_where_a_steep_line_meets_a_flat_one():
     x = np.linspace(0, 10, 21)
     steep_then_flat = np.where(x < 4, -3 * x, -12 - 0.1 * (x - 4))
     pairs = curve(x, steep_then_flat)
-    assert knee(pairs) == 8  # x = 4
+    assert at_knee(pairs) == 8  # x = 4
     # in units of hours and of per mille it is the same point
-    assert knee([(s / 3600, 1000 * e) for s, e in pairs]) == 8
+    assert at_knee([(s / 3600, 1000 * e) for s, e in pairs]) == 8
     # points off the front do not count, though they lie far below the chord of others
-    assert knee([*pairs, (math.exp(11.0), 1.0), (0.5, math.exp(1.0))]) == 8
+    assert at_knee([*pairs, (math.exp(11.0), 1.0), (0.5, math.exp(1.0))]) == 8
 
 
 def test_the_knee_of_a_smooth_curve_is_where_it_runs_along_its_chord():
     # y = exp(−x) on [0, 4] has the slope of its chord, −(1 − exp(−4))/4, at x = −ln((1 − exp(−4))/4)
     x = np.linspace(0, 4, 401)
-    at = knee(curve(x, np.exp(-x)))
+    at = at_knee(curve(x, np.exp(-x)))
     assert at is not None
     # half a step of the sampling
     assert x[at] == pytest.approx(-math.log((1 - math.exp(-4)) / 4), abs=0.005 + 1e-9)
@@ -78,9 +103,10 @@ def test_the_knee_of_a_smooth_curve_is_where_it_runs_along_its_chord():
 def test_without_a_point_below_the_chord_there_is_no_knee():
     x = np.linspace(0, 1, 11)
     for y in (-3 * x, -x - x**2):  # straight, and bulging away from the origin
-        assert knee(curve(x, y)) is None
-    assert knee([(1.0, 2.0)]) is None
-    assert knee([(1.0, 2.0), (2.0, 1.0)]) is None
+        assert at_knee(curve(x, y)) is None
+    assert at_knee([(1.0, 2.0)]) is None
+    assert at_knee([(1.0, 2.0), (2.0, 1.0)]) is None
+    assert at_knee([(1.0, 2.0), (1.5, 1.0), (2.0, 0.0)]) is None  # an error of 0 has no logarithm
 
 
 # --- records -----------------------------------------------------------------------------------------
@@ -116,6 +142,8 @@ def shown(records, tmp_path):
         ('"part":"methods"', '"part":"peers"', "expected a known part"),
         ('"rmse"', '"rms"', "expected values rmse"),
         ('"marks"', '"mark"', "unknown field"),
+        ('"rmse":2.0', '"rmse":-2.0', "expected values rmse, none of them negative"),
+        ('"label":"1","seconds":1.0', '"label":"1","seconds":-1.0', "Expected `float` > 0.0"),
     ],
 )
 def test_a_record_without_what_a_point_needs_is_refused_in_one_sentence(old, new, says, tmp_path):
@@ -160,7 +188,7 @@ def test_recommended_are_near_the_least_error_for_methods_and_the_knee_for_the_s
     marks = [(str(k), 2.0**k, e) for k, e in enumerate((1.0, 0.1, 0.052, 0.0505, 0.05))]
     method, simulator = (points([timed(task(part=part), *marks)]) for part in ("methods", "simulator"))
     assert (recommended(method).label, enough(method).label) == ("2", "2")  # 0.052 is within 5 % of 0.05
-    assert recommended(simulator) is at_knee(simulator)
+    assert recommended(simulator) is knee(simulator)
     assert recommended(simulator).label == "1"
 
 

@@ -11,8 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator
 
 from ctsim.benchmarks.engine.texts import pictured
-from ctsim.benchmarks.studies.pareto.finding import Part, Point, at_knee, curves, groups
-from ctsim.benchmarks.studies.pareto.front import front
+from ctsim.benchmarks.studies.pareto.finding import Part, Point, front, groups, knee, parted
 from ctsim.durable import replacing
 
 DPI, WIDE, HIGH = 150, 9.0, 4.6
@@ -33,9 +32,7 @@ def save(every: Sequence[Point], path: Path) -> None:
 
 def draw(every: Sequence[Point]) -> Figure:
     """Draw each scene's points: time and error on log axes, defaults, and the front and knee of each group."""
-    scenes: dict[tuple[str, str], list[Point]] = {}
-    for p in every:
-        scenes.setdefault((p.part, p.task.case), []).append(p)
+    scenes = parted(every, lambda p: (p.part, p.task.case))
     figure = Figure(figsize=(WIDE, HIGH * len(scenes)), layout="constrained")
     for axes, mine in zip(figure.subplots(len(scenes), 1, squeeze=False)[:, 0], scenes.values(), strict=True):
         _scene(axes, mine)
@@ -46,21 +43,16 @@ def _scene(axes: Axes, every: Sequence[Point]) -> None:
     handles: list[Any] = []
     known = list(dict.fromkeys(p.curve for p in every))
     for k, group in enumerate(groups(every)):
-        for curve, mine in curves(group).items():
+        for curve, mine in parted(group, lambda p: p.curve).items():
             x, y = zip(*sorted(p.pair for p in mine), strict=True)  # a default may stand anywhere on its curve
-            colour = COLOURS[known.index(curve) % len(COLOURS)]
-            marker = MARKERS[k % len(MARKERS)]
-            handles += axes.plot(x, y, marker=marker, markersize=5, linewidth=0.8, color=colour, label=pictured(curve))
-        pairs = [p.pair for p in group]
-        x, y = zip(*(pairs[i] for i in front(pairs)), strict=True)
-        label = pictured(f"front: {group[0].group}")
-        handles += axes.step(
-            x, y, where="post", color=FRONT, linewidth=1.0, linestyle=STYLES[k % len(STYLES)], zorder=1, label=label
-        )
-        if (knee := at_knee(group)) is not None:
-            axes.plot(*knee.pair, "o", markersize=15, markerfacecolor="none", markeredgecolor=KNEE)
-    chosen = [p.pair for p in every if p.default]
-    if chosen:
+            look = {"color": COLOURS[known.index(curve) % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)]}
+            handles += axes.plot(x, y, markersize=5, linewidth=0.8, label=pictured(curve), **look)
+        x, y = zip(*(p.pair for p in front(group)), strict=True)
+        style, label = STYLES[k % len(STYLES)], pictured(f"front: {group[0].group}")
+        handles += axes.step(x, y, where="post", color=FRONT, linewidth=1.0, linestyle=style, zorder=1, label=label)
+        if corner := knee(group):
+            axes.plot(*corner.pair, "o", markersize=15, markerfacecolor="none", markeredgecolor=KNEE)
+    if chosen := [p.pair for p in every if p.default]:
         axes.plot(*zip(*chosen, strict=True), "x", color=FRONT, markersize=9)
     handles += [
         Line2D([], [], color=KNEE, marker="o", markersize=11, markerfacecolor="none", linestyle="", label="knee"),

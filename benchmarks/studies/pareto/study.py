@@ -6,56 +6,34 @@ All runs share one process, which is replaced where a run exceeds its time limit
 """
 
 import contextlib
-import pkgutil
+import functools
+import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import get_args
 
 import msgspec
-import tyro
+from tqdm import tqdm
 
 from ctsim.benchmarks import suites
 from ctsim.benchmarks.engine import host, study
 from ctsim.benchmarks.engine.record import Record, Task
 from ctsim.benchmarks.engine.table import Table
 from ctsim.benchmarks.methods import code_version, find
-from ctsim.benchmarks.studies.pareto import suite, tables
-from ctsim.benchmarks.studies.pareto.choices import Choice, Effort, choices, efforts
+from ctsim.benchmarks.scores import protocol
+from ctsim.benchmarks.studies.methods import estimates
+from ctsim.benchmarks.studies.pareto import Flags, figure, suite, tables
 from ctsim.benchmarks.studies.pareto.finding import Part, Run, Timed, points
+from ctsim.benchmarks.studies.pareto.suite import Choice, Effort
 from ctsim.errors import InputError
+from ctsim.folder import is_complete
 from ctsim.human import human_choice
 from ctsim.manifest import read_manifest
+from ctsim.phantoms.dataset import make_scene
+from ctsim.phantoms.scene import Scene, scene_id
 
-if TYPE_CHECKING:
-    from ctsim.phantoms.scene import Scene
-
-HERE = "ctsim.benchmarks.studies.pareto"
 RODS = "rods"
 VERSION = 2  # of what is measured
-RAY = 6.2e-7  # seconds of the simulator for a pixel of a view by default, on two cores (docs/pareto.md)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Flags(study.Flags):
-    """Measure error against run time: the simulator over its choices, every method over its own effort.
-
-    Runs are measured again where code, data, machine or threads have changed. The machine should have nothing else to
-    do.
-    """
-
-    part: Annotated[tuple[Part, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="PART")] = ()
-    """Only this part, simulator or methods (default: both)."""
-    scene: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME")] = ()
-    """Only this scene; may be given several times. The simulator has rods, methods those of the dataset (lung-Fe)."""
-    suite: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """What to measure: a TOML file with tables of your own over those of benchmarks/suites/pareto.toml."""
-    method: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME")] = ()
-    """Only this method, or module:function of your own; may be given several times (default: all of --suite)."""
-    repeats: int = 3
-    """Rounds: timed runs of each setting; tables show medians."""
-    threads: int = 2
-    """Threads of the kernels."""
+RAY = 6.2e-7  # seconds of the simulator for a pixel of a view by default, on two cores (docs/measured/pareto.md)
 
 
 class Pareto(study.Study[Record[Run], Flags]):
@@ -64,7 +42,7 @@ class Pareto(study.Study[Record[Run], Flags]):
     name = file = "pareto"
     unit = "run"
     kind, record, flags = Run, Timed, Flags
-    work = f"{HERE}.worker:measure"
+    work = "ctsim.benchmarks.studies.pareto.measure:measure"
     apart = rounds = True
     estimate = "without compiling, planning and the reference"
 
@@ -76,18 +54,22 @@ class Pareto(study.Study[Record[Run], Flags]):
 
     def prepare(self, given: Flags) -> None:
         """Make the scans that are missing, if all that is asked for is there."""
-        if scenes := asked(given)[2]:
-            pkgutil.resolve_name(f"{HERE}.worker:make_scans")(scenes, given.results / "data")
+        data, scenes = given.results / "data", scenes_of(given)
+        for scene in scenes if efforts_of(given) else ():
+            if not is_complete(data, scene.name, scene_id(scene)):
+                bar = functools.partial(tqdm, desc=scene.name, unit="view", disable=None, file=sys.stderr)
+                make_scene(scene, data, watch=lambda views, first, n, bar=bar: bar(views, initial=first, total=n))
 
     def tasks(self, given: Flags) -> list[Task]:
         """Return a task for each choice of the simulator, and for each run of a method on each scene."""
-        simulated, runs, scenes = asked(given)
-        size = suite.load(given.suite).simulator
-        protocol = pkgutil.resolve_name("ctsim.benchmarks.scores.protocol:VERSION")
-        found = [(RODS, f"{size.side}² pixels, {size.views} views", choice) for choice in simulated]
+        asked, scenes, runs = suite.load(given.suite), scenes_of(given), efforts_of(given)
+        size = f"{asked.simulator.side}² pixels, {asked.simulator.views} views"
+        simulated = "simulator" in _parts(given) and (not given.scene or RODS in given.scene)
+        found = [(RODS, size, choice) for choice in (suite.choices(asked.simulator) if simulated else ())]
+        scored = f"protocol {protocol.VERSION}" + ", aligned" * asked.dataset.aligned
         for scene in scenes:
             folder = given.results / "data" / scene.name
-            known = f"{read_manifest(folder).content_hash}, protocol {protocol}" if folder.exists() else ""
+            known = f"{read_manifest(folder).content_hash}, {scored}" if folder.exists() else ""
             found += [(scene.name, known, effort) for effort in runs]
         machine, cases = self.machine(given), [RODS, *(scene.name for scene in scenes)]
         return [
@@ -115,13 +97,14 @@ class Pareto(study.Study[Record[Run], Flags]):
         return sorted(super().pending(tasks, records, given), key=lambda task: task.place[:1])
 
     def expected(self, task: Task, given: Flags) -> float:
-        """Return about how many seconds a run takes: each choice of the simulator about as many as the default."""
+        """Return about how many seconds a run takes: of a method from an FDK timed here, of the simulator as usual."""
         asked = suite.load(given.suite)
         if task.part == "simulator":
             return RAY * asked.simulator.side**2 * asked.simulator.views
         (scene,) = suites.select(suites.load(asked.dataset.suite), (task.case,), ())
-        effort = msgspec.convert(task.settings, Effort)
-        return pkgutil.resolve_name(f"{HERE}.worker:expected")(effort, scene)
+        effort, geometry = msgspec.convert(task.settings, Effort), scene.resolve().geometry
+        fdks = estimates.in_fdks(find(effort.method, effort.changes), geometry) or estimates.UNKNOWN
+        return fdks * estimates.fdk_seconds(geometry)
 
     def took(self, record: Record[Run], given: Flags) -> float:
         """Return the seconds of a run, which ended with its last mark."""
@@ -148,35 +131,40 @@ class Pareto(study.Study[Record[Run], Flags]):
         text = super().write(records, given)
         if drawn := points(self.shown(records)):
             picture = given.results / "pareto.png"
-            pkgutil.resolve_name(f"{HERE}.figure:save")(drawn, picture)
+            figure.save(drawn, picture)
             text += f"Figure: {picture}\n"
         return text
 
 
-def asked(given: Flags) -> "tuple[list[Choice], list[Effort], list[Scene]]":
-    """Return the simulator's choices, the methods' runs and their scenes that the flags ask for.
+def _parts(given: Flags) -> tuple[Part, ...]:
+    return given.part or get_args(Part)
 
-    Raises InputError for a method, a parameter or a scene that there is not.
-    """
-    wanted, parts = suite.load(given.suite), given.part or get_args(Part)
+
+def scenes_of(given: Flags) -> list[Scene]:
+    """Return the scenes that methods are to run on. Raises InputError for one that there is not."""
+    dataset = suite.load(given.suite).dataset
     with _where(f"{given.suite}: dataset.suite: "):
-        scenes = {scene.name: scene for scene in suites.load(wanted.dataset.suite)}
-    for name in wanted.dataset.scenes:
+        scenes = {scene.name: scene for scene in suites.load(dataset.suite)}
+    for name in dataset.scenes:
         if name not in scenes:
-            expected = human_choice(list(scenes), name)
+            expected = human_choice(scenes, name)
             raise InputError(f"{given.suite}: dataset.scenes: there is no {name!r}, expected one of {expected}")
     known: dict[Part, list[str]] = {"simulator": [RODS], "methods": list(scenes)}
     for name in given.scene:
-        if not any(name in known[part] for part in parts):
-            expected = "; ".join(f"{part}: {human_choice(known[part], name)}" for part in parts)
+        if not any(name in known[part] for part in _parts(given)):
+            expected = "; ".join(f"{part}: {human_choice(known[part], name)}" for part in _parts(given))
             raise InputError(f"--scene {name!r}: there is no such scene, expected one of {expected}")
-    chosen = given.scene or (RODS, *(wanted.dataset.scenes or scenes))
-    simulated = choices(wanted.simulator) if "simulator" in parts and RODS in chosen else []
-    runs: list[Effort] = []
-    for name in given.method or [listed.name for listed in wanted.method]:
-        with _where(f"{given.suite}: " if given.suite and wanted.listed(name) else ""):
-            runs += efforts(wanted, name) if "methods" in parts else []
-    return simulated, runs, [scene for name, scene in scenes.items() if name in chosen and runs]
+    chosen = given.scene or dataset.scenes or scenes
+    return [scene for name, scene in scenes.items() if name in chosen and "methods" in _parts(given)]
+
+
+def efforts_of(given: Flags) -> list[Effort]:
+    """Return the runs of methods on a scene. Raises InputError for a method or a parameter that there is not."""
+    asked, runs = suite.load(given.suite), []
+    for name in given.method or [listed.name for listed in asked.method]:
+        with _where(f"{given.suite}: " if given.suite and asked.listed(name) else ""):
+            runs += suite.efforts(asked, name) if "methods" in _parts(given) else []
+    return runs
 
 
 @contextlib.contextmanager

@@ -32,9 +32,9 @@ def forms() -> dict[str, type]:
 
 
 def form_of(module: types.ModuleType) -> type:
-    """Return the dataclass of a command's arguments, by the first of these names that its module has."""
+    """Return the dataclass of a command's arguments: the first of these that its module or package declares."""
     found = (getattr(module, name, None) for name in ("Flags", "Arguments", "Options"))
-    return next(form for form in found if form is not None and form.__module__ == module.__name__)
+    return next(f for f in found if f is not None and f.__module__ in (module.__name__, module.__package__))
 
 
 def page() -> str:

@@ -1,0 +1,232 @@
+"""Timed runs of `run-benchmark pareto`, in the process that takes them all: of the simulator, and of methods.
+
+What runs share stays in that process: compiled kernels, the opened scene, the reference. In a process that replaces it
+they are made again before the next run's clock starts.
+"""
+
+import contextlib
+import functools
+import time
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ctsim import settings
+from ctsim.benchmarks.engine import host
+from ctsim.benchmarks.engine.record import Task
+from ctsim.benchmarks.methods import find
+from ctsim.benchmarks.oracles import measured_pixel, poly_scene, relative, scanner_of, voxelised
+from ctsim.benchmarks.scores import metrics
+from ctsim.benchmarks.scores.protocol import Truth, aligned_score, tissue_range, truth_of
+from ctsim.benchmarks.studies.methods.attempt import describe, run_here, scan_for, skip, warm_up
+from ctsim.benchmarks.studies.pareto import Flags, suite
+from ctsim.benchmarks.studies.pareto.finding import Ended, Mark, Run
+from ctsim.benchmarks.studies.pareto.suite import EXACT, HIGHEST, SCATTER, Choice, Effort
+from ctsim.noise import Noise
+from ctsim.plan import Plan, make_plan
+from ctsim.reconstruct.watch import watch
+from ctsim.scatter import Scatter, open_fraction
+from ctsim.simulate import simulate_views
+from ctsim.store import StoredScan, open_scan
+from ctsim.types import Phantom, Scanner, Status
+
+CHECKED = 2  # views that are compared with the reference
+FINER, FINEST = 16, 64
+"""Of the reference: finer pixels along a side of a pixel, and rays in each."""
+CALM = 1e-4  # |ΔP| of the central ray alone, below which a pixel has no edge
+USUALLY = Choice(curve=EXACT, label="default")
+_WARM: set[tuple[Hashable, ...]] = set()
+
+
+def measure(task: Task, given: Flags) -> list[Run]:
+    """Take one timed run of a task."""
+    host.use_threads(given.threads)
+    asked = suite.load(given.suite)
+    if task.part == "simulator":
+        of = (asked.simulator.side, asked.simulator.views)
+        return [timed(Rods, of, msgspec.convert(task.settings, Choice))]
+    of = (given.results / "data" / task.case, asked.dataset.aligned)
+    return [timed(Stored, of, msgspec.convert(task.settings, Effort))]
+
+
+def timed(make: Callable[..., Any], of: tuple[Hashable, ...], choice: Any) -> Run:
+    """Time a choice on the bench that `make(*of)` returns, after a warm-up if it is the first of its kind there."""
+    first, key = None, (make, *of, choice.kind)
+    try:
+        bench = _bench(make, of)
+        if key not in _WARM:
+            first = bench.warm_up(choice)
+            _WARM.add(key)
+        return Run(marks=bench.run(choice), warm_up=first)
+    except Ended as end:
+        return Run(ok=end.status == Status.SKIPPED, status=end.status, reason=end.reason, warm_up=first)
+    except Exception as error:  # a method's failure is a result
+        status = "out_of_memory" if isinstance(error, MemoryError) else "error"
+        return Run(ok=False, status=status, reason=describe(error), warm_up=first)
+
+
+@functools.lru_cache(maxsize=1)  # a scene's tasks come one after the other
+def _bench(make: Callable[..., Any], of: tuple[Hashable, ...]) -> Any:
+    return make(*of)
+
+
+# --- the simulator -----------------------------------------------------------------------------------
+
+
+class Rods:
+    """The simulator's scene, its reference, and what is prepared for each choice; `side` is of detector and grid.
+
+    The scene is analytic: a water cylinder with a bone rod and two iron rods. The reference has the finest of every
+    choice: closed-form chords, 16² finer pixels a pixel of up to 64 rays each averaged in intensity, and the whole fine
+    spectrum. Errors are those of P = −ln(signal/open) without noise in a few views. The scatter levels have a group of
+    their own, where the reference has level 1's signal added: a constant, whose own error is not known here.
+    """
+
+    def __init__(self, side: int, views: int) -> None:
+        self.side = side
+        self.scanner = msgspec.structs.replace(scanner_of(side, views), noise=Noise(model="none"))
+        self.phantom = poly_scene(side)
+        self.checked = tuple(sorted({round((k + 0.5) * views / CHECKED) % views for k in range(CHECKED)}))
+        self._plans: dict[Choice, tuple[Plan, Phantom, Scanner]] = {}
+
+    def warm_up(self, _: Choice) -> float:
+        """Run the defaults, so that compiling and the reference are not timed with a choice; return the seconds."""
+        return sum(mark.seconds for mark in self.run(USUALLY))
+
+    def run(self, choice: Choice) -> tuple[Mark, ...]:
+        """Time all views of a choice and return its errors."""
+        plan, phantom, scanner = self._plan(choice)
+        start = time.perf_counter()
+        views = [images["noise_free"] for _, images in simulate_views(plan, phantom, scanner)]
+        seconds = time.perf_counter() - start
+        found = np.stack([views[k] for k in self.checked])
+        s = open_fraction(Scatter(level=HIGHEST), scanner.geometry) if choice.curve == SCATTER else 0.0
+        label = f"{choice.label}, {len(plan.rule.energies)} energies"
+        return (Mark(label=label, seconds=seconds, values=self.errors(found, s), default=choice.default),)
+
+    def errors(self, p: NDArray[np.float32], scatter: float = 0.0) -> dict[str, float]:
+        """Compare P of the checked views with the reference, to which `scatter` (S/I0) is added.
+
+        `rms` is relative, `worst` and `off_edges` are the greatest |ΔP|, the latter where a pixel has no edge.
+        """
+        exact, calm = self.reference
+        exact = -np.log(np.exp(-exact) + scatter)
+        off = np.abs(p - exact)
+        return {"rms": relative(p, exact), "worst": float(off.max()), "off_edges": float(off[calm].max())}
+
+    @functools.cached_property
+    def reference(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """P of the checked views, and where the central ray alone says the same."""
+        exact, central = (
+            measured_pixel(self.phantom, self.scanner, self.checked, finer=finer, subrays=rays)
+            for finer, rays in ((FINER, FINEST), (1, 1))
+        )
+        return exact, np.abs(central - exact) < CALM
+
+    def _plan(self, choice: Choice) -> tuple[Plan, Phantom, Scanner]:
+        """Plan a choice, once; no clock runs yet. The body (and with `metal` all) is labels where there is a `grid`."""
+        if choice not in self._plans:
+            scanner, phantom = msgspec.structs.replace(self.scanner, scatter=Scatter(level=choice.level)), self.phantom
+            if choice.grid is not None:
+                cubes = scanner_of(max(round(choice.grid * self.side), 1), 1).geometry
+                metal = tuple(s for s in phantom.solids if s.metal and not choice.metal)
+                phantom = voxelised(phantom, cubes, metal)
+            plan = make_plan(phantom, scanner, choice.simulation, settings.Truth(twin=False, noise_free=True), "pareto")
+            self._plans[choice] = plan, phantom, scanner
+        return self._plans[choice]
+
+
+# --- methods -----------------------------------------------------------------------------------------
+
+
+class Stored:
+    """A stored scene, on which every method of the table is timed over its own effort and scored under `tissue`.
+
+    Iterative methods run once, past their default iterations, and are scored as they pass each of the stops (`watch`);
+    the clock stands still meanwhile. A run of k iterations takes what it took to get there, and what the method took
+    after its last: its closing residual. Methods whose effort is not a count of iterations that can be watched run once
+    for each value; methods without any are single points.
+    """
+
+    def __init__(self, folder: Path, aligned: bool = False) -> None:
+        self.stored: StoredScan = open_scan(folder)
+        self.aligned = aligned
+
+    @functools.cached_property
+    def truth(self) -> Truth:
+        """What volumes are compared with."""
+        return truth_of(self.stored)
+
+    def warm_up(self, effort: Effort) -> float:
+        """Run the method on a few views and slices, so that compiling is not timed; return its seconds."""
+        method = find(effort.method, effort.changes)
+        return warm_up(method, scan_for(method, self.stored, "metal"))
+
+    def run(self, effort: Effort) -> tuple[Mark, ...]:
+        """Time one run; return a mark at each stop, the default and the end, or one if the method cannot be watched.
+
+        Raises Ended where the method is skipped or there is no finite volume.
+        """
+        method, usual = find(effort.method, effort.changes), find(effort.method).params.get("iterations")
+        marks = Marks(score=self.values, stops={*effort.stops, usual, method.params.get("iterations")})
+        with watch(marks) if effort.watched else contextlib.nullcontext():
+            outcome = skip(method, self.stored, "metal") or run_here(self.stored, "metal", method, 0.0)
+        if outcome.status != Status.OK or outcome.values is None or outcome.cost is None:
+            raise Ended(outcome.status, outcome.reason)
+        end, around, count = self.values(outcome.values), outcome.cost.wall - marks.watched, len(marks.seen)
+        if not count:
+            return (Mark(label=effort.label, seconds=around, values=end, default=effort.default),)
+        # the volume that is returned may be finished, such as by a last cut at 0
+        marks.seen[-1] = marks.seen[-1][0], end
+        return tuple(
+            Mark(
+                label=f"{k} iteration{'s' * (k > 1)}",
+                seconds=seconds + around,
+                values=values,
+                default=effort.default and k == min(usual or count, count),
+            )
+            for k, (seconds, values) in enumerate(marks.seen, 1)
+            if values
+        )
+
+    def values(self, volume: NDArray[np.float32]) -> dict[str, float]:
+        """Return RMSE (1/mm) and PSNR3D (dB) of `tissue`, and PSNR3D of `aligned` where it is asked for.
+
+        There are none of a volume with values that are not finite.
+        """
+        truth = self.truth
+        if not np.isfinite(volume).all():
+            return {}
+        mse = metrics.mse3d(volume, truth.references["effective"], truth.tissue)
+        scores = {"rmse": mse**0.5, "psnr3d": metrics.psnr(mse, tissue_range(truth, "effective"))}
+        if self.aligned:
+            scores["aligned"] = aligned_score(volume, truth, "effective").values["psnr3d"]
+        return {name: score for name, score in scores.items() if score is not None}
+
+
+@dataclass(slots=True, kw_only=True)
+class Marks:
+    """Watches a method: scores its volume at the stops.
+
+    `seen` are the method's own seconds after each iteration, without those of scoring, and the scores at a stop;
+    `watched` are all from the start of its clock until its last iteration had been seen.
+    """
+
+    score: Callable[[NDArray[np.float32]], dict[str, float]]
+    stops: set[Any]
+    seen: list[tuple[float, dict[str, float]]] = field(default_factory=list)
+    began: float = 0.0
+    watched: float = 0.0
+
+    def __call__(self, _view_updates: int, seconds: float, volume: torch.Tensor) -> None:
+        """Take note of an iteration that ended `seconds` after the method's clock was started."""
+        if not self.seen:
+            self.began = time.perf_counter() - seconds
+        self.seen.append((seconds, self.score(volume.numpy()) if len(self.seen) + 1 in self.stops else {}))
+        self.watched = time.perf_counter() - self.began
