@@ -87,8 +87,5 @@ def test_help_loads_nothing_slow(command):
 
 def test_importing_everything_neither_prints_nor_warns():
     names = modules("reports")
-    left_out = {
-        "ctsim.data.make_spectrum_table",
-        "ctsim.benchmarks.studies.peers.rtk",
-    }  # they need what only an extra installs
+    left_out = {"ctsim.data.make_spectrum_table"}  # it needs what only an extra installs
     assert run("import " + ", ".join(n for n in names if n not in left_out)) == ""

@@ -1,14 +1,12 @@
 """The catalogue of `run-benchmark peers`, and what becomes of cases and peers that are not measured."""
 
-import os
 from pathlib import Path
 
 import pytest
 
 from ctsim.benchmarks.engine import host
-from ctsim.benchmarks.engine import study as engine
 from ctsim.benchmarks.engine.record import Task
-from ctsim.benchmarks.studies.peers import cases, catalogue, poly, study
+from ctsim.benchmarks.studies.peers import cases, finding, poly, study
 from ctsim.benchmarks.studies.peers.finding import MEASURED, RTK, Measurement, Setup
 from ctsim.errors import InputError
 
@@ -31,8 +29,8 @@ install = "pip install itk-rtk"
 @pytest.mark.parametrize(
     ("before", "after", "said"),
     [
-        ("views = 180", "views = 0", "$.case[0].views"),
-        ("views = 180", 'views = "many"', "$.case[0].views"),
+        ("views = 180", "views = 0", "case[0].views"),
+        ("views = 180", 'views = "many"', "case[0].views"),
         ("rest = 2.0", "", "rest"),
         ("turn = 1.0", "trun = 1.0", "trun"),
         ('metals = ["Al"]', "", "expected scenes or metals"),
@@ -47,23 +45,23 @@ install = "pip install itk-rtk"
     ],
 )
 def test_what_is_no_catalogue_is_one_sentence(before, after, said):
-    assert catalogue.parse(WHOLE, "my.toml").case[0].peers == (RTK,)
+    assert finding.parse(WHOLE, "my.toml").case[0].peers == (RTK,)
     with pytest.raises(InputError) as error:
-        catalogue.parse(WHOLE.replace(before, after, 1), "my.toml")
+        finding.parse(WHOLE.replace(before, after, 1), "my.toml")
     assert str(error.value).startswith("my.toml: ") and said in str(error.value) and "\n" not in str(error.value)
 
 
 def test_code_and_catalogue_know_the_same_names(monkeypatch):
-    found = catalogue.load()
+    found = finding.load()
     assert set(MEASURED) <= {peer.name for peer in found.peer}
-    assert set(cases.PATH_SCENES) == set(catalogue.case("paths").scenes)
-    assert set(poly.SCENES) == set(catalogue.case("poly").scenes)
-    assert {m for m in catalogue.case("poly").peers if m in MEASURED} < set(poly.NOTES)
+    assert set(cases.PATH_SCENES) == set(finding.case("paths").scenes)
+    assert set(poly.SCENES) == set(finding.case("poly").scenes)
+    assert {m for m in finding.case("poly").peers if m in MEASURED} < set(poly.NOTES)
     names = [case.name for case in found.case]
     assert set(names) == set(cases.CASES)
     assert f"({', '.join(names)})" in Path(study.__file__).read_text(encoding="utf-8")  # what --help lists
     with pytest.raises(InputError, match="no case 'fkd': expected one of paths, exact"):
-        catalogue.case("fkd")
+        finding.case("fkd")
 
 
 def test_a_case_is_measured_on_all_of_its_scenes_and_peers_left_out_follow(monkeypatch):
@@ -79,7 +77,7 @@ def test_a_case_is_measured_on_all_of_its_scenes_and_peers_left_out_follow(monke
 def test_the_scene_of_the_case_paper_is_the_suites_with_so_many_views():
     from ctsim.benchmarks.suites import load, select
 
-    case = catalogue.case("paper")
+    case = finding.case("paper")
     for suite in ("quick", "paper"):
         chosen = select(load(suite), case.scenes, ())
     assert [scene.resolve().geometry.n_views for scene in chosen] == [case.views]
@@ -87,7 +85,7 @@ def test_the_scene_of_the_case_paper_is_the_suites_with_so_many_views():
 
 def test_a_peer_is_there_with_its_distribution_and_its_module():
     def peer(**found):
-        return catalogue.Peer(name="p", install="so", **found)
+        return finding.Peer(name="p", install="so", **found)
 
     assert peer(distribution="numpy").version == peer(distribution="numpy", module="numpy").version is not None
     assert peer(distribution="numpy", module="no_such_module").version is None
@@ -97,7 +95,7 @@ def test_a_peer_is_there_with_its_distribution_and_its_module():
 
 
 def test_a_peer_without_code_says_so_where_it_is_installed():
-    rows = Setup(case=catalogue.case("fdk"), versions={RTK: "2.7", "leap": "1.26"}).left_out()
+    rows = Setup(case=finding.case("fdk"), versions={RTK: "2.7", "leap": "1.26"}).left_out()
     assert [(m.contender, m.skipped) for m in rows] == [
         ("leap", "not measured"),
         ("tigre", "absent"),
@@ -105,18 +103,3 @@ def test_a_peer_without_code_says_so_where_it_is_installed():
     ]
     assert rows[0].reason == "leapct 1.26: this command has no code for it"
     assert "not for commercial use" in rows[2].reason and "GPU" in rows[2].reason
-
-
-def test_a_case_that_dies_is_a_row_and_the_next_begins(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(catalogue, "installed", dict)
-    monkeypatch.setattr(host, "use_threads", lambda threads: None)  # those of this process are not ours to set
-    fatal = study.Peers()
-    vars(fatal)["work"] = "peer_jobs:die_in_exact"  # of this one, which travels to the process
-    monkeypatch.setenv("CTSIM_TEST_MARK", str(tmp_path / "mark"))
-    words = [str(tmp_path / "r"), "--repeats", "1", "--small", "--case", "exact", "--case", "fdk", "--seconds", "60"]
-    assert engine.main(fatal, words) == 1
-    out = capsys.readouterr().out
-    assert "| exact | all | all | error | – | – | – | the process died with exit code 3 |" in out
-    (whole,) = (r.found[0] for r in fatal.store(study.Flags(results=tmp_path / "r")).read() if r.finished)
-    assert whole.note.startswith("small ") and whole.note != f"small {os.getpid()}"
-    assert not Path((tmp_path / "mark").read_text()).parent.exists()  # nor what it left there

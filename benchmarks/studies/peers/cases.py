@@ -22,12 +22,11 @@ from ctsim.benchmarks.engine import host
 from ctsim.benchmarks.engine.process import Process
 from ctsim.benchmarks.engine.record import Task
 from ctsim.benchmarks.oracles import SIZE, relative, scanner_of, upright_chord, voxelised
-from ctsim.benchmarks.studies.peers import catalogue
+from ctsim.benchmarks.studies.peers import finding
 from ctsim.benchmarks.studies.peers.finding import OURS, RTK, SIDES, XCIST, Measurement, Setup, versions
+from ctsim.benchmarks.studies.peers.libraries import Rtk, Xcist
 from ctsim.benchmarks.studies.peers.poly import poly
-from ctsim.benchmarks.studies.peers.rtk import Rtk
 from ctsim.benchmarks.studies.peers.study import Flags
-from ctsim.benchmarks.studies.peers.xcist import Xcist
 from ctsim.materials import attenuation
 from ctsim.phantoms.bodies import Validation
 from ctsim.phantoms.body_lung import Lung
@@ -183,7 +182,7 @@ CASES: dict[str, Callable[[Setup, str], list[Measurement]]] = {f.__name__: f for
 def measure(task: Task, given: Flags) -> list[Measurement]:
     """Measure a case on all of its scenes."""
     host.use_threads(task.settings["threads"])
-    case = catalogue.case(task.case)
+    case = finding.case(task.case)
     runs = {"repeats": given.repeats, "threads": host.host().threads}  # which may be fewer than asked for
     setup = Setup(case=case, side=SIDES[task.part], versions=versions(task), **runs)
     out: list[Measurement] = []

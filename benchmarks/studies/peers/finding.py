@@ -1,19 +1,108 @@
-"""A case of `run-benchmark peers` as it is measured, and what one contender reaches in it."""
+"""What `run-benchmark peers` compares: the catalogue `benchmarks/suites/peers.toml`, and what a contender reaches."""
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
-from typing import Any
+from importlib import metadata, resources, util
+from typing import Annotated, Any
+
+import msgspec
 
 from ctsim.benchmarks.engine.host import in_turns
 from ctsim.benchmarks.engine.record import Found, Task
-from ctsim.benchmarks.studies.peers import catalogue
-from ctsim.benchmarks.studies.peers.catalogue import Case
+from ctsim.errors import InputError
+from ctsim.phantoms.suites import decode, parse_toml
 
 OURS = "ctsim"
 MEASURED = RTK, XCIST = "itk-rtk", "xcist"  # the catalogue's peers that there is code for
 FULL, SMALL = "full", "small"
 SIDES = {FULL: 256, SMALL: 32}  # of grids and detectors
+Name = Annotated[str, msgspec.Meta(min_length=1)]
+Seconds = Annotated[float, msgspec.Meta(ge=0)]
+
+
+class Case(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A case: on which scenes, or on rods of which metals, in how many views, and with which peers.
+
+    `turn` and `rest` are seconds expected on full grids, see the file.
+    """
+
+    name: Name
+    views: Annotated[int, msgspec.Meta(ge=1)]
+    scenes: tuple[Name, ...] = ()
+    metals: tuple[Name, ...] = ()
+    turn: Seconds
+    rest: Seconds
+    peers: tuple[Name, ...] = ()
+    small: bool = True
+
+
+class Peer(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A library that does what a case measures: how it is found, how it is installed, and whether it needs a GPU."""
+
+    name: Name
+    distribution: Name
+    module: str = ""
+    install: Name
+    gpu: bool = False
+
+    @property
+    def version(self) -> str | None:
+        """Its version, None where it is not installed."""
+        if self.module and util.find_spec(self.module) is None:
+            return None
+        try:
+            return metadata.version(self.distribution)
+        except metadata.PackageNotFoundError:
+            return None
+
+    @property
+    def absence(self) -> str:
+        """The sentence that says that it is not there, and how to install it."""
+        return f"{self.distribution} is not installed ({self.install}{'; needs an NVIDIA GPU' if self.gpu else ''})"
+
+
+class Catalogue(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The whole file: names differ, and each case has scenes or metals, and peers that are listed."""
+
+    case: tuple[Case, ...]
+    peer: tuple[Peer, ...]
+
+    def __post_init__(self) -> None:
+        peers = [peer.name for peer in self.peer]
+        for names in ([case.name for case in self.case], peers):
+            if twice := sorted({name for name in names if names.count(name) > 1}):
+                raise InputError(f"{twice[0]!r} is there twice; names must differ")
+        for case in self.case:
+            if bool(case.scenes) == bool(case.metals):
+                raise InputError(f"case {case.name!r}: expected scenes or metals, one of the two")
+            if unknown := [name for name in case.peers if name not in peers]:
+                raise InputError(f"case {case.name!r}: no peer {unknown[0]!r}, expected of {', '.join(peers)}")
+
+
+def parse(text: str, where: str) -> Catalogue:
+    """Read a catalogue from TOML text; `where` names the file in messages. Raises InputError where it is none."""
+    return decode(parse_toml(text, where), Catalogue, where)
+
+
+@functools.cache
+def load() -> Catalogue:
+    """Read the bundled catalogue."""
+    file = resources.files("ctsim.benchmarks.suites") / "peers.toml"
+    return parse(file.read_text(encoding="utf-8"), str(file))
+
+
+def case(name: str) -> Case:
+    """Return a case of the bundled catalogue. Raises InputError naming those there are."""
+    cases = {case.name: case for case in load().case}
+    if name not in cases:
+        raise InputError(f"there is no case {name!r}: expected one of {', '.join(cases)}")
+    return cases[name]
+
+
+def installed() -> dict[str, str]:
+    """Return the versions of the peers that are installed, by name."""
+    return {peer.name: version for peer in load().peer if (version := peer.version) is not None}
 
 
 class Measurement(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -33,6 +122,10 @@ class Measurement(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
     error_kind: str = ""
     peak_bytes: int | None = None
     note: str = ""
+
+    def __post_init__(self) -> None:
+        if not all(second > 0 for seconds in self.seconds.values() for second in seconds):
+            raise ValueError("seconds must be positive")
 
     @property
     def runs(self) -> tuple[float, ...]:
@@ -71,7 +164,7 @@ class Setup:
         def call(name: str) -> None:
             last[name] = contenders[name]()
 
-        timed = in_turns({name: partial(call, name) for name in contenders}, self.repeats)
+        timed = in_turns({name: functools.partial(call, name) for name in contenders}, self.repeats)
         return {
             name: (last[name], Measurement(contender=name, seconds={"run": runs}, views=self.views, warm_up=first))
             for name, (first, runs) in timed.items()
@@ -80,7 +173,7 @@ class Setup:
     def left_out(self) -> list[Measurement]:
         """Return rows for the peers that are not measured: how to install them, or that there is no code for them."""
         out = []
-        for peer in catalogue.load().peer:
+        for peer in load().peer:
             if peer.name in self.case.peers and not self.measures(peer.name):
                 skipped, reason = "absent", peer.absence
                 if version := self.versions.get(peer.name):

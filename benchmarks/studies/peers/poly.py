@@ -1,4 +1,7 @@
-"""The case `poly` of `run-benchmark peers`: polychromatic projections, against what a pixel of finite size measures."""
+"""The case `poly` of `run-benchmark peers`: polychromatic projections, against what a pixel of finite size measures.
+
+It loads no torch, which would count in a contender's peak memory.
+"""
 
 import contextlib
 from collections.abc import Callable
@@ -11,8 +14,7 @@ from ctsim.benchmarks.engine import host
 from ctsim.benchmarks.engine.process import Process, Stopped
 from ctsim.benchmarks.oracles import measured_pixel, poly_scene, relative, scanner_of, voxelised
 from ctsim.benchmarks.studies.peers.finding import OURS, RTK, XCIST, Measurement, Setup
-from ctsim.benchmarks.studies.peers.rtk import Rtk
-from ctsim.benchmarks.studies.peers.xcist import Xcist
+from ctsim.benchmarks.studies.peers.libraries import Rtk, Xcist
 from ctsim.materials import attenuation
 from ctsim.plan import make_plan
 from ctsim.project import Response, Tracer, transmit

@@ -9,7 +9,7 @@ import tyro
 from ctsim.benchmarks.engine import host, study
 from ctsim.benchmarks.engine.record import Record, Task
 from ctsim.benchmarks.engine.table import Table
-from ctsim.benchmarks.studies.peers import catalogue, tables
+from ctsim.benchmarks.studies.peers import finding, tables
 from ctsim.benchmarks.studies.peers.finding import FULL, SMALL, Measurement
 from ctsim.errors import InputError
 
@@ -52,18 +52,18 @@ class Peers(study.Study[Record[Measurement], Flags]):
 
     def tasks(self, given: Flags) -> list[Task]:
         """Return a task for each case asked for, all that have grids of this size where none is named."""
-        asked = {catalogue.case(name) for name in given.case}
+        asked = {finding.case(name) for name in given.case}
         return [
             Task(
                 study=self.name,
                 part=given.part,
                 case=case.name,
-                settings={"threads": given.threads, **catalogue.installed()},
+                settings={"threads": given.threads, **finding.installed()},
                 code=host.commit(),
                 machine=host.machine(),
                 place=(place,),
             )
-            for place, case in enumerate(catalogue.load().case)
+            for place, case in enumerate(finding.load().case)
             if case in asked or (not asked and (case.small or not given.small))
         ]
 
@@ -73,16 +73,16 @@ class Peers(study.Study[Record[Measurement], Flags]):
 
     def runs(self, task: Task, given: Flags) -> int:
         """Return --repeats for cases that are measured in turns, else 1."""
-        return given.repeats if catalogue.case(task.case).turn else 1
+        return given.repeats if finding.case(task.case).turn else 1
 
     def expected(self, task: Task, given: Flags) -> float | None:
         """Return what the catalogue expects on full grids."""
-        case = catalogue.case(task.case)
+        case = finding.case(task.case)
         return None if given.small else case.turn * (given.repeats + 1) + case.rest
 
     def took(self, record: Record[Measurement], given: Flags) -> float | None:
         """Return the seconds of the recorded turns, and on full grids what the catalogue expects of the rest."""
-        case = catalogue.case(record.task.case)
+        case = finding.case(record.task.case)
         turns = super().took(record, given) if case.turn else 0.0
         return turns if given.small or turns is None else turns + case.rest
 

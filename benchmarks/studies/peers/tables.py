@@ -20,13 +20,13 @@ EXACT = f"{OURS}, exact solids"  # the only one of ours with a target in the cas
 
 
 class Verdict(NamedTuple):
-    """A target: on which scene, what of, what was measured, the limit, and relative to which peer."""
+    """A target: on which scene, what of, what was measured, relative to which peer, and the limit."""
 
     scene: str
     quantity: str
     value: float
+    peer: str
     limit: float
-    peer: str = ""
 
     @property
     def met(self) -> bool:
@@ -37,52 +37,43 @@ class Verdict(NamedTuple):
 def verdicts(case: str, found: Sequence[Measurement]) -> list[Verdict]:
     """Compare all of ours with the targets of their case; those that need a peer are left out where there is none."""
     out: list[Verdict] = []
-    for m in found:
-        if not _is_ours(m) or m.status != OK or (case == "exact" and m.contender != EXACT):
+    measured = [m for m in found if m.status == OK]
+    for m in measured:
+        who, _, how = m.contender.partition(", ")
+        if who != OURS or (case == "exact" and m.contender != EXACT):
             continue
-        peers = [p for p in found if p.scene == m.scene and p.status == OK and not _is_ours(p)]
-        who = m.contender.removeprefix(OURS).removeprefix(", ")
-        for quantity, limit in TARGETS.get(case, {}).items():
-            value, peer = _reached(quantity, m, peers)
-            if value is not None:
-                out.append(Verdict(f"{m.scene} ({who})" if who else m.scene, quantity, value, limit, peer))
+        peers = [p for p in measured if p.scene == m.scene and p.contender.partition(",")[0] != OURS]
+        reached, scene = _reached(m, peers), f"{m.scene} ({how})" if how else m.scene
+        targets = TARGETS.get(case, {})
+        out += [Verdict(scene, what, *reached[what], limit) for what, limit in targets.items() if what in reached]
     return out
 
 
-def _is_ours(m: Measurement) -> bool:
-    return m.contender.partition(",")[0] == OURS
-
-
-def _reached(quantity: str, m: Measurement, peers: Sequence[Measurement]) -> tuple[float | None, str]:
-    """Return a quantity of ours and the peer it is relative to: the fastest one, or the most accurate one."""
-    runs = {p.contender: p.runs for p in peers if p.runs}
-    errors = {p.contender: p.error for p in peers if p.error}
-    if quantity == "time ratio" and runs and m.runs:
-        best = min(runs, key=lambda name: median(runs[name]))
-        # the median over neighbouring runs, which drifts of the machine hardly touch
-        return median(a / b for a, b in zip(m.runs, runs[best], strict=True)), best
-    if quantity == "error ratio" and errors and m.error is not None:
-        best = min(errors, key=errors.__getitem__)
-        return m.error / errors[best], best
-    own = {
-        "relative RMS": m.error,
-        "seconds": median(m.runs) if m.runs else None,
-        "peak GB": None if m.peak_bytes is None else m.peak_bytes / 1e9,
-    }
-    return own.get(quantity), ""
+def _reached(m: Measurement, peers: Sequence[Measurement]) -> dict[str, tuple[float, str]]:
+    """Return the quantities of ours, and the peer each is relative to: the fastest one, or the most accurate one."""
+    out: dict[str, tuple[float, str]] = {}
+    if m.runs:
+        out["seconds"] = median(m.runs), ""
+        if timed := [p for p in peers if p.runs]:
+            best = min(timed, key=lambda p: median(p.runs))
+            # the median over neighbouring runs, which drifts of the machine hardly touch
+            out["time ratio"] = median(a / b for a, b in zip(m.runs, best.runs, strict=False)), best.contender
+    if m.error is not None:
+        out["relative RMS"] = m.error, ""
+        if errors := {p.contender: p.error for p in peers if p.error}:
+            best = min(errors, key=errors.__getitem__)
+            out["error ratio"] = m.error / errors[best], best
+    if m.peak_bytes is not None:
+        out["peak GB"] = m.peak_bytes / 1e9, ""
+    return out
 
 
 def judged(records: Sequence[Record[Measurement]]) -> list[Table]:
     """Return the table of targets, none where there are none."""
     rows = [
         (
-            r.task.case,
-            v.scene,
-            v.quantity,
-            v.peer or "–",
-            f"{v.value:.3g}",
-            f"≤ {v.limit:.3g}",
-            "yes" if v.met else "NO",
+            *(r.task.case, v.scene, v.quantity, v.peer or "–"),
+            *(f"{v.value:.3g}", f"≤ {v.limit:.3g}", "yes" if v.met else "NO"),
         )
         for r in records
         for v in verdicts(r.task.case, r.found)
