@@ -21,6 +21,14 @@ from test_record import places
 
 from ctsim.benchmarks import cli
 from ctsim.benchmarks.engine import host, study
+from ctsim.benchmarks.studies.methods import estimates
+from ctsim.benchmarks.studies.pareto import figure
+from ctsim.benchmarks.studies.pareto import finding as pareto_finding
+from ctsim.benchmarks.studies.pareto import measure as pareto_measure
+from ctsim.benchmarks.studies.pareto.study import Pareto
+from ctsim.benchmarks.studies.peers import cases as peer_cases
+from ctsim.benchmarks.studies.peers import finding as peer_finding
+from ctsim.benchmarks.studies.peers.study import Peers
 from ctsim.benchmarks.studies.skipping import simulator
 from ctsim.benchmarks.studies.skipping.simulator import Pair
 from ctsim.benchmarks.studies.skipping.study import Skipping
@@ -34,7 +42,8 @@ class Command:
     """A study as the tests call it.
 
     `words` are flags of every call but the first word, the results folder; `cases` asks for cases by number, `few` for
-    the first of them. `prepare(monkeypatch)` lets its tasks run in this process, in no time.
+    the first of them. `prepare(monkeypatch)` lets its tasks run in this process, in no time. `by_commit` says that its
+    tasks depend on the commit, and not on the sources that they use.
     """
 
     study: study.Study[Any, Any]
@@ -43,12 +52,18 @@ class Command:
     words: tuple[str, ...] = ()
     prepare: Callable[[pytest.MonkeyPatch], None] = lambda monkeypatch: None
     flag: str = "--case"
+    by_commit: bool = True
 
     def call(self, folder: Path, *words: str, cases: int | None = None) -> int:
         """Run the command as the user does, on the first of its cases; return the exit code."""
         asked = [word for case in self.cases[:cases] for word in (self.flag, case)]
         name = f"run-benchmark {self.study.name}".rstrip()
         return cli.guarded(name, self.module, [str(folder), *self.words, *asked, *words])
+
+    def listed(self, lines: list[str]) -> list[str]:
+        """Return the cases that --dry-run lists, and the word of their sum."""
+        words = (*self.cases, "total:")
+        return [next((word for word in line.split() if word in words), line) for line in lines]
 
     def records(self, folder: Path) -> list[Any]:
         given = self.study.flags(results=folder)
@@ -63,11 +78,45 @@ def in_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(simulator.CASES, case, lambda setup: iter([nothing]))
 
 
+def timed_in_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the study of run times find one mark of FDK, on scans that are not there, here."""
+    mark = pareto_finding.Mark(label="defaults", seconds=0.5, values={"rmse": 0.1, "psnr3d": 30.0}, default=True)
+    run = pareto_finding.Run(marks=(mark,))
+    monkeypatch.setattr(Pareto, "apart", False)
+    monkeypatch.setattr(Pareto, "prepare", lambda self, given: None)
+    monkeypatch.setattr(pareto_measure, "measure", lambda task, given: [run])
+    monkeypatch.setattr(estimates, "fdk_seconds", lambda geometry: 1.0)
+    monkeypatch.setattr(figure, "save", lambda points, path: None)
+    monkeypatch.setattr(host, "use_threads", lambda threads: None)  # those of this process are not ours to set
+
+
+def without_peers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a case of the study of peers take two seconds a run, of which there is one peer."""
+
+    def found(setup: Any, scene: str) -> list[Any]:
+        names = (peer_finding.OURS, peer_finding.RTK)
+        runs = {"run": (2.0,) * setup.repeats}
+        return [peer_finding.Measurement(contender=name, seconds=runs, error=0.1) for name in names]
+
+    for case in list(peer_cases.CASES):
+        monkeypatch.setitem(peer_cases.CASES, case, found)
+    monkeypatch.setattr(peer_finding, "installed", dict)
+    monkeypatch.setattr(peer_finding.Setup, "left_out", lambda self: [])
+    monkeypatch.setattr(host, "use_threads", lambda threads: None)
+
+
 STUDIES = {
     "tiny": Command(tiny_study.Tiny(), "tiny_study", ("good", "better", "best")),
     "skipping": Command(
         Skipping(), "ctsim.benchmarks.studies.skipping.study", ("rays", "energies", "edges"),
         ("--size", "small", "--repeats", "1"), in_no_time,
+    ),
+    "pareto": Command(
+        Pareto(), "ctsim.benchmarks.studies.pareto.study", ("lung-Fe", "teeth-Ti", "broccoli-Al"),
+        ("--part", "methods", "--method", "fdk", "--repeats", "1"), timed_in_no_time, "--scene", by_commit=False,
+    ),
+    "peers": Command(
+        Peers(), "ctsim.benchmarks.studies.peers.study", ("paths", "fdk", "poly"), ("--repeats", "1"), without_peers,
     ),
 }  # fmt: skip
 
@@ -113,7 +162,7 @@ def test_a_dry_run_lists_and_writes_nothing(command, measured, tmp_path, capsys)
     folder = tmp_path / "new"
     assert command.call(folder, "--dry-run") == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == [*command.cases, "total:"]
+    assert command.listed(lines) == [*command.cases, "total:"]
     assert lines[-1].startswith(f"total: 3 of 3 {command.study.unit}s, ")
     assert not folder.exists() and measured == []
     assert command.call(folder, cases=1) == 0
@@ -121,7 +170,7 @@ def test_a_dry_run_lists_and_writes_nothing(command, measured, tmp_path, capsys)
     capsys.readouterr()
     assert command.call(folder, "--dry-run") == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == [*command.cases[1:], "total:"]
+    assert command.listed(lines) == [*command.cases[1:], "total:"]
     assert lines[-1].startswith(f"total: 2 of 3 {command.study.unit}s, ")
     assert files(folder) == before
 
@@ -147,13 +196,13 @@ def test_a_commit_that_does_not_say_what_ran_is_measured_again(command, measured
     monkeypatch.setenv("CTSIM_TEST_CODE", commit)
     for _ in range(2):
         assert command.call(tmp_path, cases=1) == 0
-    assert measured == [command.cases[0]] * 2
+    assert measured == [command.cases[0]] * (2 if command.by_commit else 1)
 
 
 def test_more_runs_are_measured_and_fewer_are_recorded_already(command, measured, tmp_path):
-    for repeats, times in (("2", 1), ("3", 2), ("2", 2), ("3", 2)):
-        assert command.call(tmp_path, "--repeats", repeats, cases=1) == 0
-        assert len(measured) == times, repeats
+    for repeats, times in ((2, 1), (3, 2), (2, 2), (3, 2)):
+        assert command.call(tmp_path, "--repeats", str(repeats), cases=1) == 0
+        assert len(measured) == times + command.study.rounds, repeats  # two rounds are two tasks, three are three
 
 
 def test_the_table_is_written_from_the_records_alone(command, measured, tmp_path, capsys):
@@ -161,7 +210,8 @@ def test_the_table_is_written_from_the_records_alone(command, measured, tmp_path
     printed = capsys.readouterr().out
     page = tmp_path / f"{command.study.file}.md"
     text, done = page.read_bytes(), list(measured)
-    assert all(case in text.decode() for case in command.cases) and text.decode().strip() in printed
+    assert all(case in text.decode() for case in command.cases)
+    assert printed.partition("\nWritten: ")[0] in text.decode()  # which may have details below
     page.unlink()
     with (tmp_path / f"{command.study.file}.jsonl").open("ab") as file:
         file.write(b'{"task": {')  # as a kill leaves it
