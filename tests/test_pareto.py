@@ -13,11 +13,12 @@ import torch
 from conftest import SMALLEST
 from test_pareto_points import task, timed
 
-from ctsim.benchmarks import cli
+from ctsim.benchmarks import cli, suites
 from ctsim.benchmarks.engine import host
 from ctsim.benchmarks.engine.process import Process, Stopped
-from ctsim.benchmarks.methods import TABLE
+from ctsim.benchmarks.methods import TABLE, find
 from ctsim.benchmarks.oracles import measured_pixel, relative
+from ctsim.benchmarks.scores.protocol import evaluate
 from ctsim.benchmarks.studies.pareto import measure
 from ctsim.benchmarks.studies.pareto import study as pareto
 from ctsim.benchmarks.studies.pareto import suite as pareto_suite
@@ -144,6 +145,20 @@ def test_a_file_of_ones_own_says_what_is_measured_and_leaves_the_rest_as_it_is(t
     assert [e.label for e in pareto_suite.efforts(SUITE, mine)] == ["8 iterations"]
 
 
+def test_settings_are_tuned_one_at_a_time_from_the_defaults():
+    suite = pareto_suite.load(Path(suites.__file__).with_name("tune-settings.toml"))
+    assert suite.dataset.aligned and {scene.name for scene in suites.load(suite.dataset.suite)} > {"tune-Fe-64"}
+    for listed in suite.method:
+        first, *others = pareto_suite.efforts(suite, listed.name)
+        usual = find(listed.name).params
+        longest = 2 * usual["iterations"] if "iterations" in usual else None
+        assert first.default and first.params.get("iterations") == longest
+        for effort in others:
+            (key,) = effort.changes.keys() - {"iterations"}
+            assert effort.changes[key] != usual[key] and effort.params.get("iterations") == longest
+            assert effort.curve.startswith(f"{listed.name}, {key} ")
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -237,6 +252,18 @@ def test_the_clock_leaves_out_scoring_and_counts_what_begins_and_ends_a_run(smal
     assert [m.values["rmse"] for m in marks] == pytest.approx([0, 0, 0, 0.01])
 
 
+def test_volumes_are_scored_under_aligned_where_that_is_asked_for(smallest):
+    (folder,) = (path for path in smallest.iterdir() if (path / "scene.toml").exists())
+    plain, bench = measure.Stored(folder), measure.Stored(folder, True)
+    volume = 0.5 * bench.truth.references["effective"]
+    volume[::2] += 0.001
+    scores = evaluate(volume, bench.truth)
+    assert plain.values(volume) == {k: scores["tissue"].values[k] for k in ("rmse", "psnr3d")}
+    assert bench.values(volume) == plain.values(volume) | {"aligned": scores["aligned"].values["psnr3d"]}
+    volume[0, 0, 0] = np.inf
+    assert not bench.values(volume)
+
+
 def test_methods_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(host, "use_threads", lambda threads: None)  # the threads of this process are not ours to set
     out = tmp_path / "out"
@@ -265,7 +292,11 @@ def test_methods_end_to_end(tmp_path, monkeypatch, capsys):
     for default in ("fdk | defaults", "cgls | 15 iterations", "limar | defaults"):
         assert every.count(f"| {default} (default) |") == 1
     assert (out / "pareto.png").read_bytes().startswith(b"\x89PNG")
-    # other data of the scene are measured
+    # other protocols and other data of the scene are measured
+    mine = tmp_path / "mine.toml"
+    mine.write_text(mine.read_text("utf-8") + "\naligned = true", encoding="utf-8")
+    assert left() == {"fdk": 2, "cgls": 2, "limar": 2, "pareto_ends:fails": 2}
+    mine.write_text(mine.read_text("utf-8").replace("\naligned = true", ""), encoding="utf-8")
     (folder,) = (path for path in (out / "data").iterdir() if path.is_dir())
     manifest = folder / "manifest.json"
     manifest.write_text(re.sub('("content_hash": ")....', r"\1ffff", manifest.read_text("utf-8")), encoding="utf-8")

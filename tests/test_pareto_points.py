@@ -200,6 +200,16 @@ def said(records, tmp_path):
     return "\n".join(table.markdown() for table in Pareto().tables(shown(records, tmp_path), Flags(results=tmp_path)))
 
 
+def test_a_protocol_that_was_not_asked_for_has_no_column(tmp_path):
+    for scores, shown_there in (({}, False), ({"aligned": 31.5}, True)):
+        marks = (Mark(label="a", seconds=1.0, values={"rmse": 0.5, "psnr3d": 30.0, **scores}),)
+        tables = pareto_tables.every_point([record(task(), Run(marks=marks))])
+        tables += pareto_tables.summary([record(task(), Run(marks=marks))])
+        assert [("| aligned (dB) |" in t.markdown(), "| 31.50 |" in t.markdown()) for t in tables[:2]] == [
+            (shown_there, shown_there)
+        ] * 2
+
+
 def simulated(*rows):
     """Records of defaults whose rows are (label, seconds of the rounds, rms, worst)."""
     found = []

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from ctsim.phantoms.scene import Scene
 
-STUDY_SUITES = ("pareto", "peers", "stress")
+STUDY_SUITES = ("pareto", "peers", "stress", "tune-settings")
 """Suites of studies, which make-dataset does not know."""
 
 

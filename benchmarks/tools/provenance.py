@@ -36,7 +36,7 @@ PAGES: dict[str, Page] = {
     ),
     "methods": Page(
         title="Methods: settings and experiments",
-        command="python -m ctsim.benchmarks.tools.tune_settings data/ results/",
+        command="run-benchmark pareto results/ --suite benchmarks/suites/tune-settings.toml --part methods",
         sources=(*SIMULATOR, *METHODS, "benchmarks/scores/", "benchmarks/suites/"),
     ),
     "pareto": Page(
