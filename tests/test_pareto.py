@@ -47,7 +47,7 @@ def test_a_scene_is_opened_once_and_each_kind_of_choice_warmed_up_once():
     calls.clear()
     found = {}
     for label, kind in ("bx", "cy", "dy", "ax", "bx"):
-        found[label] = measure.timed(pareto_ends.Scene, ("rounds",), pareto_ends.Tried(label, kind))
+        found[label] = measure.timed(pareto_ends.Scene, ("rounds",), pareto_ends.Tried(label, kind), kind)
         assert found[label].warm_up == (0.5 if len(calls) in (3, 5) else None)
     assert calls == ["open rounds", "warm x", "b", "warm y", "c", "d", "a", "b"]
     assert {label: (run.ok, run.status, run.reason) for label, run in found.items()} == {
@@ -60,7 +60,8 @@ def test_a_scene_is_opened_once_and_each_kind_of_choice_warmed_up_once():
 
 def test_the_run_after_one_that_overstayed_warms_up_again():
     def timed_there(process, label, seconds=60.0):
-        return process.run(measure.timed, pareto_ends.Scene, ("hung",), pareto_ends.Tried(label, "x"), seconds=seconds)
+        tried = pareto_ends.Tried(label, "x")
+        return process.run(measure.timed, pareto_ends.Scene, ("hung",), tried, "x", seconds=seconds)
 
     with Process() as process:
         first, second = (timed_there(process, "a") for _ in range(2))
@@ -107,9 +108,7 @@ def test_the_bundled_suite_has_every_method_and_the_defaults_of_all():
         found = pareto_suite.efforts(SUITE, name)
         published = name in ("splat-paper", "splat-r2")  # whose own steps are hours
         assert [e.curve for e in found if e.default is not published] == [name]
-        assert len({(e.curve, e.label) for e in found}) == len(found), name
-    runs = pareto_suite.efforts(SUITE, "splat")
-    assert len({e.kind for e in runs}) == len(runs)  # each is compiled before its clock starts
+        assert len({(e.curve, e.label) for e in found}) == len(found), name  # each is compiled before its clock starts
     assert [e.label for e in pareto_suite.efforts(SUITE, "fdk")] == ["defaults"]
     assert [e.changes for e in pareto_suite.efforts(SUITE, "cgls")] == [{"iterations": 30}]
     choices = pareto_suite.choices(SUITE.simulator)
@@ -230,7 +229,7 @@ def test_the_clock_leaves_out_scoring_and_counts_what_begins_and_ends_a_run(smal
     monkeypatch.setattr("time.perf_counter", lambda: CLOCK[0])
     monkeypatch.setitem(TABLE, "slow", (f"{__name__}:slow", "counts only"))
     (folder,) = (path for path in smallest.iterdir() if (path / "scene.toml").exists())
-    bench = measure.Stored(folder)
+    bench = measure.MethodBench(folder)
 
     def score(volume):
         CLOCK[0] += 100
@@ -239,8 +238,8 @@ def test_the_clock_leaves_out_scoring_and_counts_what_begins_and_ends_a_run(smal
     monkeypatch.setattr(bench, "values", score)
     (effort,) = pareto_suite.efforts(SUITE, "slow")
     effort = msgspec.structs.replace(effort, stops=(1, 2, 3))
-    marks = bench.run(effort)
-    told = bench.run(msgspec.structs.replace(effort, default=False))
+    marks = bench.run(effort).marks
+    told = bench.run(msgspec.structs.replace(effort, default=False)).marks
     assert not any(m.default for m in told) and [m.label for m in told] == [m.label for m in marks]
     assert [(m.label, m.seconds, m.default) for m in marks] == [
         ("1 iteration", 8.0, False),
@@ -254,7 +253,7 @@ def test_the_clock_leaves_out_scoring_and_counts_what_begins_and_ends_a_run(smal
 
 def test_volumes_are_scored_under_aligned_where_that_is_asked_for(smallest):
     (folder,) = (path for path in smallest.iterdir() if (path / "scene.toml").exists())
-    plain, bench = measure.Stored(folder), measure.Stored(folder, True)
+    plain, bench = measure.MethodBench(folder), measure.MethodBench(folder, True)
     volume = 0.5 * bench.truth.references["effective"]
     volume[::2] += 0.001
     scores = evaluate(volume, bench.truth)
@@ -308,14 +307,14 @@ def test_methods_end_to_end(tmp_path, monkeypatch, capsys):
 
 @pytest.fixture(scope="module")
 def bench():
-    return measure.Rods(side=16, views=4)
+    return measure.SimulatorBench(side=16, views=4)
 
 
 def test_the_reference_is_converged_where_the_choices_are_not(bench):
     best, _ = bench.reference
     half = measured_pixel(bench.phantom, bench.scanner, bench.checked, finer=measure.FINER // 2, subrays=measure.FINEST)
     plain, default, finest = (
-        bench.run(Choice(curve="c", label=str(n), simulation=Simulation(subrays=n)))[0].values["rms"]
+        bench.run(Choice(curve="c", label=str(n), simulation=Simulation(subrays=n))).marks[0].values["rms"]
         for n in (1, Simulation().subrays, 233)
     )
     # a quarter of the rays moves the reference by less than what the finest choice is off it
@@ -339,12 +338,12 @@ def test_errors_are_those_of_p(bench):
 
 def test_scatter_is_judged_with_scatter(bench):
     off, on = (
-        bench.run(Choice(group=pareto_suite.SCATTER, curve=pareto_suite.SCATTER, label=str(k), level=k))[0].values[
-            "rms"
-        ]
+        bench.run(Choice(group=pareto_suite.SCATTER, curve=pareto_suite.SCATTER, label=str(k), level=k))
+        .marks[0]
+        .values["rms"]
         for k in (0, pareto_suite.HIGHEST)
     )
-    plain = bench.run(Choice(curve="c", label="c"))[0].values["rms"]
+    plain = bench.run(Choice(curve="c", label="c")).marks[0].values["rms"]
     # scatter fills up the darkest pixels, whose error leads, so it can but lessen what edges leave; without it P is off
     assert on < 2 * plain < off
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import tyro
 
@@ -30,3 +30,8 @@ class Flags(Shared):
     """Rounds: timed runs of each setting; tables show medians."""
     threads: int = 2
     """Threads of the kernels."""
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The parts that are asked for."""
+        return self.part or get_args(Part)

@@ -50,14 +50,6 @@ class Timed(Record[Run], frozen=True, kw_only=True, forbid_unknown_fields=True):
             raise ValueError(f"marks: expected values {', '.join(errors)}, none of them negative")
 
 
-class Ended(RuntimeError):
-    """A run ended without a result to score: its status and the reason."""
-
-    def __init__(self, status: str, reason: str) -> None:
-        super().__init__(f"{status}: {reason}")
-        self.status, self.reason = status, reason
-
-
 @dataclass(frozen=True, kw_only=True)
 class Point:
     """A task at one of its marks: the seconds of all rounds, and the errors, which do not differ between rounds.

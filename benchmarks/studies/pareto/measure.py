@@ -26,7 +26,7 @@ from ctsim.benchmarks.scores import metrics
 from ctsim.benchmarks.scores.protocol import Truth, aligned_score, tissue_range, truth_of
 from ctsim.benchmarks.studies.methods.attempt import describe, run_here, scan_for, skip, warm_up
 from ctsim.benchmarks.studies.pareto import Flags, suite
-from ctsim.benchmarks.studies.pareto.finding import Ended, Mark, Run
+from ctsim.benchmarks.studies.pareto.finding import Mark, Run
 from ctsim.benchmarks.studies.pareto.suite import EXACT, HIGHEST, SCATTER, Choice, Effort
 from ctsim.noise import Noise
 from ctsim.plan import Plan, make_plan
@@ -50,22 +50,21 @@ def measure(task: Task, given: Flags) -> list[Run]:
     asked = suite.load(given.suite)
     if task.part == "simulator":
         of = (asked.simulator.side, asked.simulator.views)
-        return [timed(Rods, of, msgspec.convert(task.settings, Choice))]
+        return [timed(SimulatorBench, of, msgspec.convert(task.settings, Choice), task.case)]
     of = (given.results / "data" / task.case, asked.dataset.aligned)
-    return [timed(Stored, of, msgspec.convert(task.settings, Effort))]
+    # other values of a parameter may take other kernels
+    return [timed(MethodBench, of, msgspec.convert(task.settings, Effort), task.subject)]
 
 
-def timed(make: Callable[..., Any], of: tuple[Hashable, ...], choice: Any) -> Run:
+def timed(make: Callable[..., Any], of: tuple[Hashable, ...], choice: Any, kind: str) -> Run:
     """Time a choice on the bench that `make(*of)` returns, after a warm-up if it is the first of its kind there."""
-    first, key = None, (make, *of, choice.kind)
+    first, key = None, (make, *of, kind)
     try:
         bench = _bench(make, of)
         if key not in _WARM:
             first = bench.warm_up(choice)
             _WARM.add(key)
-        return Run(marks=bench.run(choice), warm_up=first)
-    except Ended as end:
-        return Run(ok=end.status == Status.SKIPPED, status=end.status, reason=end.reason, warm_up=first)
+        return msgspec.structs.replace(bench.run(choice), warm_up=first)
     except Exception as error:  # a method's failure is a result
         status = "out_of_memory" if isinstance(error, MemoryError) else "error"
         return Run(ok=False, status=status, reason=describe(error), warm_up=first)
@@ -79,7 +78,7 @@ def _bench(make: Callable[..., Any], of: tuple[Hashable, ...]) -> Any:
 # --- the simulator -----------------------------------------------------------------------------------
 
 
-class Rods:
+class SimulatorBench:
     """The simulator's scene, its reference, and what is prepared for each choice; `side` is of detector and grid.
 
     The scene is analytic: a water cylinder with a bone rod and two iron rods. The reference has the finest of every
@@ -97,9 +96,9 @@ class Rods:
 
     def warm_up(self, _: Choice) -> float:
         """Run the defaults, so that compiling and the reference are not timed with a choice; return the seconds."""
-        return sum(mark.seconds for mark in self.run(USUALLY))
+        return sum(mark.seconds for mark in self.run(USUALLY).marks)
 
-    def run(self, choice: Choice) -> tuple[Mark, ...]:
+    def run(self, choice: Choice) -> Run:
         """Time all views of a choice and return its errors."""
         plan, phantom, scanner = self._plan(choice)
         start = time.perf_counter()
@@ -108,7 +107,8 @@ class Rods:
         found = np.stack([views[k] for k in self.checked])
         s = open_fraction(Scatter(level=HIGHEST), scanner.geometry) if choice.curve == SCATTER else 0.0
         label = f"{choice.label}, {len(plan.rule.energies)} energies"
-        return (Mark(label=label, seconds=seconds, values=self.errors(found, s), default=choice.default),)
+        mark = Mark(label=label, seconds=seconds, values=self.errors(found, s), default=choice.default)
+        return Run(marks=(mark,))
 
     def errors(self, p: NDArray[np.float32], scatter: float = 0.0) -> dict[str, float]:
         """Compare P of the checked views with the reference, to which `scatter` (S/I0) is added.
@@ -145,7 +145,7 @@ class Rods:
 # --- methods -----------------------------------------------------------------------------------------
 
 
-class Stored:
+class MethodBench:
     """A stored scene, on which every method of the table is timed over its own effort and scored under `tissue`.
 
     Iterative methods run once, past their default iterations, and are scored as they pass each of the stops (`watch`);
@@ -168,32 +168,26 @@ class Stored:
         method = find(effort.method, effort.changes)
         return warm_up(method, scan_for(method, self.stored, "metal"))
 
-    def run(self, effort: Effort) -> tuple[Mark, ...]:
-        """Time one run; return a mark at each stop, the default and the end, or one if the method cannot be watched.
-
-        Raises Ended where the method is skipped or there is no finite volume.
-        """
+    def run(self, effort: Effort) -> Run:
+        """Time one run, with a mark at each stop, the default and the end, or one if the method cannot be watched."""
         method, usual = find(effort.method, effort.changes), find(effort.method).params.get("iterations")
         marks = Marks(score=self.values, stops={*effort.stops, usual, method.params.get("iterations")})
         with watch(marks) if effort.watched else contextlib.nullcontext():
             outcome = skip(method, self.stored, "metal") or run_here(self.stored, "metal", method, 0.0)
         if outcome.status != Status.OK or outcome.values is None or outcome.cost is None:
-            raise Ended(outcome.status, outcome.reason)
+            return Run(ok=outcome.status == Status.SKIPPED, status=outcome.status, reason=outcome.reason)
         end, around, count = self.values(outcome.values), outcome.cost.wall - marks.watched, len(marks.seen)
         if not count:
-            return (Mark(label=effort.label, seconds=around, values=end, default=effort.default),)
+            return Run(marks=(Mark(label=effort.label, seconds=around, values=end, default=effort.default),))
         # the volume that is returned may be finished, such as by a last cut at 0
         marks.seen[-1] = marks.seen[-1][0], end
-        return tuple(
-            Mark(
-                label=f"{k} iteration{'s' * (k > 1)}",
-                seconds=seconds + around,
-                values=values,
-                default=effort.default and k == min(usual or count, count),
-            )
+        default = min(usual or count, count) if effort.default else None
+        passed = [
+            Mark(label=f"{k} iteration{'s' * (k > 1)}", seconds=seconds + around, values=values, default=k == default)
             for k, (seconds, values) in enumerate(marks.seen, 1)
             if values
-        )
+        ]
+        return Run(marks=tuple(passed))
 
     def values(self, volume: NDArray[np.float32]) -> dict[str, float]:
         """Return RMSE (1/mm) and PSNR3D (dB) of `tissue`, and PSNR3D of `aligned` where it is asked for.

@@ -9,7 +9,6 @@ import contextlib
 import functools
 import sys
 from collections.abc import Iterator, Sequence
-from typing import get_args
 
 import msgspec
 from tqdm import tqdm
@@ -64,7 +63,7 @@ class Pareto(study.Study[Record[Run], Flags]):
         """Return a task for each choice of the simulator, and for each run of a method on each scene."""
         asked, scenes, runs = suite.load(given.suite), scenes_of(given), efforts_of(given)
         size = f"{asked.simulator.side}² pixels, {asked.simulator.views} views"
-        simulated = "simulator" in _parts(given) and (not given.scene or RODS in given.scene)
+        simulated = "simulator" in given.parts and (not given.scene or RODS in given.scene)
         found = [(RODS, size, choice) for choice in (suite.choices(asked.simulator) if simulated else ())]
         scored = f"protocol {protocol.VERSION}" + ", aligned" * asked.dataset.aligned
         for scene in scenes:
@@ -136,10 +135,6 @@ class Pareto(study.Study[Record[Run], Flags]):
         return text
 
 
-def _parts(given: Flags) -> tuple[Part, ...]:
-    return given.part or get_args(Part)
-
-
 def scenes_of(given: Flags) -> list[Scene]:
     """Return the scenes that methods are to run on. Raises InputError for one that there is not."""
     dataset = suite.load(given.suite).dataset
@@ -151,11 +146,11 @@ def scenes_of(given: Flags) -> list[Scene]:
             raise InputError(f"{given.suite}: dataset.scenes: there is no {name!r}, expected one of {expected}")
     known: dict[Part, list[str]] = {"simulator": [RODS], "methods": list(scenes)}
     for name in given.scene:
-        if not any(name in known[part] for part in _parts(given)):
-            expected = "; ".join(f"{part}: {human_choice(known[part], name)}" for part in _parts(given))
+        if not any(name in known[part] for part in given.parts):
+            expected = "; ".join(f"{part}: {human_choice(known[part], name)}" for part in given.parts)
             raise InputError(f"--scene {name!r}: there is no such scene, expected one of {expected}")
     chosen = given.scene or dataset.scenes or scenes
-    return [scene for name, scene in scenes.items() if name in chosen and "methods" in _parts(given)]
+    return [scene for name, scene in scenes.items() if name in chosen and "methods" in given.parts]
 
 
 def efforts_of(given: Flags) -> list[Effort]:
@@ -163,7 +158,7 @@ def efforts_of(given: Flags) -> list[Effort]:
     asked, runs = suite.load(given.suite), []
     for name in given.method or [listed.name for listed in asked.method]:
         with _where(f"{given.suite}: " if given.suite and asked.listed(name) else ""):
-            runs += suite.efforts(asked, name) if "methods" in _parts(given) else []
+            runs += suite.efforts(asked, name) if "methods" in given.parts else []
     return runs
 
 

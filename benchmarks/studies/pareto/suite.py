@@ -6,7 +6,7 @@ compared within a `group` and make curves.
 
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 
@@ -132,11 +132,6 @@ class Effort(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     watched: bool = False
     stops: tuple[int, ...] = ()
 
-    @property
-    def kind(self) -> str:
-        """What one warm-up compiles: this run's kernels, since other values of a parameter may take others."""
-        return f"{self.curve}, {self.label}"
-
 
 class Choice(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One way to simulate the scene; `grid` (None: analytic) and `metal` say what is turned into voxels."""
@@ -149,7 +144,6 @@ class Choice(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     metal: bool = False
     level: Level = 0
     default: bool = False
-    kind: ClassVar[str] = "simulator"  # one warm-up compiles for all choices
 
 
 def efforts(suite: Suite, name: str) -> list[Effort]:
