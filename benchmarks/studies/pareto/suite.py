@@ -158,9 +158,7 @@ def efforts(suite: Suite, name: str) -> list[Effort]:
         more |= {"group": method.inputs, "curve": curve or name, "label": label}
         return Effort(method=name, changes=changes, params=method.params, **more)
 
-    further = [
-        effort(r.set, r.label, curve=r.curve or name, default=False, watched=True, stops=stops) for r in listed.run
-    ]
+    further = [effort(r.set, r.label, curve=r.curve, default=False, watched=True, stops=stops) for r in listed.run]
     if not listed.default:
         return further
     if key := listed.parameter:
