@@ -7,16 +7,16 @@ All runs share one process, which is replaced where a run exceeds its time limit
 
 import contextlib
 import functools
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TypeVar
 
 import msgspec
-from tqdm import tqdm
 
 from ctsim.benchmarks import suites
 from ctsim.benchmarks.engine import host, study
 from ctsim.benchmarks.engine.record import Record, Task
 from ctsim.benchmarks.engine.table import Table
+from ctsim.benchmarks.engine.terminal import Bar
 from ctsim.benchmarks.methods import code_version, find
 from ctsim.benchmarks.scores import protocol
 from ctsim.benchmarks.studies.methods import estimates
@@ -31,6 +31,7 @@ from ctsim.phantoms.dataset import make_scene
 from ctsim.phantoms.scene import Scene, scene_id
 
 RODS = "rods"
+T = TypeVar("T")
 VERSION = 2  # of what is measured
 RAY = 6.2e-7  # seconds of the simulator for a pixel of a view by default, on two cores (docs/measured/pareto.md)
 
@@ -56,8 +57,7 @@ class Pareto(study.Study[Record[Run], Flags]):
         data, scenes = given.results / "data", scenes_of(given)
         for scene in scenes if efforts_of(given) else ():
             if not is_complete(data, scene.name, scene_id(scene)):
-                bar = functools.partial(tqdm, desc=scene.name, unit="view", disable=None, file=sys.stderr)
-                make_scene(scene, data, watch=lambda views, first, n, bar=bar: bar(views, initial=first, total=n))
+                make_scene(scene, data, watch=functools.partial(_watched, scene.name))
 
     def tasks(self, given: Flags) -> list[Task]:
         """Return a task for each choice of the simulator, and for each run of a method on each scene."""
@@ -133,6 +133,12 @@ class Pareto(study.Study[Record[Run], Flags]):
             figure.save(drawn, picture)
             text += f"Figure: {picture}\n"
         return text
+
+
+def _watched(name: str, views: Iterable[T], first: int, n_views: int) -> Iterator[T]:
+    """Yield the views of a scan that is made, with a bar."""
+    with Bar(n_views, "view", first) as bar:
+        yield from bar.over(views, name)
 
 
 def scenes_of(given: Flags) -> list[Scene]:
