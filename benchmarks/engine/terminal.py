@@ -61,7 +61,7 @@ class Bar:
         """Say how many units are finished."""
         self.done = done
         if self._rich:
-            self._rich.update(self._task, completed=done, **({"description": text} if text else {}))
+            self._rich.update(self._task, completed=done, description=text or None)
         elif text or (time.monotonic() - self._said > EVERY):
             self._said = time.monotonic()
             line = f"{done}/{self._total} {self._unit}s" if self._unit else f"{done}/{self._total}"

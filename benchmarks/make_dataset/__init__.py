@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -37,7 +37,7 @@ class Options:
 
 def main(argv: list[str]) -> int:
     """Run the command; return 0, 2 for an error of the user's or damaged data, 130 when interrupted."""
-    given = tyro.cli(Options, prog="make-dataset", args=argv)
+    given: Any = tyro.cli(Options, prog="make-dataset", args=argv)
 
     from ctsim.benchmarks.make_dataset import work  # kernels: --help does not wait for them
 
