@@ -8,8 +8,7 @@ import numba
 import numpy as np
 
 from ctsim.benchmarks.studies.stress import worker
-from ctsim.benchmarks.studies.stress.rows import Row
-from ctsim.benchmarks.studies.stress.study import Outcome, Stress
+from ctsim.benchmarks.studies.stress.study import Outcome, Row, Stress
 
 
 def fine(side, found):
@@ -53,18 +52,19 @@ ENDS = {
 
 
 def catalogue(*names, code="code"):
-    rows = [Row(f.__name__, "test", "w", "e", f"stress_ends:{f.__name__}", (), code) for f in ENDS]
+    rows = [Row(f.__name__, "test", "w", "e", code) for f in ENDS]
     return {(row.case, row.subject): row for row in rows if not names or row.case in names}
 
 
-def judge(task, given, threads):
+def judge(task, given):
     worker.catalogue = lambda *_: catalogue()
-    return worker.judge(task, given, threads)
+    worker.PROGRAMS.update({(f.__name__, "test"): f for f in ENDS})
+    return worker.judge(task, given)
 
 
-def threads(task, given, n):
+def threads(task, given):
     most = numba.config.NUMBA_NUM_THREADS
-    numba.set_num_threads(n)
+    numba.set_num_threads(task.hints["threads"])
     return [Outcome(found=f"{numba.get_num_threads()} of {most} threads")]
 
 

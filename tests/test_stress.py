@@ -2,14 +2,13 @@
 
 import dataclasses
 import functools
-import pkgutil
 import sys
 
 import msgspec
 import numba
 import numpy as np
 import pytest
-from stress_ends import ENDS, Ends, Threads, catalogue, judge
+from stress_ends import ENDS, Ends, Threads, catalogue
 
 from ctsim import plan
 from ctsim.baselines.known_spectrum import Beam
@@ -17,9 +16,8 @@ from ctsim.benchmarks.engine import study as engine
 from ctsim.benchmarks.methods import TABLE, find
 from ctsim.benchmarks.studies.peers.cases import upright_chord
 from ctsim.benchmarks.studies.stress import methods as stress_methods
-from ctsim.benchmarks.studies.stress import rows, simulator, study
-from ctsim.benchmarks.studies.stress.findings import Findings, carry_out
-from ctsim.benchmarks.studies.stress.scans import example, few_views, lengths
+from ctsim.benchmarks.studies.stress import scans, simulator, study, worker
+from ctsim.benchmarks.studies.stress.scans import Findings, carry_out, example, few_views, lengths
 from ctsim.benchmarks.studies.stress.suite import Machine, Rod, Scene, load
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -37,16 +35,16 @@ from ctsim.reconstruct.splat.published_settings import Settings
 from ctsim.spectrum import Tube
 
 SMALLEST = 12
-SUBJECTS = [rows.label(*method) for method in rows.subjects()]
-ROWS = rows.catalogue()
-METHODS = [row for row in ROWS.values() if row.run.startswith(rows.MODULES["methods"]) and row.case != "float64"]
+SUBJECTS = [study.label(*method) for method in study.subjects()]
+ROWS = study.catalogue()
+METHODS = [row for row in ROWS.values() if row.method is not None]
 # every scene meets a third of the methods here and every method a third of the scenes; the command runs all
 SOME = [row for k, row in enumerate(METHODS) if (k // len(SUBJECTS) + k % len(SUBJECTS)) % 3 == 0]
 CASES = [*(row for row in ROWS.values() if row not in METHODS), *SOME]
 
 
 def judged(row, side=SMALLEST):
-    return carry_out(functools.partial(pkgutil.resolve_name(row.run), *row.given, side))[0]
+    return carry_out(functools.partial(worker.run, row, side))[0]
 
 
 @pytest.mark.parametrize("row", CASES, ids=lambda row: f"{row.case}-{row.subject}")
@@ -57,7 +55,8 @@ def test_a_case_is_as_expected(row):
 
 def test_every_method_and_kernel_has_its_cases():
     assert {subject for _, subject in ROWS} == {"simulator", "splat kernels", *SUBJECTS}
-    assert [find(*method).label for method in rows.subjects()] == SUBJECTS and {*TABLE} < {*SUBJECTS}
+    assert [find(*method).label for method in study.subjects()] == SUBJECTS
+    assert {name for name, _ in study.subjects()} == {*TABLE}
     assert {row.subject for row in SOME} == set(SUBJECTS)
     assert {row.case for row in SOME} == {*(scene.name for scene in load() if scene.methods), "threads"}
 
@@ -67,12 +66,14 @@ def test_a_case_is_the_same_for_all_its_subjects():
     scenes, whats = {scene.name: scene for scene in load()}, {}
     for row in ROWS.values():
         whats.setdefault(row.case, set()).add(row.what)
-        assert all(scene == scenes[row.case] for scene in row.given if isinstance(scene, Scene))
+        assert row.scene is None or row.scene == scenes[row.case]
     assert [case for case, what in whats.items() if len(what) > 1] == []
     assert {case for case, subject in ROWS if subject == "simulator"} == {
         *(name for name, scene in scenes.items() if scene.simulated), "flat-solids", "float64", "threads",
     }  # fmt: skip
-    assert {*simulator.CHECKS} == {*rows.CHECKS} < {*scenes}
+    assert {*simulator.CHECKS} == {*study.CHECKS} < {*scenes}
+    no_scenes = {name for name, row in ROWS.items() if row.scene is None and row.method is None}
+    assert no_scenes == {*worker.PROGRAMS} == {(c, subject) for subject, own in study.PROGRAMS.items() for c, *_ in own}
 
 
 # --- closed forms ------------------------------------------------------------------------------------
@@ -115,9 +116,8 @@ def test_without_as_many_energies_as_it_takes_the_scan_is_reported(monkeypatch):
 
 
 def test_a_volume_that_depends_on_the_number_of_threads_is_reported(monkeypatch):
-    results = iter([np.zeros(3), np.ones(3)])
-    monkeypatch.setattr(stress_methods, "on_threads", lambda n, call: next(results))
-    monkeypatch.setattr(stress_methods, "thread_counts", lambda: [1, 2])
+    monkeypatch.setattr(scans, "on_threads", lambda n, call: np.full(3, n))
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 2)
     (wrong,) = judged(ROWS["threads", "fdk"]).wrong
     assert "differ" in wrong
 
@@ -166,7 +166,7 @@ class Here(Ends):
 
     def measure(self, task, given):
         Here.ran += 1
-        return judge(task, given, numba.get_num_threads())
+        return super().measure(task, given)
 
 
 @pytest.fixture

@@ -11,11 +11,20 @@ import pytest
 from test_imports import loaded
 
 from ctsim.benchmarks.studies.stress import methods as stress_methods
-from ctsim.benchmarks.studies.stress import rows, study
-from ctsim.benchmarks.studies.stress.changes import Filled, Magnified, Rounded, Turned, Twice
-from ctsim.benchmarks.studies.stress.findings import Findings
-from ctsim.benchmarks.studies.stress.scans import example, other_example
-from ctsim.benchmarks.studies.stress.suite import RODS, Circle, OfSide, Scene, load
+from ctsim.benchmarks.studies.stress import study
+from ctsim.benchmarks.studies.stress.scans import Findings, changed, example
+from ctsim.benchmarks.studies.stress.suite import (
+    RODS,
+    Circle,
+    Filled,
+    Magnified,
+    OfSide,
+    Rounded,
+    Scene,
+    Turned,
+    Twice,
+    load,
+)
 from ctsim.errors import InputError
 
 SIDE = 8
@@ -60,7 +69,7 @@ def read(tmp_path, text):
 def test_what_a_scene_leaves_out_is_usual(tmp_path):
     (scene,) = read(tmp_path, HEAD)
     where = scene.scanner.resolve(SIDE).geometry
-    assert scene.near and scene.methods and other_example(scene, SIDE) is None
+    assert scene.near and scene.methods and scene.like is None
     assert where == Circle().resolve(SIDE) and where.d_voxel == (7.5,) * 3 and where.s_detector == (150.0, 150.0)
     usual = example(scene, SIDE).scan
     assert len(RODS) == 3
@@ -90,20 +99,20 @@ def test_metal_is_what_is_known_as_metal_or_said_to_be(tmp_path):
 def test_a_change_is_of_the_counts_or_of_what_is_said_of_them():
     given = example(Scene(name="usual", what="usual"), SIDE)
     counts, where = given.scan.counts, given.scan.geometry
-    twice = Twice().of(given).scan
+    twice = changed(given, Twice()).scan
     assert twice.counts.shape[0] == 2 * where.n_views and np.array_equal(twice.counts[1::2], counts)
     assert np.allclose(twice.geometry.angles[1::2], where.angles)
-    assert set(np.unique(Filled(value=7).of(given).scan.counts)) == {7}
-    rounded = Rounded().of(given).scan.counts / counts.float()
+    assert set(np.unique(changed(given, Filled(value=7)).scan.counts)) == {7}
+    rounded = changed(given, Rounded()).scan.counts / counts.float()
     assert 0 < abs(rounded - 1).max() < 2e-7
-    larger = Magnified(voxel_mm=75.0).of(given)
+    larger = changed(given, Magnified(voxel_mm=75.0))
     assert larger.scan.geometry.dso == 10 * where.dso and larger.scan.geometry.d_voxel == (75.0,) * 3
     assert np.allclose(larger.reference * 10, given.reference)
     crowded = dataclasses.replace(
         given, scan=dataclasses.replace(given.scan, geometry=Circle(crowding=2.0).resolve(SIDE))
     )
     for one in (given, crowded):
-        turned = Turned(deg=1.0).of(one).scan.geometry
+        turned = changed(one, Turned(deg=1.0)).scan.geometry
         assert np.allclose(turned.angles - one.scan.geometry.angles, np.radians(1.0))
 
 
@@ -138,7 +147,7 @@ def test_what_is_wrong_is_said_with_file_and_path(line, words, tmp_path):
 def test_names_of_other_cases_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"scene\[0\]\.name must not be 'threads', which is a case of its own"):
         read(tmp_path, HEAD.replace("own", "threads"))
-    taken = {case for case, subject in rows.catalogue() if subject in rows.TABLE} - {s.name for s in load()}
+    taken = {case for case, subject in study.catalogue() if subject in study.TABLE} - {s.name for s in load()}
     assert taken == {"threads", "float64"}
 
 
@@ -171,14 +180,14 @@ def test_methods_of_the_users_own_run_on_scenes_of_their_own(tmp_path, own, caps
 
 def test_a_scene_for_the_simulator_alone_is_none_for_methods(tmp_path):
     (tmp_path / "own.toml").write_text(HEAD + "methods = false\n", encoding="utf-8")
-    assert {case for case, _ in rows.catalogue(tmp_path / "own.toml", ("sirt",))} == {"threads"}
+    assert {case for case, _ in study.catalogue(tmp_path / "own.toml", ("sirt",))} == {"threads"}
 
 
 def test_the_rows_of_a_method_are_those_of_its_variants_and_of_nothing_else():
-    subjects = {subject for _, subject in rows.catalogue(None, ("splat",))}
-    assert subjects == {rows.label(*m) for m in rows.subjects(("splat",))} and "splat[response=known]" in subjects
-    assert {case for case, _ in rows.catalogue(None, ("fdk",))} > {"float64", "threads"}
-    assert "float64" not in {case for case, _ in rows.catalogue(None, ("sirt",))}
+    subjects = {subject for _, subject in study.catalogue(None, ("splat",))}
+    assert subjects == {study.label(*m) for m in study.subjects(("splat",))} and "splat[response=known]" in subjects
+    assert {case for case, _ in study.catalogue(None, ("fdk",))} > {"float64", "threads"}
+    assert "float64" not in {case for case, _ in study.catalogue(None, ("sirt",))}
 
 
 def test_the_true_mask_is_for_methods_that_declare_to_be_given_it(own):
@@ -193,7 +202,7 @@ def test_a_scene_that_says_something_else_is_run_again(tmp_path):
     def code(n, text):
         path = tmp_path / f"own-{n}.toml"
         path.write_text(HEAD + text, encoding="utf-8")
-        return rows.catalogue(path, ("fdk",))["own", "fdk"].code
+        return study.catalogue(path, ("fdk",))["own", "fdk"].code
 
     assert code(0, "") == code(1, "near = true") != code(2, "scanner.i0 = 1e4")
 
@@ -215,4 +224,4 @@ def test_the_page_names_every_key():
 
 
 def test_the_rows_are_listed_without_torch():
-    assert "torch" not in loaded("from ctsim.benchmarks.studies.stress.rows import catalogue\ncatalogue()")
+    assert "torch" not in loaded("from ctsim.benchmarks.studies.stress.study import catalogue\ncatalogue()")

@@ -17,20 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.benchmarks.methods import SPECTRUM, TABLE, Method, find
-from ctsim.benchmarks.studies.stress.changes import Example
-from ctsim.benchmarks.studies.stress.findings import Findings
-from ctsim.benchmarks.studies.stress.limits import GROUPS, NEAR, P_SURE, bound_of, same_of
-from ctsim.benchmarks.studies.stress.scans import (
-    exact_p,
-    example,
-    lengths,
-    on_threads,
-    other_example,
-    scan_from,
-    simulated,
-    thread_counts,
-)
-from ctsim.benchmarks.studies.stress.suite import Machine, Scene
+from ctsim.benchmarks.studies.stress import scans
+from ctsim.benchmarks.studies.stress.scans import USUAL, Example, Findings, example
+from ctsim.benchmarks.studies.stress.suite import BOUNDS, GROUPS, NEAR, P_SURE, Machine, Scene, same_of
 from ctsim.geometry import Geometry
 from ctsim.kernels.backproject_reference import backproject
 from ctsim.noise import Noise
@@ -41,8 +30,6 @@ from ctsim.reconstruct.redundancy import ray_weights
 from ctsim.settings import Truth
 from ctsim.spectrum import TABLE_KVP
 from ctsim.types import Scan, Status, Volume
-
-USUAL = Scene(name="usual", what="usual")
 
 
 def bound(scan: Scan) -> float:
@@ -56,8 +43,8 @@ def bound(scan: Scan) -> float:
 
 def on_scene(name: str, settings: dict[str, Any], scene: Scene, side: int, found: Findings) -> None:
     """Run a method on a scene and judge what it returns."""
-    method, given, other = find(name, settings), example(scene, side), other_example(scene, side)
-    if _refuses(method, given.scan.e_max):
+    method, given = find(name, settings), example(scene, side)
+    if method.name in TABLE and method.inputs == SPECTRUM and given.scan.e_max > TABLE_KVP[1]:
         found.refused("kvp must be within", lambda: method.reconstruct(given.scan))
         return
     if reason := method.skip(given.scan):
@@ -68,12 +55,13 @@ def on_scene(name: str, settings: dict[str, Any], scene: Scene, side: int, found
     if values.shape != given.scan.geometry.n_voxel:
         found.say(f"the volume has shape {values.shape}, the grid {given.scan.geometry.n_voxel}", holds=False)
         return
-    _judge(volume, found, given, scene, bound_of(name))
+    _judge(volume, found, given, scene, BOUNDS.get(name, 1.0))
     if name in GROUPS["by-mask"] and given.scan.metal is not None and not given.scan.metal.any():
         found.same("without metal its bits and FDK's are", values, fdk(given.scan).values.numpy())
-    if other is not None and scene.has_other(name):
-        factor = given.scan.geometry.dso / other.scan.geometry.dso  # lengths may differ
-        expected = _volume(method, other.scan).values.numpy()
+    if scene.has_other(name):
+        other = example(scene, side, scene.like).scan
+        factor = given.scan.geometry.dso / other.geometry.dso  # lengths may differ
+        expected = _volume(method, other).values.numpy()
         off = float(np.abs(values * factor - expected).max() / max(np.abs(expected).max(), 1e-30))
         found.at_most("off the other form of the scan by", off, same_of(name))
 
@@ -81,11 +69,6 @@ def on_scene(name: str, settings: dict[str, Any], scene: Scene, side: int, found
 def _volume(method: Method, scan: Scan) -> Volume:
     """Run a method, with the true mask only where it declares to be given it."""
     return method.reconstruct(scan if method.mask == "oracle" else dataclasses.replace(scan, metal=None))
-
-
-def _refuses(method: Method, e_max: float) -> bool:
-    """Say whether a method of the table takes a spectrum from one that ends below the scan's."""
-    return method.name in TABLE and method.inputs == SPECTRUM and e_max > TABLE_KVP[1]
 
 
 def _judge(volume: Volume, found: Findings, given: Example, scene: Scene, bounds: float) -> None:
@@ -106,11 +89,7 @@ def _judge(volume: Volume, found: Findings, given: Example, scene: Scene, bounds
 def on_any_threads(name: str, settings: dict[str, Any], side: int, found: Findings) -> None:
     """Compare the volumes of 1, 2 and all threads."""
     method, scan = find(name, settings), example(USUAL, side).scan
-    first, *others = thread_counts()
-    values = on_threads(first, lambda: _volume(method, scan).values.numpy())
-    for n in others:
-        other = on_threads(n, lambda: _volume(method, scan).values.numpy())
-        found.same(f"volumes of {first} and {n} threads are", values, other)
+    found.same_on_threads("volumes", lambda: _volume(method, scan).values.numpy())
 
 
 # --- the whole chain: counts and FDK in float32, closed-form P and FDK in float64 -----------------------
@@ -134,10 +113,10 @@ def fdk_in_float64(p: NDArray[np.float64], of: Geometry) -> NDArray[np.float64]:
 def chain(side: int, found: Findings) -> None:
     """Compare the volumes of both chains; P may differ by the simulator's limit, the volume by that through FDK."""
     scanner = Machine(noise=Noise(model="none")).resolve(side)
-    stacks, volumes = simulated(USUAL.phantom(), scanner, Truth(twin=False))
-    scan = scan_from(stacks, volumes, scanner)
+    stacks, volumes = scans.simulated(USUAL.phantom(), scanner, Truth(twin=False))
+    scan = scans.scan_from(stacks, volumes, scanner)
     values = fdk(scan).values.numpy()
-    p = exact_p(scanner, lengths(USUAL, scanner.geometry))
+    p = scans.exact_p(scanner, scans.lengths(USUAL, scanner.geometry))
     exact = fdk_in_float64(p, scanner.geometry)
     found.finite("the volume", values)
     limit = bound(scan) * P_SURE / p.max()

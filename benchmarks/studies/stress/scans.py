@@ -1,7 +1,14 @@
-"""Scans of the stress suite's scenes: simulated, and what is known of them in closed form."""
+"""What the rows of the stress suite share: what they found, simulated scans and their closed forms, threads.
 
+A row fails where a number exceeds its limit and where anything is raised or warned of.
+"""
+
+import dataclasses
 import functools
+import time
+import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -12,8 +19,19 @@ import torch
 from numpy.typing import NDArray
 
 from ctsim.baselines.morphology import dilate
-from ctsim.benchmarks.studies.stress.changes import Example, Twice
-from ctsim.benchmarks.studies.stress.suite import Circle, Machine, Rod, Scene
+from ctsim.benchmarks.studies.stress.suite import (
+    AnyChange,
+    Circle,
+    Filled,
+    Machine,
+    Magnified,
+    Rod,
+    Rounded,
+    Scene,
+    Turned,
+    Twice,
+)
+from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.plan import make_plan
@@ -25,8 +43,130 @@ from ctsim.spectrum import spectrum
 from ctsim.types import Phantom, Scan, Scanner
 
 FEW = 6  # views of the simulator's rows where the scene has as many as its grid asks for
-Lengths = Mapping[str, NDArray[np.float64]]
-"""Length (mm) of every central ray in each material, times its relative density: [view, v, u]."""
+USUAL = Scene(name="usual", what="usual")
+Stacks = Mapping[str, NDArray[Any]]
+
+
+@dataclass(slots=True)
+class Findings:
+    """What a row found, in words; `wrong` is what is not as expected."""
+
+    said: list[str] = field(default_factory=list)
+    wrong: list[str] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        return "; ".join([*(f"NOT EXPECTED: {words}" for words in self.wrong), *self.said])
+
+    def say(self, words: str, *, holds: bool = True) -> None:
+        """Note something that was found, and whether it was expected."""
+        (self.said if holds else self.wrong).append(words)
+
+    def at_most(self, what: str, value: float, limit: float) -> None:
+        """Note a number that must not exceed its limit; one that is not a number does."""
+        holds = bool(value <= limit)
+        self.say(f"{what} {value:.2g}" + ("" if holds else f", limit {limit:.2g}"), holds=holds)
+
+    def finite(self, what: str, values: NDArray[Any]) -> None:
+        """Note values that are not finite."""
+        if not (fine := np.isfinite(values)).all():
+            self.say(f"{int((~fine).sum())} of {fine.size} values of {what} are not finite", holds=False)
+
+    def same(self, what: str, one: NDArray[Any], other: NDArray[Any]) -> None:
+        """Note whether two arrays are equal to the last bit."""
+        equal = one.shape == other.shape and np.array_equal(one, other)
+        self.say(f"{what} {'equal to the last bit' if equal else 'differ'}", holds=equal)
+
+    def same_on_threads(self, what: str, call: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+        """Note whether `call` gives the same bits on 1, 2 and all threads; return those of 1."""
+        most = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]
+        first = on_threads(1, call)
+        for n in sorted({min(2, most), most} - {1}):
+            self.same(f"{what} of 1 and {n} threads are", first, on_threads(n, call))
+        return first
+
+    def refused(self, words: str, call: Callable[[], object]) -> None:
+        """Note whether `call` raises an InputError whose sentence holds `words`."""
+        try:
+            call()
+        except InputError as error:
+            self.say(f"refused: {error}", holds=words in str(error))
+        else:
+            self.say(f"not refused, expected an InputError with {words!r}", holds=False)
+
+
+def carry_out(run: Callable[[Findings], None]) -> tuple[Findings, float]:
+    """Return what `run` finds and the seconds it took; exceptions and warnings, also numpy's, are not expected."""
+    found, began = Findings(), time.perf_counter()
+    with warnings.catch_warnings(record=True) as caught, np.errstate(divide="warn", over="warn", invalid="warn"):
+        warnings.simplefilter("always")
+        try:
+            run(found)
+        except Exception as error:  # an exception of any kind is a finding
+            found.say(" ".join(f"{type(error).__name__}: {error}".split()), holds=False)
+    for text in dict.fromkeys(f"{w.category.__name__}: {w.message}" for w in caught):
+        found.say(text, holds=False)
+    return found, time.perf_counter() - began
+
+
+def on_threads(threads: int, call: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+    """Call with so many threads of numba's."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(threads)
+    try:
+        return call()
+    finally:
+        numba.set_num_threads(before)
+
+
+# --- scans ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Example:
+    """A scan as a method gets it, with the true metal mask, and what it is judged by.
+
+    `reference` [z, y, x] is the effective attenuation in 1/mm; errors are taken over `region`, voxels a voxel or more
+    inside the body and more than two from metal, in the field of view.
+    """
+
+    scan: Scan
+    reference: NDArray[np.float32]
+    region: NDArray[np.bool_]
+
+    def error(self, values: NDArray[np.float32]) -> float:
+        """Return the RMSE over that of an empty volume; 0 where there is no region."""
+        if not self.region.any():
+            return 0.0
+        there = self.reference[self.region].astype(np.float64)
+        return float(np.sqrt(np.mean((values[self.region] - there) ** 2) / np.mean(there**2)))
+
+
+def changed(given: Example, change: AnyChange) -> Example:
+    """Return an example with other counts, or with another geometry said of the same ones."""
+    g, counts, factor = given.scan.geometry, given.scan.counts, 1.0
+    match change:
+        case Twice():
+            g, counts = doubled(g), counts.repeat_interleave(2, 0)
+        case Filled():
+            counts = torch.full_like(counts, change.value)
+        case Rounded():
+            ulps = np.random.Generator(np.random.Philox(key=5)).uniform(-1, 1, counts.shape)
+            counts = counts.float() * torch.from_numpy((1 + ulps * 2.0**-24).astype(np.float32))
+        case Turned():
+            angles = None if g.angles_deg is None else tuple(a + change.deg for a in g.angles_deg)
+            g = msgspec.structs.replace(g, start_deg=g.start_deg + change.deg, angles_deg=angles)
+        case Magnified():
+            factor = change.voxel_mm / g.d_voxel[2]
+            sizes = {name: tuple(d * factor for d in getattr(g, name)) for name in ("d_voxel", "d_detector")}
+            g = msgspec.structs.replace(g, dso=g.dso * factor, dsd=g.dsd * factor, **sizes)
+    scan = dataclasses.replace(given.scan, geometry=g, counts=counts)
+    return dataclasses.replace(given, scan=scan, reference=given.reference / np.float32(factor))
+
+
+def doubled(geometry: Geometry) -> Geometry:
+    """Return a geometry with each view followed by itself."""
+    angles = np.degrees(geometry.angles).repeat(2)
+    return msgspec.structs.replace(geometry, angles_deg=tuple(angles.tolist()), n_views=angles.size)
 
 
 def simulated(
@@ -40,7 +180,7 @@ def simulated(
     return stacks, dict(truth_volumes(plan, phantom, scanner))
 
 
-def scan_from(stacks: Mapping[str, NDArray[Any]], volumes: Mapping[str, NDArray[Any]], scanner: Scanner) -> Scan:
+def scan_from(stacks: Stacks, volumes: Stacks, scanner: Scanner) -> Scan:
     """Return what `simulated` gave as a method gets it."""
     return Scan(
         geometry=scanner.geometry,
@@ -53,18 +193,13 @@ def scan_from(stacks: Mapping[str, NDArray[Any]], volumes: Mapping[str, NDArray[
     )
 
 
-def example(scene: Scene, side: int) -> Example:
-    """Return a scene's scan for methods on grids of so many voxels a side, sub-rays and noise included."""
-    return scene.change.of(_example(_unchanged(scene), side))
+def example(scene: Scene, side: int, change: AnyChange | None = None) -> Example:
+    """Return a scene's scan for methods on side³ voxels, sub-rays and noise included, changed as the scene says.
 
-
-def other_example(scene: Scene, side: int) -> Example | None:
-    """Return the other form of the scan, if there is one."""
-    return None if scene.like is None else scene.like.of(_example(_unchanged(scene), side))
-
-
-def _unchanged(scene: Scene) -> Scene:
-    return Scene(name="", what="", rods=scene.rods, block=scene.block, scanner=scene.scanner)
+    `change` is another change of the same scan instead.
+    """
+    bare = Scene(name="", what="", rods=scene.rods, block=scene.block, scanner=scene.scanner)
+    return changed(_example(bare, side), change or scene.change)
 
 
 @functools.lru_cache(maxsize=4)
@@ -87,27 +222,27 @@ def few_views(scene: Scene, side: int) -> Scanner:
         of = msgspec.structs.replace(of, n_views=FEW)
     scanner = msgspec.structs.replace(scene.scanner, geometry=of).resolve(side)
     if isinstance(scene.change, Twice):
-        where = msgspec.structs.replace(scanner.geometry, **scene.change.where(scanner.geometry))
-        scanner = msgspec.structs.replace(scanner, geometry=where)
+        scanner = msgspec.structs.replace(scanner, geometry=doubled(scanner.geometry))
     return scanner
 
 
 def usual(side: int, **geometry: Any) -> tuple[Phantom, Scanner]:
     """Return water with a rod of bone and one of titanium, on a circle that differs from the usual one as given."""
-    return Scene(name="usual", what="usual").phantom(), Machine(geometry=Circle(**geometry)).resolve(side)
+    return USUAL.phantom(), Machine(geometry=Circle(**geometry)).resolve(side)
 
 
 # --- closed forms, float64 ----------------------------------------------------------------------------
 
 
 def lengths(scene: Scene, of: Geometry) -> dict[str, NDArray[np.float64]]:
-    """Return the length of every central ray in each material of a scene."""
+    """Return the length (mm) of every central ray in each material, times its relative density: [view, v, u]."""
+    rays = _rays(of)
     if scene.block is not None:
-        half, density = scene.block.edge / 2, scene.block.density
-        enter, leave = _slabs(_rays(of), (half, half, half))
-        return {"water": (1.0 if density is None else density) * np.maximum(leave - enter, 0.0)}
+        enter, leave = _slabs(rays, (scene.block.edge / 2,) * 3)
+        density = 1.0 if scene.block.density is None else scene.block.density
+        return {"water": density * np.maximum(leave - enter, 0.0)}
     found = {rod.material: np.zeros(of.shape) for rod in scene.all_rods}
-    spans = [_span(_rays(of), rod) for rod in scene.all_rods]
+    spans = [_span(rays, rod) for rod in scene.all_rods]
     ends = np.sort(np.concatenate(spans), axis=0)
     for low, high in pairwise(ends):  # nothing changes along a ray between two ends
         middle, owner = (low + high) / 2, np.full(of.shape, -1)
@@ -147,28 +282,9 @@ def _span(rays: tuple[NDArray, NDArray], rod: Rod) -> NDArray[np.float64]:
     return np.stack([enter, np.where(root > 0, np.maximum(leave, enter), enter)])
 
 
-def exact_p(scanner: Scanner, lengths: Lengths) -> NDArray[np.float64]:
+def exact_p(scanner: Scanner, lengths: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return P = −ln(signal/open) of the whole fine spectrum: [view, v, u]."""
     fine = full_rule(spectrum(scanner.tube), scanner.detector)
     depth = sum(length[..., None] * attenuation(m, fine.energies) for m, length in lengths.items() if m != "air")
     least = np.asarray(depth).min(-1)
     return least - np.log(np.exp(least[..., None] - depth) @ fine.w1)
-
-
-# --- threads ------------------------------------------------------------------------------------------
-
-
-def on_threads(threads: int, call: Callable[[], NDArray[Any]]) -> NDArray[Any]:
-    """Call with so many threads of numba's."""
-    before = numba.get_num_threads()
-    numba.set_num_threads(threads)
-    try:
-        return call()
-    finally:
-        numba.set_num_threads(before)
-
-
-def thread_counts() -> list[int]:
-    """Return 1, 2 and as many threads as there are, each once."""
-    most = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]
-    return sorted({1, min(2, most), most})

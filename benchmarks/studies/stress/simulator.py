@@ -11,19 +11,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.benchmarks.studies.stress.findings import Findings
-from ctsim.benchmarks.studies.stress.limits import CLAMP, FLOAT32, MASS, P_SURE
-from ctsim.benchmarks.studies.stress.scans import (
-    FEW,
-    exact_p,
-    few_views,
-    lengths,
-    on_threads,
-    simulated,
-    thread_counts,
-    usual,
-)
-from ctsim.benchmarks.studies.stress.suite import RODS, Scene, in_air
+from ctsim.benchmarks.studies.stress.scans import FEW, Findings, exact_p, few_views, lengths, simulated, usual
+from ctsim.benchmarks.studies.stress.suite import CLAMP, FLOAT32, MASS, P_SURE, RODS, Scene, in_air
 from ctsim.kernels import raytrace_cpu, raytrace_reference
 from ctsim.materials import attenuation
 from ctsim.noise import Noise
@@ -37,53 +26,47 @@ from ctsim.solids import FRUSTUM, Primitive, Solid
 from ctsim.spectrum import Tube
 from ctsim.types import Phantom, Scanner
 
-Stacks = dict[str, NDArray[Any]]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Bench:
-    """A scene on a scanner of few views; `depth` are the lengths of its central rays, `p` their P [view, v, u]."""
+class Measured:
+    """A scan of few views: its stacks by name, the lengths of its central rays and their P, all [view, v, u]."""
 
     phantom: Phantom
     scanner: Scanner
     depth: NDArray[np.float64]
     p: NDArray[np.float64]
-
-
-def bench(scene: Scene, side: int) -> Bench:
-    """Return a scene with its closed form."""
-    scanner = few_views(scene, side)
-    inside = lengths(scene, scanner.geometry)
-    p = exact_p(scanner, inside)
-    if scanner.scatter.fraction:
-        p = -np.log(np.exp(-p) + scanner.scatter.fraction)
-    return Bench(phantom=scene.phantom(), scanner=scanner, depth=np.sum(list(inside.values()), axis=0), p=p)
+    stacks: dict[str, NDArray[Any]]
 
 
 def on_scene(scene: Scene, side: int, found: Findings) -> None:
     """Compare a scan of a scene with its closed form, and check what is special about it."""
-    given = bench(scene, side)
-    stacks, volumes = simulated(given.phantom, given.scanner, Truth(twin=False, noise_free=True))
+    phantom, scanner = scene.phantom(), few_views(scene, side)
+    inside = lengths(scene, scanner.geometry)
+    exact = exact_p(scanner, inside)
+    if scanner.scatter.fraction:
+        exact = -np.log(np.exp(-exact) + scanner.scatter.fraction)
+    stacks, volumes = simulated(phantom, scanner, Truth(twin=False, noise_free=True))
     for name, values in (stacks | volumes).items():
         found.finite(name, values)
-    p, seen = stacks["noise_free"], given.p <= P_MAX
-    found.at_most("|ΔP|", float(np.abs(p - given.p)[seen].max(initial=0.0)), P_SURE)
-    found.say(f"P to {given.p.max():.3g}")
+    p, seen = stacks["noise_free"], exact <= P_MAX
+    found.at_most("|ΔP|", float(np.abs(p - exact)[seen].max(initial=0.0)), P_SURE)
+    found.say(f"P to {exact.max():.3g}")
     if not seen.all():
         low, high = float(p[~seen].min()), float(p[~seen].max())
         found.say(f"P beyond {P_MAX:g} within {low:.3g} … {high:.3g}", holds=low >= P_MAX - P_SURE and high <= CLAMP)
     if (rod := scene.lone) is not None:
-        there = float(volumes["reference_50kev"].sum(dtype=np.float64) * np.prod(given.scanner.geometry.d_voxel))
+        there = float(volumes["reference_50kev"].sum(dtype=np.float64) * np.prod(scanner.geometry.d_voxel))
         mu = float(attenuation(rod.material, np.array([REFERENCE_KEV]))[0])
         found.at_most("mass on the grid off by", abs(there / (mu * np.pi * rod.radius**2 * rod.height) - 1), MASS)
     if scene.name in CHECKS:
-        CHECKS[scene.name](given, stacks, found)
+        depth = np.sum(list(inside.values()), axis=0)
+        CHECKS[scene.name](Measured(phantom=phantom, scanner=scanner, depth=depth, p=exact, stacks=stacks), found)
 
 
 # --- what some scenes are checked for beyond P --------------------------------------------------------
 
 
-def unbiased(given: Bench, stacks: Stacks, found: Findings) -> None:
+def unbiased(given: Measured, found: Findings) -> None:
     """Compare the mean of counts without an ADC with the closed form; a Poisson draw is unbiased at any dose."""
     plain = msgspec.structs.replace(given.scanner, noise=Noise(electronic=0.0, adc_bits=None))
     counts = simulated(given.phantom, plain, Truth(twin=False))[0]["counts"]
@@ -94,21 +77,21 @@ def unbiased(given: Bench, stacks: Stacks, found: Findings) -> None:
     found.say(f"{np.mean(counts == 0):.0%} of the readings are 0")
 
 
-def dark(given: Bench, stacks: Stacks, found: Findings) -> None:
+def dark(given: Measured, found: Findings) -> None:
     """Look for photons behind what lets none through: what is left is the pedestal."""
     pedestal = given.scanner.noise.dark
-    found.say(f"all readings are the pedestal {pedestal:g}", holds=bool((stacks["counts"] == pedestal).all()))
+    found.say(f"all readings are the pedestal {pedestal:g}", holds=bool((given.stacks["counts"] == pedestal).all()))
 
 
-def clipped(given: Bench, stacks: Stacks, found: Findings) -> None:
+def clipped(given: Measured, found: Findings) -> None:
     """Look at an open field that fills the ADC: noise clips at full scale and does not wrap round."""
-    full, readings = given.scanner.noise.full_scale, stacks["counts"][given.depth == 0]
+    full, readings = given.scanner.noise.full_scale, given.stacks["counts"][given.depth == 0]
     # half of a symmetric distribution lies above its mean; Poisson's at 1e4 is skewed by 1 %
     found.at_most("share of open readings at full scale off a half by", abs(np.mean(readings == full) - 0.5), 0.05)
     found.at_most("largest drop of an open reading", float(1 - readings.min() / full), 0.1)
 
 
-def no_twin(given: Bench, stacks: Stacks, found: Findings) -> None:
+def no_twin(given: Measured, found: Findings) -> None:
     """Compare a scan without metal with the twin of one with metal, count by count."""
     with_metal = in_air(*given.phantom.solids, RODS["titanium"].solid())
     twin, _ = simulated(with_metal, given.scanner, Truth(), subrays=34)
@@ -117,17 +100,17 @@ def no_twin(given: Bench, stacks: Stacks, found: Findings) -> None:
     found.say("no twin of its own", holds="metal_free/counts" not in bare)
 
 
-def equal_views(given: Bench, stacks: Stacks, found: Findings) -> None:
+def equal_views(given: Measured, found: Findings) -> None:
     """Compare the views at equal angles, which are equal before noise."""
-    found.same("views at one angle are", stacks["noise_free"][::2], stacks["noise_free"][1::2])
+    found.same("views at one angle are", given.stacks["noise_free"][::2], given.stacks["noise_free"][1::2])
 
 
-def table_ends(given: Bench, stacks: Stacks, found: Findings) -> None:
+def table_ends(given: Measured, found: Findings) -> None:
     """Ask the bundled table for a tube that only the closed-form one reaches."""
     found.refused("covers 10 to 500", lambda: Tube(kvp=given.scanner.tube.kvp))
 
 
-CHECKS: dict[str, Callable[[Bench, Stacks, Findings], None]] = {
+CHECKS: dict[str, Callable[[Measured, Findings], None]] = {
     "ten-photons": unbiased,
     "tungsten-120mm": dark,
     "full-scale": clipped,
@@ -145,14 +128,13 @@ def flat_solids(side: int, found: Findings) -> None:
     phantom, scanner = usual(side, n_views=FEW)
     pieces = [Primitive(kind=FRUSTUM, centre=(3.0, 1.0, 2.0), params=p) for p in ((0.0, 5.0, 5.0), (10.0, 0.0, 0.0))]
     thin = [Solid(name="flat", material="Fe", primitives=(piece,), metal=True) for piece in pieces]
-    both = [
-        simulated(p, scanner, Truth(twin=False, noise_free=True)) for p in (phantom, in_air(*phantom.solids, *thin))
-    ]
-    (without, _), (stacks, _) = both
-    found.same("P with and without them are", stacks["noise_free"], without["noise_free"])
-    found.refused(
-        "must not be negative", lambda: Primitive(kind=FRUSTUM, centre=(0.0, 0.0, 0.0), params=(-1.0, 1.0, 1.0))
+    without, both = (
+        simulated(p, scanner, Truth(twin=False, noise_free=True))[0]["noise_free"]
+        for p in (phantom, in_air(*phantom.solids, *thin))
     )
+    found.same("P with and without them are", both, without)
+    centre, params = (0.0, 0.0, 0.0), (-1.0, 1.0, 1.0)
+    found.refused("must not be negative", lambda: Primitive(kind=FRUSTUM, centre=centre, params=params))
 
 
 def beside_float64(side: int, found: Findings) -> None:
@@ -183,9 +165,6 @@ def same_bits(side: int, found: Findings) -> None:
     def counts() -> NDArray[Any]:
         return np.stack([v["counts"] for _, v in simulate_views(plan, phantom, scanner)])
 
-    results = {n: on_threads(n, counts) for n in thread_counts()}
-    first = results[1]
-    for n, other in results.items():
-        found.same(f"counts of 1 and {n} threads are", first, other)
+    first = found.same_on_threads("counts", counts)
     alone = [next(iter(simulate_views(plan, phantom, scanner, k)))[1]["counts"] for k in range(FEW)]
     found.same("views made alone and in turn are", np.stack(alone), first)

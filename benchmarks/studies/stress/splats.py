@@ -1,13 +1,13 @@
 """Stress rows of the splat kernels: odd splats together with a fair one, which they must neither spoil nor move."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.benchmarks.studies.stress.findings import Findings
-from ctsim.benchmarks.studies.stress.limits import PROJECTED, RESPONDED, VOXELISED
-from ctsim.benchmarks.studies.stress.scans import on_threads, thread_counts
+from ctsim.benchmarks.studies.stress.scans import Findings
+from ctsim.benchmarks.studies.stress.suite import PROJECTED, RESPONDED, VOXELISED
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.splat.densify import Schedule, densify
 from ctsim.reconstruct.splat.kernels import response_reference, splat_reference
@@ -28,7 +28,6 @@ GEOMETRY = Geometry(
     start_deg=7.0,
 )
 TURNED = (1.0, 0.3, 0.2, 0.1)
-Arrays = dict[str, NDArray[np.float32]]
 
 
 def splat(place: Sequence[float], scales: Sequence[float], turn: Sequence[float] = TURNED) -> Splats:
@@ -42,11 +41,7 @@ FAIR = splat([1.0, 2.0, -1.0], [1.0, 2.0, 1.5], (1.0, 2.0, 3.0, 4.0))
 
 def joined(one: Splats, other: Splats) -> Splats:
     """Return both sets, the first one's splats first."""
-    return Splats(**{name: np.concatenate([a, _arrays(other)[name]]) for name, a in _arrays(one).items()})
-
-
-def _arrays(given: Splats) -> Arrays:
-    return {name: getattr(given, name) for name in ("positions", "scales", "densities", "rotations")}
+    return Splats(**{name: np.concatenate([a, getattr(other, name)]) for name, a in asdict(one).items()})
 
 
 def _near_float64(found: Findings, given: Splats) -> None:
@@ -127,7 +122,7 @@ def outside(_: int, found: Findings) -> None:
 
 def empty(_: int, found: Findings) -> None:
     """Project, voxelise and differentiate no splats."""
-    none = Splats(**{name: a[:0] for name, a in _arrays(FAIR).items()})
+    none = Splats(**{name: a[:0] for name, a in asdict(FAIR).items()})
     view = Projector(geometry=GEOMETRY)
     images = view.forward(none.shapes(), none.densities)
     found.say("images of zeros", holds=images.shape == (3, 2, 23, 38) and not images.any())
@@ -140,9 +135,8 @@ def not_finite(_: int, found: Findings) -> None:
     """Seed a splat with NaN or infinity in each of its arrays; densification drops it."""
     for value in (np.nan, np.inf):
         for name in ("positions", "scales", "rotations", "densities"):
-            arrays = {key: a.copy() for key, a in _arrays(splat([0, 0, 0], [2, 2, 2])).items()}
-            arrays[name][0, 0] = value
-            odd = Splats(**arrays)
+            odd = splat([0, 0, 0], [2, 2, 2])
+            getattr(odd, name)[0, 0] = value
             _beside_fair(found, f"{value} in {name}", odd, seen=name == "densities")
             kept, origin = densify(joined(odd, FAIR), np.zeros(2), GEOMETRY, Schedule(), np.uint64(1))
             found.say(f"{value} in {name}: dropped", holds=len(kept) == 1 and origin.tolist() == [1])
@@ -189,10 +183,7 @@ def same_bits(side: int, found: Findings) -> None:
         parts = (images, one, view.adjoint(shapes, images), voxelise(given, GEOMETRY), gradient.positions)
         return np.concatenate([p.ravel() for p in (*parts, gradient.log_scales)])
 
-    first, *others = thread_counts()
-    bits = on_threads(first, everything)
-    for n in others:
-        found.same(f"all sums of {first} and {n} threads are", bits, on_threads(n, everything))
+    found.same_on_threads("all sums", everything)
     order = [2, 0, 1]
     images = [view.forward(shapes, given.densities, [k])[0] for k in range(3)]
     again = view.forward(shapes, given.densities, order)

@@ -1,25 +1,160 @@
-"""`run-benchmark stress OUT`: what is hard on the numbers, each case with an expected outcome."""
+"""`run-benchmark stress OUT`: what is hard on the numbers, each case with an expected outcome.
 
-import pkgutil
+Listing the rows simulates and reconstructs nothing.
+"""
+
+import functools
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, NamedTuple
 
-import tyro
+import msgspec
 
 from ctsim.benchmarks.engine import host, study
 from ctsim.benchmarks.engine.record import Found, Record, Task, latest
 from ctsim.benchmarks.engine.table import Table, simple
-from ctsim.benchmarks.studies.stress.limits import FULL, SHORT
+from ctsim.benchmarks.methods import TABLE, Method, code_version, find
+from ctsim.benchmarks.studies.stress import Flags, suite
+from ctsim.benchmarks.studies.stress.suite import Scene, load
 from ctsim.errors import InputError
 from ctsim.human import human_choice
+from ctsim.quadrature import P_MAX
 
-CATALOGUE = "ctsim.benchmarks.studies.stress.rows:catalogue"
+SIMULATOR, SPLAT_KERNELS = "simulator", "splat kernels"  # subjects that are no methods
 # seconds of a row on one idle core, short and full, from runs on a busy machine
-SECONDS = {"simulator": (0.3, 0.6), "splat kernels": (0.1, 0.1)}
+SECONDS = {SIMULATOR: (0.3, 0.6), SPLAT_KERNELS: (0.1, 0.1)}
 SECONDS_OF_METHOD = (0.2, 0.5)
+STEPS = 100  # of the published methods, whose own 20000 are hours; they add splats from the 500th on
+VARIANTS: dict[str, tuple[dict[str, Any], ...]] = {
+    "splat": ({}, {"response": "known"}),
+    "splat-paper": ({"steps": STEPS},),
+    "splat-r2": ({"steps": STEPS},),
+}
+"""Parameters with which a method runs where those are not its defaults alone."""
+
+CLOSED_FORM = f"|ΔP| ≤ {suite.P_SURE:g} of the float64 closed form where P ≤ {P_MAX:g}, finite beyond"
+MASS = f"mass on the grid within {suite.MASS:g}"
+CHECKS = {
+    "ten-photons": "mean count within five standard errors",
+    "tungsten-120mm": "the pedestal everywhere",
+    "full-scale": "half of the open readings at full scale, none wraps",
+    "no-metal": "the bits of the metal-free twin of a body with metal, and no twin",
+    "duplicate-views": "equal views have equal bits",
+    "450kvp": "the bundled table refuses by name",
+}
+"""What is expected of the simulator beside the closed form, by scene."""
+
+ODD = "finite, and the other splats keep their bits"
+FLAT, NARROW, THREADS = "solids of no thickness", "float32 beside float64", "1, 2 and all threads"
+PEAK = f"within {suite.PROJECTED:g} of float64's peak"
+BITS = "equal to the last bit"
+PROGRAMS = {
+    SIMULATOR: (
+        ("flat-solids", FLAT, "the bits of the scan without them; negative sizes refused"),
+        ("float64", NARROW, f"|ΔP| ≤ {suite.FLOAT32:g}, sub-rays included"),
+        ("threads", THREADS, f"{BITS}, views in any order, too"),
+    ),
+    SPLAT_KERNELS: (
+        ("needles", "needles and discs of 20000:1", f"{PEAK}; finite gradient"),
+        ("sub-pixel", "splats far smaller than a pixel", PEAK),
+        ("behind-source", "splats behind, at and next to the source", f"{ODD}; not seen in that view"),
+        ("outside", "splats that no ray meets", f"{ODD}; not seen"),
+        ("empty-set", "no splats", "zeros of the right shapes"),
+        ("nan-seed", "a splat of NaN or infinity", f"{ODD}; not seen, and dropped"),
+        ("opaque", "path values up to 1e4", f"the response within {suite.RESPONDED:g} of float64"),
+        ("float64", NARROW, f"many splats of all shapes {PEAK}"),
+        ("threads", THREADS, f"{BITS}, views in another order, too"),
+    ),
+    "fdk": (("float64", NARROW, f"closed-form P and FDK in float64 as far off as |ΔP| ≤ {suite.P_SURE:g} allows"),),
+}
+"""Case, what it is and what is expected, of rows that are no scene; what judges them is in `worker`."""
+
+
+class Row(NamedTuple):
+    """One row: a scene, a method (name and settings), both or neither.
+
+    `subject` is SIMULATOR, SPLAT_KERNELS or a method's label. `code` hashes scene and sources, which decide the result.
+    """
+
+    case: str
+    subject: str
+    what: str
+    expected: str
+    code: str
+    method: tuple[str, dict[str, Any]] | None = None
+    scene: Scene | None = None
+
+
+@functools.lru_cache
+def catalogue(path: Path | None = None, methods: tuple[str, ...] = ()) -> dict[tuple[str, str], Row]:
+    """Return all rows by (case, subject), those of methods on the scenes of a file; only those of `methods` if named.
+
+    Raises InputError for a file that is wrong and a method that does not exist.
+    """
+    chosen = [*_of_methods(load(path), methods)]
+    own = [] if methods else [*_of_simulator(), *_programs(SPLAT_KERNELS, "splats")]
+    chain = [*_programs("fdk", "methods")] if "fdk" in (methods or TABLE) else []
+    return {(row.case, row.subject): row for row in (*own, *chain, *chosen)}
+
+
+def subjects(names: Sequence[str] = ()) -> list[tuple[str, dict[str, Any]]]:
+    """Return the methods of these names, by default of the table, each with the parameters of its variants."""
+    return [(name, given) for name in dict.fromkeys(names or TABLE) for given in VARIANTS.get(name, ({},))]
+
+
+def label(name: str, given: dict[str, Any]) -> str:
+    """Return a method's label without loading the method."""
+    return Method(name=name, target="", inputs="", params={}, overrides=given).label
+
+
+def _code(module: str) -> str:
+    return code_version(f"ctsim.benchmarks.studies.stress.{module}")
+
+
+def _programs(subject: str, module: str) -> Iterator[Row]:
+    for case, what, expected in PROGRAMS[subject]:
+        yield Row(case, subject, what, expected, _code(module))
+
+
+def _of_simulator() -> Iterator[Row]:
+    for scene in load():
+        if scene.simulated:
+            words = (CLOSED_FORM, MASS if scene.lone else "", CHECKS.get(scene.name, ""))
+            expected, code = "; ".join(filter(None, words)), _code("simulator") + scene.digest
+            yield Row(scene.name, SIMULATOR, scene.what, expected, code, scene=scene)
+    yield from _programs(SIMULATOR, "simulator")
+
+
+def _of_methods(scenes: Sequence[Scene], names: Sequence[str]) -> Iterator[Row]:
+    """Yield every scene by every method, scene by scene, so that methods share scans."""
+    methods = [(method, label(*method), _code("methods") + _code_of(method[0])) for method in subjects(names)]
+    for scene in scenes:
+        for method, named, code in methods if scene.methods else ():
+            expected = _expected(method[0], scene)
+            yield Row(scene.name, named, scene.what, expected, code + scene.digest, method, scene)
+    for method, named, code in methods:
+        yield Row("threads", named, THREADS, BITS, code, method)
+
+
+def _code_of(name: str) -> str:
+    """Hash a method's sources; those of the table are not loaded for it."""
+    return code_version(TABLE[name][0].partition(":")[0]) if name in TABLE else find(name).code
+
+
+def _expected(name: str, scene: Scene) -> str:
+    bounds = f"{suite.BOUNDS[name]:g} times " if name in suite.BOUNDS else ""
+    words = [f"finite, within {bounds}the bound of values"]
+    if scene.unlit:
+        words.append("a status other than ok, and its reason")
+    if scene.near:
+        words.append(f"error ≤ {suite.NEAR:g} of an empty volume's, or its limitation said")
+    if scene.has_other(name):
+        words.append(f"as the other form of the scan to {suite.same_of(name):g}")
+    return "; ".join(words)
+
+
+# --- the command ----------------------------------------------------------------------------------------------
 
 
 class Outcome(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -47,28 +182,6 @@ class StressRecord(Record[Outcome], frozen=True, kw_only=True, forbid_unknown_fi
         return True
 
 
-@dataclass(frozen=True, kw_only=True)
-class Flags(study.Options):
-    """Put simulator, methods and splat kernels under numerical stress; exit code 1 if anything is not as expected.
-
-    A row fails where it misses its oracle, is not finite, raises, warns, crashes or does not end.
-    """
-
-    results: tyro.conf.Positional[Path]
-    """The folder for stress.jsonl and stress.md; made if it is not there."""
-    short: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Small grids; every case, in about two minutes on two cores."""
-    case: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
-    """Only this case; may be given several times (default: all)."""
-    suite: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None
-    """Scenes for the methods in place of the bundled ones; docs/how-to/test-stability.md lists its keys."""
-    method: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
-    """Only the rows of this method, such as fdk, or of module:function of your own; may be given several times
-    (default: all methods, simulator and splat kernels)."""
-    seconds: float | None = 120.0
-    """Time limit of one row, compilation and the start of its process included."""
-
-
 class Stress(study.Study[Record[Outcome], Flags]):
     """The study."""
 
@@ -88,7 +201,11 @@ class Stress(study.Study[Record[Outcome], Flags]):
 
     def measure(self, task: Task, given: Flags) -> Sequence[Outcome]:
         """Judge a row on the threads that there are."""
-        return pkgutil.resolve_name(self.work)(task, given, self.threads)
+        return super().measure(msgspec.structs.replace(task, hints={"threads": self.threads}), given)
+
+    def rows(self, given: Flags) -> dict[tuple[str, str], Row]:
+        """Return the rows by (case, subject)."""
+        return catalogue(given.suite, given.method)
 
     def check(self, given: Flags) -> None:
         """Refuse names of cases that are none."""
@@ -97,13 +214,9 @@ class Stress(study.Study[Record[Outcome], Flags]):
             if name not in known:
                 raise InputError(f"--case {name!r}: expected one of {human_choice(known, name)}")
 
-    def rows(self, given: Flags) -> dict[tuple[str, str], Any]:
-        """Return the rows by (case, subject); what lists them is loaded here, so that --help does without."""
-        return pkgutil.resolve_name(CATALOGUE)(given.suite, given.method)
-
     def tasks(self, given: Flags) -> list[Task]:
         """Return a task for each row."""
-        side = SHORT if given.short else FULL
+        side = suite.SHORT if given.short else suite.FULL
         rows = [row for row in self.rows(given).values() if not given.case or row.case in given.case]
         return [
             Task(
@@ -137,12 +250,19 @@ class Stress(study.Study[Record[Outcome], Flags]):
 
     def tables(self, records: Sequence[Record[Outcome]], given: Flags) -> list[Table]:
         """Return what is not as expected, the cases, and every row."""
-        wrong = [r for r in records if not r.found[0].ok]
         side = records[0].task.settings["side"]
         caption = f"{side} voxels a side; {_how_many(records)}; {_seconds(records):.0f} s in all."
-        rows = [[r.task.case, r.task.subject, r.found[0].words] for r in wrong]
-        named = [simple(["case", "subject", "found"], rows, title="Not as expected", caption=caption)] * bool(wrong)
-        return [*named, by_case(records, "" if wrong else caption), _every_row(records)]
+        rows = [
+            [r.task.case, r.task.subject, r.task.settings["expected"], one.words, "yes" if one.ok else "NO"]
+            for r in records
+            for one in r.found[:1]
+        ]
+        wrong = [[case, subject, words] for case, subject, _, words, ok in rows if ok == "NO"]
+        return [
+            *[simple(["case", "subject", "found"], wrong, title="Not as expected", caption=caption)] * bool(wrong),
+            by_case(records, "" if wrong else caption),
+            simple(["case", "subject", "expected", "found", "ok"], rows, title="Rows"),
+        ]
 
     def write(self, records: Sequence[Record[Outcome]], given: Flags) -> str:
         """Write the tables; return what is not as expected. Warns of rows that other sources gave."""
@@ -172,14 +292,6 @@ def by_case(records: Sequence[Record[Outcome]], caption: str = "") -> Table:
     ]
     numbers = ("rows", "as expected", "s")
     return simple(["case", "what", *numbers], rows, numbers=numbers, title="Cases", caption=caption)
-
-
-def _every_row(records: Sequence[Record[Outcome]]) -> Table:
-    rows = [
-        [r.task.case, r.task.subject, r.task.settings["expected"], r.found[0].words, "yes" if r.found[0].ok else "NO"]
-        for r in records
-    ]
-    return simple(["case", "subject", "expected", "found", "ok"], rows, title="Rows")
 
 
 def _seconds(records: Sequence[Record[Outcome]]) -> float:

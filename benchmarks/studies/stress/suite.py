@@ -1,6 +1,7 @@
 """Scenes that are hard on the numbers, as a TOML file says them: `benchmarks/suites/stress.toml`, or one of the user's.
 
-Simulator and methods take the same scenes. `docs/how-to/test-stability.md` lists the keys. Lengths mm.
+Simulator and methods take the same scenes. `docs/how-to/test-stability.md` lists the keys. Lengths mm. The limits of
+what is found on them stand here too. Simulates nothing.
 """
 
 import hashlib
@@ -13,8 +14,6 @@ import msgspec
 import numpy as np
 
 from ctsim.benchmarks.methods import TABLE
-from ctsim.benchmarks.studies.stress.changes import AnyChange, Filled, Positive, Twice, Unchanged
-from ctsim.benchmarks.studies.stress.limits import FULL, GROUPS, SHORT
 from ctsim.detector import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Count, Geometry, Pair, Triple
@@ -27,9 +26,37 @@ from ctsim.solids import Solid
 from ctsim.spectrum import Tube
 from ctsim.types import Phantom, Scanner
 
+FULL, SHORT = 24, 16  # voxels along a side
+P_SURE = 1.2e-4  # |ΔP|: 1e-4 of the energies where P ≤ 14.6, a tenth more between the paths tried, float32's 1e-5
+CLAMP = 81.0  # of P: exponents end at 80, and the weight of one node
+MASS = 0.01  # of a rod on the grid: 1/250 of every voxel that its surface crosses, of 216 cm³ for its 94 at worst
+FLOAT32 = 2e-5  # |ΔP|: exp is good to 4e-7·max(1, P/4) and so are the sums; lengths of 50 mm to 8e-6 mm, by 0.5/mm
+NEAR = 0.7  # of an empty volume's error
+SAME = 1e-3  # of the greatest value: float32
+SAME_BY_DESCENT = 0.03
+BOUNDS = {"ibhc": 10.0}  # adds to P what its own volume says of hardening, streaks included
+PROJECTED, VOXELISED, RESPONDED = 1e-5, 1e-5, 2e-6  # splats: of the peak, of the greatest voxel, of the response
+
+SPLATS = ("splat", "splat-paper", "splat-r2")
+GROUPS: dict[str, tuple[str, ...]] = {
+    "by-mask": ("limar", "nmar", "bhc-poly"),
+    # their steps are of one length whatever the gradient of TV, in flat regions rounding
+    "descent": ("asd-pocs", "awpcsd"),
+    "ordered": ("sart", "os-sart", "asd-pocs", "awpcsd", *SPLATS),  # a view that comes twice moves them twice
+    "sampled": ("bhc-poly",),  # fits in 64 views, other ones where there are twice as many
+    "physical": (*SPLATS, "ibhc"),  # take materials from tables in 1/mm
+}
+"""Methods that have something in common, by the names that a scene's `unlike` may give."""
+
 METALS = ("Ti", "Fe", "Sn", "W", "Au")
 TAKEN = ("threads", "float64")  # names of cases of methods that are no scenes
 AIR = np.zeros((2, 2, 2), np.uint8)
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+def same_of(method: str) -> float:
+    """Return how far two forms of one scan may be from each other, of the greatest value."""
+    return SAME_BY_DESCENT if method in GROUPS["descent"] else SAME
 
 
 class OfSide(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -156,6 +183,43 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         """Return the scanner for grids of so many voxels a side."""
         parts = {name: getattr(self, name) for name in self.__struct_fields__ if name != "geometry"}
         return Scanner(geometry=self.geometry.resolve(side), **parts)
+
+
+class Change(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag=str.lower):
+    """What `scans.changed` does to a simulated scan, by its name."""
+
+
+class Unchanged(Change, frozen=True):
+    """The scan as it was simulated."""
+
+
+class Twice(Change, frozen=True):
+    """Every view given twice."""
+
+
+class Filled(Change, frozen=True, kw_only=True):
+    """One reading everywhere, in counts."""
+
+    value: Annotated[int, msgspec.Meta(ge=0, le=65535)]
+
+
+class Rounded(Change, frozen=True):
+    """The counts as float32, each moved by a unit in its last place or less."""
+
+
+class Turned(Change, frozen=True, kw_only=True):
+    """The same counts, said to begin so many degrees further on."""
+
+    deg: float
+
+
+class Magnified(Change, frozen=True, kw_only=True):
+    """The counts as those of a machine and an object of such a size that voxels have this edge along x, in mm."""
+
+    voxel_mm: Positive
+
+
+AnyChange = Unchanged | Twice | Filled | Rounded | Turned | Magnified
 
 
 class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
