@@ -19,7 +19,7 @@ from ctsim.benchmarks.studies.pareto import study as pareto
 from ctsim.benchmarks.studies.peers import study as peers
 from ctsim.benchmarks.studies.peers.finding import Measurement
 from ctsim.benchmarks.studies.skipping import study as skipping
-from ctsim.benchmarks.studies.skipping.finding import Skip
+from ctsim.benchmarks.studies.skipping.study import Skip
 from ctsim.benchmarks.studies.stress import study as stress
 from ctsim.errors import InputError
 from ctsim.folder import read_progress

@@ -1,4 +1,4 @@
-"""What `run-benchmark skipping` measures of reconstruction methods and commands (see `skipping_cases`)."""
+"""What `run-benchmark skipping` measures of reconstruction methods and commands, beside the simulator's cases."""
 
 import functools
 import tempfile
@@ -18,14 +18,13 @@ from ctsim.baselines.prior import Choice, choose_prior
 from ctsim.benchmarks import make_dataset
 from ctsim.benchmarks.cli import quietly
 from ctsim.benchmarks.engine.record import Task
-from ctsim.benchmarks.methods import Method, find
+from ctsim.benchmarks.methods import find
 from ctsim.benchmarks.studies.methods import study as cli_run
 from ctsim.benchmarks.studies.methods.attempt import scan_for
 from ctsim.benchmarks.studies.methods.volumes import read_volume
-from ctsim.benchmarks.studies.skipping import simulator as skipping_cases
-from ctsim.benchmarks.studies.skipping.finding import Skip
-from ctsim.benchmarks.studies.skipping.simulator import Pair, Pairs, Setup, largest
-from ctsim.benchmarks.studies.skipping.study import Flags
+from ctsim.benchmarks.studies.skipping import simulator
+from ctsim.benchmarks.studies.skipping.pairs import Cases, Pair, Setup, largest
+from ctsim.benchmarks.studies.skipping.study import Flags, Skip
 from ctsim.phantoms.scene import scene_to_toml
 from ctsim.reconstruct.fdk import fdk_stream
 from ctsim.reconstruct.fdk import reconstruct as fdk
@@ -34,7 +33,6 @@ from ctsim.store import StoredScan, open_scan
 from ctsim.types import Scan
 
 HOW = "rows"
-Bridge = Callable[[NDArray[np.float32], slice, Filled], None]
 # float32 sums in the same order, of rows read at places that were worked out from another centre
 MOVED, MOVED_AT = 1e-5, "tests/test_fdk.py"
 
@@ -48,40 +46,30 @@ def made(setup: Setup, *flags: str) -> StoredScan:
     return open_scan(setup.folder / "data" / scene.name)
 
 
-# --- the whole way, as published, with nothing left out ---------------------------------------------
+def everything(trace: Trace, choice: Choice | None = None) -> torch.Tensor:
+    """Bridge all projections, as NMAR does where a prior is chosen and as LIMAR else; reconstruct them from nothing.
 
-
-def straight(trace: Trace) -> Bridge:
-    """Return what bridges the trace as LIMAR does."""
-
-    def bridge(p: NDArray[np.float32], views: slice, filled: Filled) -> None:
-        for k, view in enumerate(range(views.start, views.stop)):
-            fill(p[k], trace.view(view), HOW, filled)
-
-    return bridge
-
-
-def through_prior(trace: Trace, choice: Choice) -> Bridge:
-    """Return what bridges the trace as NMAR does, with the prior projected on every row of every view."""
-
-    def bridge(p: NDArray[np.float32], views: slice, filled: Filled) -> None:
-        q = forward_columns(choice.columns, trace.geometry, views)
-        for k, view in enumerate(range(views.start, views.stop)):
-            p[k] = Normalise().fill(p[k], q[k], trace.view(view), filled, choice.largest, HOW)
-
-    return bridge
-
-
-def everything(trace: Trace, bridge: Bridge) -> torch.Tensor:
-    """Reconstruct all bridged projections from nothing: [z, y, x] in 1/mm."""
+    The prior is projected on every row of every view. Returns [z, y, x] in 1/mm.
+    """
     filled = Filled()
 
     def read(views: slice) -> NDArray[np.float32]:
         p = trace.logarithm.of(views)[0]
-        bridge(p, views, filled)
+        q = None if choice is None else forward_columns(choice.columns, trace.geometry, views)
+        for k, view in enumerate(range(views.start, views.stop)):
+            if choice is None or q is None:
+                fill(p[k], trace.view(view), HOW, filled)
+            else:
+                p[k] = Normalise().fill(p[k], q[k], trace.view(view), filled, choice.largest, HOW)
         return p
 
     return fdk_stream(read, trace.geometry)
+
+
+def begun(scan: Scan) -> tuple[torch.Tensor, Trace]:
+    """Return the volume of FDK, and the metal's trace."""
+    first = fdk(scan).values
+    return first, Trace(find_metal(scan, first.numpy(), "oracle"), scan)
 
 
 def chosen(trace: Trace, scan: Scan, first: torch.Tensor) -> Choice:
@@ -92,68 +80,52 @@ def chosen(trace: Trace, scan: Scan, first: torch.Tensor) -> Choice:
     return choice
 
 
-def corrected(method: Method, scan: Scan) -> torch.Tensor:
-    """Correct a scan by a method as it is."""
-    return method.reconstruct(scan).values
-
-
-def regardless(scan: Scan, name: str) -> torch.Tensor:
+def without_metal_check(scan: Scan, name: str) -> torch.Tensor:
     """Correct a scan as LIMAR or NMAR would, did they not look whether there is metal."""
-    first = fdk(scan).values
-    trace = Trace(find_metal(scan, first.numpy(), "oracle"), scan)
-    if name == "limar":
-        return everything(trace, straight(trace))
-    return everything(trace, through_prior(trace, chosen(trace, scan, first)))
+    first, trace = begun(scan)
+    return everything(trace, chosen(trace, scan, first) if name == "nmar" else None)
 
 
 # --- pairs ---------------------------------------------------------------------------------------------
 
 
-def volumes_apart(one: torch.Tensor, other: torch.Tensor) -> float:
-    """Return the largest difference of two volumes."""
-    return largest([(one.numpy(), other.numpy())])
-
-
-def metal_free(setup: Setup) -> Iterator[Pair[torch.Tensor]]:
+def metal_free(setup: Setup) -> Iterator[Pair]:
     """Yield LIMAR and NMAR on the twin, where they stop after FDK, and all they would do for an empty trace."""
     stored = made(setup)
     for name in ("limar", "nmar"):
         method = find(name)
         scan = scan_for(method, stored, "metal_free")
-
         yield Pair(
             scene=f"{stored.name}, twin",
             what=f"all that {name.upper()} does after FDK where there is no metal",
-            skipping=functools.partial(corrected, method, scan),
-            whole=functools.partial(regardless, scan, name),
-            difference=volumes_apart,
+            skipping=functools.partial(method.reconstruct, scan),
+            whole=functools.partial(without_metal_check, scan, name),
+            difference=lambda volume, values: largest(volume.values, values),
             unit="1/mm",
         )
 
 
-def rows(setup: Setup) -> Iterator[Pair[torch.Tensor]]:
+def rows(setup: Setup) -> Iterator[Pair]:
     """Yield LIMAR and NMAR reconstructing what they change, and reconstructing all of it again.
 
     FDK, the trace and the prior, which both ways need, are prepared.
     """
     stored = made(setup)
     scan = scan_for(find("limar"), stored, "metal")
-    first = fdk(scan).values
-    trace = Trace(find_metal(scan, first.numpy(), "oracle"), scan)
+    first, trace = begun(scan)
     choice, touched = chosen(trace, scan, first), trace.rows()
     bridge = functools.partial(Normalise().fill, largest=choice.largest, how=HOW)
-    ways: dict[str, tuple[Callable[[], torch.Tensor], Bridge]] = {
-        "LIMAR": (lambda: interpolated(trace, first, HOW)[0], straight(trace)),
-        "NMAR": (lambda: normalised(trace, first, choice.columns, bridge)[0], through_prior(trace, choice)),
+    ways: dict[str, tuple[Callable[[], torch.Tensor], Choice | None]] = {
+        "LIMAR": (lambda: interpolated(trace, first, HOW)[0], None),
+        "NMAR": (lambda: normalised(trace, first, choice.columns, bridge)[0], choice),
     }
-    for name, (part, bridging) in ways.items():
+    for name, (part, prior) in ways.items():
         most = float(part().abs().max())
         yield Pair(
             scene=stored.name,
             what=f"detector rows that {name} leaves as they are",
             skipping=part,
-            whole=functools.partial(everything, trace, bridging),
-            difference=volumes_apart,
+            whole=functools.partial(everything, trace, prior),
             unit="1/mm",
             limit=MOVED * most,
             stated=MOVED_AT,
@@ -161,7 +133,7 @@ def rows(setup: Setup) -> Iterator[Pair[torch.Tensor]]:
         )
 
 
-def stored_scan(setup: Setup) -> Iterator[Pair[list[NDArray[Any]]]]:
+def stored_scan(setup: Setup) -> Iterator[Pair]:
     """Yield make-dataset where the scan is there, and made again."""
     stored = made(setup)
     names = sorted(name.removesuffix(".tif") for name in stored.files if name.endswith(".tif"))
@@ -175,12 +147,11 @@ def stored_scan(setup: Setup) -> Iterator[Pair[list[NDArray[Any]]]]:
         what="make-dataset of a scan that is there",
         skipping=arrays,
         whole=functools.partial(arrays, "--force"),
-        difference=lambda a, b: largest(list(zip(a, b, strict=True))),
         unit="any array",
     )
 
 
-def recorded_run(setup: Setup) -> Iterator[Pair[list[NDArray[np.float32]]]]:
+def recorded_run(setup: Setup) -> Iterator[Pair]:
     """Yield run-benchmark where the run is recorded, and run again; both render the tables and pictures."""
     name = made(setup).name
     results = setup.folder / "results"
@@ -194,18 +165,17 @@ def recorded_run(setup: Setup) -> Iterator[Pair[list[NDArray[np.float32]]]]:
         what="run-benchmark of a run that is recorded, LIMAR on the scan and its twin",
         skipping=volumes,
         whole=functools.partial(volumes, "--force"),
-        difference=lambda a, b: largest(list(zip(a, b, strict=True))),
         unit="1/mm",
     )
 
 
-CASES: dict[str, Pairs] = {"metal-free": metal_free, "rows": rows, "scan": stored_scan, "record": recorded_run}
+CASES: Cases = {"metal-free": metal_free, "rows": rows, "scan": stored_scan, "record": recorded_run}
 
 
 def measure(task: Task, given: Flags) -> list[Skip]:
     """Measure all pairs of a case."""
     setup = Setup(size=task.part, repeats=given.repeats, folder=_folder())
-    return [pair.measure(given.repeats) for pair in (skipping_cases.CASES | CASES)[task.case](setup)]
+    return [pair.measure(given.repeats) for pair in (simulator.CASES | CASES)[task.case](setup)]
 
 
 @functools.cache

@@ -8,10 +8,10 @@ from typing import Annotated, Literal, get_args
 import tyro
 
 from ctsim.benchmarks.engine import host, study
-from ctsim.benchmarks.engine.record import OK, Record, Task
+from ctsim.benchmarks.engine.record import OK, Found, Record, Task
 from ctsim.benchmarks.engine.table import Table, simple
-from ctsim.benchmarks.studies.skipping.finding import CORE, Skip
 
+CORE = "core"  # the size that says something about speed
 Case = Literal[
     "materials", "bricks", "rays", "energies", "edges", "refining", "scatter", "twin",
     "truth", "metal-free", "rows", "scan", "record",
@@ -21,6 +21,34 @@ SECONDS: dict[str, float] = {
     "materials": 0.46, "bricks": 1.1, "rays": 10.3, "energies": 0.63, "edges": 2.0, "refining": 1.6, "scatter": 0.45,
     "twin": 2.6, "truth": 0.49, "metal-free": 4.4, "rows": 2.0, "scan": 6.7, "record": 4.8,
 }  # fmt: skip
+
+
+class Skip(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One skip: seconds "skipping" and "whole", run by run in pairs, and the largest difference of the result.
+
+    `difference` is in what `unit` says, None where it is not finite; `limit` is what `stated` allows it, None where
+    the two are meant to differ.
+    """
+
+    scene: str = ""
+    what: str = ""
+    difference: float | None = None
+    unit: str = ""
+    limit: float | None = None
+    stated: str = ""
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        pairs = [self.seconds.get(way, ()) for way in ("skipping", "whole")]
+        if self.seconds and not (len(self.seconds) == 2 and len(pairs[0]) == len(pairs[1]) > 0):
+            raise ValueError('seconds must be as many for "skipping" as for "whole", and for nothing else')
+        if not all(second > 0 for seconds in pairs for second in seconds):
+            raise ValueError("seconds must be positive")
+
+    @property
+    def gain(self) -> float:
+        """Median over pairs of neighbouring runs of the time without the skip over that with it."""
+        return median(b / a for a, b in zip(self.seconds["skipping"], self.seconds["whole"], strict=True))
 
 
 @dataclass(frozen=True, kw_only=True)
