@@ -21,6 +21,7 @@ from ctsim.voxelise import label_volume
 
 SIZE = 60.0  # edge of the scene's cube in mm
 FINER = 16  # finer pixels along each side of a pixel in `measured_pixel`
+Rays = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def relative(p: NDArray, exact: NDArray) -> float:
@@ -28,24 +29,44 @@ def relative(p: NDArray, exact: NDArray) -> float:
     return float(np.sqrt(np.mean((np.asarray(p, np.float64) - exact) ** 2) / np.mean(np.asarray(exact) ** 2)))
 
 
-def upright_chord(geometry: Geometry, view: int, solid: Solid) -> NDArray[np.float64]:
-    """Return the chord (mm) of every central ray through an upright cylinder: [v, u]."""
-    primitive = solid.primitives[0]
-    half, radius = primitive.params[:2]
-    source, centre, e_u, e_v = geometry.pose_array()[view].reshape(4, 3)
+def central_rays(geometry: Geometry, view: int | None = None) -> Rays:
+    """Return the sources [view, 1, 1, xyz] and the unit vectors [view, v, u, xyz] of central rays, of all views or one.
+
+    A ray along a plane is tilted by 1e-12: it enters and leaves far away.
+    """
+    poses = geometry.pose_array() if view is None else geometry.pose(view)[None]
     n_v, n_u = geometry.n_detector
     u, v = np.arange(n_u) - (n_u - 1) / 2, np.arange(n_v) - (n_v - 1) / 2
-    ray = (centre - source) + u[None, :, None] * e_u + v[:, None, None] * e_v
+    source, centre, e_u, e_v = np.split(poses[:, None, None], 4, axis=-1)
+    ray = centre + u[:, None] * e_u + v[:, None, None] * e_v - source
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    start = source - np.asarray(primitive.centre)
-    a = ray[..., 0] ** 2 + ray[..., 1] ** 2
-    b = ray[..., 0] * start[0] + ray[..., 1] * start[1]
-    root = np.sqrt(np.maximum(b**2 - a * (start[0] ** 2 + start[1] ** 2 - radius**2), 0))
-    flat = np.where(np.abs(ray[..., 2]) < 1e-300, 1e-300, ray[..., 2])
-    caps = np.stack([(-half - start[2]) / flat, (half - start[2]) / flat])
-    enter = np.maximum((-b - root) / a, caps.min(0))
-    leave = np.minimum((-b + root) / a, caps.max(0))
-    return np.where(root > 0, np.maximum(leave - enter, 0), 0.0)
+    return source, np.where(np.abs(ray) < 1e-12, 1e-12, ray)
+
+
+def slab_span(rays: Rays, half: tuple[float, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return where rays enter and leave what lies between planes at ±half of the first or of all axes from the end."""
+    source, ray = (part[..., -len(half) :] for part in rays)
+    ends = np.sort(np.stack([(sign * np.array(half) - source) / ray for sign in (-1, 1)]), axis=0)
+    return ends[0].max(-1), ends[1].min(-1)
+
+
+def upright_span(rays: Rays, solid: Solid) -> NDArray[np.float64]:
+    """Return where rays enter and leave an upright cylinder, the same for rays that miss it: [2, view, v, u]."""
+    half, radius = solid.primitives[0].params[:2]
+    start, ray = rays[0] - np.asarray(solid.primitives[0].centre), rays[1]
+    low, high = slab_span((start, ray), (half,))
+    start, across = start[..., :2], ray[..., :2]
+    a, b, c = (across**2).sum(-1), (across * start).sum(-1), (start**2).sum(-1) - radius**2
+    root = np.sqrt(np.maximum(b**2 - a * c, 0.0))
+    enter = np.maximum((-b - root) / a, low)
+    leave = np.minimum((-b + root) / a, high)
+    return np.stack([enter, np.where(root > 0, np.maximum(leave, enter), enter)])
+
+
+def upright_chord(geometry: Geometry, view: int, solid: Solid) -> NDArray[np.float64]:
+    """Return the chord (mm) of every central ray of a view through an upright cylinder: [v, u]."""
+    enter, leave = upright_span(central_rays(geometry, view), solid)[:, 0]
+    return leave - enter
 
 
 def voxelised(phantom: Phantom, geometry: Geometry, keep: tuple[Solid, ...]) -> Phantom:

@@ -8,15 +8,16 @@ import msgspec
 import numba
 import numpy as np
 import pytest
+import torch
 from stress_ends import ENDS, Ends, Threads, catalogue
 
 from ctsim import plan
 from ctsim.baselines.known_spectrum import Beam
 from ctsim.benchmarks.engine import study as engine
 from ctsim.benchmarks.methods import TABLE, find
-from ctsim.benchmarks.studies.peers.cases import upright_chord
+from ctsim.benchmarks.oracles import upright_chord
 from ctsim.benchmarks.studies.stress import methods as stress_methods
-from ctsim.benchmarks.studies.stress import scans, simulator, study, worker
+from ctsim.benchmarks.studies.stress import simulator, study, worker
 from ctsim.benchmarks.studies.stress.scans import Findings, carry_out, example, few_views, lengths
 from ctsim.benchmarks.studies.stress.suite import Machine, Rod, Scene, load
 from ctsim.errors import InputError
@@ -116,8 +117,11 @@ def test_without_as_many_energies_as_it_takes_the_scan_is_reported(monkeypatch):
 
 
 def test_a_volume_that_depends_on_the_number_of_threads_is_reported(monkeypatch):
-    monkeypatch.setattr(scans, "on_threads", lambda n, call: np.full(3, n))
-    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 2)
+    threads = [0]
+    monkeypatch.setattr(numba, "set_num_threads", threads.append)
+    monkeypatch.setattr("numba.config.NUMBA_NUM_THREADS", 2)
+    volume = type("Volume", (), {"values": property(lambda self: torch.full((3,), threads[-1]))})
+    monkeypatch.setattr(stress_methods, "_volume", lambda method, scan: volume())
     (wrong,) = judged(ROWS["threads", "fdk"]).wrong
     assert "differ" in wrong
 

@@ -19,13 +19,13 @@ import torch
 from numpy.typing import NDArray
 
 from ctsim.baselines.morphology import dilate
+from ctsim.benchmarks.oracles import central_rays, relative, slab_span, upright_span
 from ctsim.benchmarks.studies.stress.suite import (
     AnyChange,
     Circle,
     Filled,
     Machine,
     Magnified,
-    Rod,
     Rounded,
     Scene,
     Turned,
@@ -77,12 +77,18 @@ class Findings:
         self.say(f"{what} {'equal to the last bit' if equal else 'differ'}", holds=equal)
 
     def same_on_threads(self, what: str, call: Callable[[], NDArray[Any]]) -> NDArray[Any]:
-        """Note whether `call` gives the same bits on 1, 2 and all threads; return those of 1."""
+        """Note whether `call` gives the same bits on 1, 2 and all threads of numba's; return those of 1."""
         most = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]
-        first = on_threads(1, call)
-        for n in sorted({min(2, most), most} - {1}):
-            self.same(f"{what} of 1 and {n} threads are", first, on_threads(n, call))
-        return first
+        before, found = numba.get_num_threads(), {}
+        try:
+            for n in sorted({1, min(2, most), most}):
+                numba.set_num_threads(n)
+                found[n] = call()
+                if n > 1:
+                    self.same(f"{what} of 1 and {n} threads are", found[1], found[n])
+        finally:
+            numba.set_num_threads(before)
+        return found[1]
 
     def refused(self, words: str, call: Callable[[], object]) -> None:
         """Note whether `call` raises an InputError whose sentence holds `words`."""
@@ -108,16 +114,6 @@ def carry_out(run: Callable[[Findings], None]) -> tuple[Findings, float]:
     return found, time.perf_counter() - began
 
 
-def on_threads(threads: int, call: Callable[[], NDArray[Any]]) -> NDArray[Any]:
-    """Call with so many threads of numba's."""
-    before = numba.get_num_threads()
-    numba.set_num_threads(threads)
-    try:
-        return call()
-    finally:
-        numba.set_num_threads(before)
-
-
 # --- scans ------------------------------------------------------------------------------------------------
 
 
@@ -137,8 +133,7 @@ class Example:
         """Return the RMSE over that of an empty volume; 0 where there is no region."""
         if not self.region.any():
             return 0.0
-        there = self.reference[self.region].astype(np.float64)
-        return float(np.sqrt(np.mean((values[self.region] - there) ** 2) / np.mean(there**2)))
+        return relative(values[self.region], self.reference[self.region].astype(np.float64))
 
 
 def changed(given: Example, change: AnyChange) -> Example:
@@ -236,13 +231,13 @@ def usual(side: int, **geometry: Any) -> tuple[Phantom, Scanner]:
 
 def lengths(scene: Scene, of: Geometry) -> dict[str, NDArray[np.float64]]:
     """Return the length (mm) of every central ray in each material, times its relative density: [view, v, u]."""
-    rays = _rays(of)
+    rays = central_rays(of)
     if scene.block is not None:
-        enter, leave = _slabs(rays, (scene.block.edge / 2,) * 3)
+        enter, leave = slab_span(rays, (scene.block.edge / 2,) * 3)
         density = 1.0 if scene.block.density is None else scene.block.density
         return {"water": density * np.maximum(leave - enter, 0.0)}
     found = {rod.material: np.zeros(of.shape) for rod in scene.all_rods}
-    spans = [_span(rays, rod) for rod in scene.all_rods]
+    spans = [upright_span(rays, rod.solid()) for rod in scene.all_rods]
     ends = np.sort(np.concatenate(spans), axis=0)
     for low, high in pairwise(ends):  # nothing changes along a ray between two ends
         middle, owner = (low + high) / 2, np.full(of.shape, -1)
@@ -251,35 +246,6 @@ def lengths(scene: Scene, of: Geometry) -> dict[str, NDArray[np.float64]]:
         for k, rod in enumerate(scene.all_rods):
             found[rod.material] += np.where(owner == k, high - low, 0.0)
     return found
-
-
-def _rays(of: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the sources [view, 1, 1, xyz] and the unit vectors of all central rays [view, v, u, xyz]."""
-    poses, (n_v, n_u) = of.pose_array()[:, None, None], of.n_detector
-    u, v = np.arange(n_u) - (n_u - 1) / 2, np.arange(n_v) - (n_v - 1) / 2
-    source, centre, e_u, e_v = np.split(poses, 4, axis=-1)
-    ray = centre + u[:, None] * e_u + v[:, None, None] * e_v - source
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    return source, np.where(np.abs(ray) < 1e-12, 1e-12, ray)  # along a plane: enters and leaves far away
-
-
-def _slabs(rays: tuple[NDArray, NDArray], half: tuple[float, ...]) -> tuple[NDArray, NDArray]:
-    """Return where rays enter and leave what lies between planes at ±half of the first or of all axes from the end."""
-    source, ray = (part[..., -len(half) :] for part in rays)
-    ends = np.sort(np.stack([(sign * np.array(half) - source) / ray for sign in (-1, 1)]), axis=0)
-    return ends[0].max(-1), ends[1].min(-1)
-
-
-def _span(rays: tuple[NDArray, NDArray], rod: Rod) -> NDArray[np.float64]:
-    """Return where rays enter and leave an upright rod, the same for rays that miss it: [2, view, v, u]."""
-    source, ray = rays
-    low, high = _slabs(rays, (rod.height / 2,))
-    start, across = source[..., :2] - np.array(rod.at), ray[..., :2]
-    a, b, c = (across**2).sum(-1), (across * start).sum(-1), (start**2).sum(-1) - rod.radius**2
-    root = np.sqrt(np.maximum(b**2 - a * c, 0.0))
-    enter = np.maximum((-b - root) / a, low)
-    leave = np.minimum((-b + root) / a, high)
-    return np.stack([enter, np.where(root > 0, np.maximum(leave, enter), enter)])
 
 
 def exact_p(scanner: Scanner, lengths: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:

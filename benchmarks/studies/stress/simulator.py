@@ -4,14 +4,13 @@ Beyond P = 14.6 nothing is promised but a finite P. Some scenes are checked for 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.benchmarks.studies.stress.scans import FEW, Findings, exact_p, few_views, lengths, simulated, usual
+from ctsim.benchmarks.studies.stress.scans import FEW, Findings, Stacks, exact_p, few_views, lengths, simulated, usual
 from ctsim.benchmarks.studies.stress.suite import CLAMP, FLOAT32, MASS, P_SURE, RODS, Scene, in_air
 from ctsim.kernels import raytrace_cpu, raytrace_reference
 from ctsim.materials import attenuation
@@ -25,17 +24,6 @@ from ctsim.simulate import REFERENCE_KEV, simulate_views
 from ctsim.solids import FRUSTUM, Primitive, Solid
 from ctsim.spectrum import Tube
 from ctsim.types import Phantom, Scanner
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Measured:
-    """A scan of few views: its stacks by name, the lengths of its central rays and their P, all [view, v, u]."""
-
-    phantom: Phantom
-    scanner: Scanner
-    depth: NDArray[np.float64]
-    p: NDArray[np.float64]
-    stacks: dict[str, NDArray[Any]]
 
 
 def on_scene(scene: Scene, side: int, found: Findings) -> None:
@@ -59,58 +47,58 @@ def on_scene(scene: Scene, side: int, found: Findings) -> None:
         mu = float(attenuation(rod.material, np.array([REFERENCE_KEV]))[0])
         found.at_most("mass on the grid off by", abs(there / (mu * np.pi * rod.radius**2 * rod.height) - 1), MASS)
     if scene.name in CHECKS:
-        depth = np.sum(list(inside.values()), axis=0)
-        CHECKS[scene.name](Measured(phantom=phantom, scanner=scanner, depth=depth, p=exact, stacks=stacks), found)
+        stacks |= {"exact": exact, "depth": np.sum(list(inside.values()), axis=0)}
+        CHECKS[scene.name](phantom, scanner, stacks, found)
 
 
 # --- what some scenes are checked for beyond P --------------------------------------------------------
 
 
-def unbiased(given: Measured, found: Findings) -> None:
+def unbiased(phantom: Phantom, scanner: Scanner, stacks: Stacks, found: Findings) -> None:
     """Compare the mean of counts without an ADC with the closed form; a Poisson draw is unbiased at any dose."""
-    plain = msgspec.structs.replace(given.scanner, noise=Noise(electronic=0.0, adc_bits=None))
-    counts = simulated(given.phantom, plain, Truth(twin=False))[0]["counts"]
-    expected = plain.i0 * np.exp(-given.p)
+    plain = msgspec.structs.replace(scanner, noise=Noise(electronic=0.0, adc_bits=None))
+    counts = simulated(phantom, plain, Truth(twin=False))[0]["counts"]
+    expected = plain.i0 * np.exp(-stacks["exact"])
     # an energy-integrating detector's variance is at most twice a counter's at 90 kVp; five standard errors
     limit = 5 * np.sqrt(2 * expected.sum()) / expected.sum()
     found.at_most("mean count off by", abs(counts.sum(dtype=np.float64) / expected.sum() - 1), limit)
     found.say(f"{np.mean(counts == 0):.0%} of the readings are 0")
 
 
-def dark(given: Measured, found: Findings) -> None:
+def dark(phantom: Phantom, scanner: Scanner, stacks: Stacks, found: Findings) -> None:
     """Look for photons behind what lets none through: what is left is the pedestal."""
-    pedestal = given.scanner.noise.dark
-    found.say(f"all readings are the pedestal {pedestal:g}", holds=bool((given.stacks["counts"] == pedestal).all()))
+    pedestal = scanner.noise.dark
+    found.say(f"all readings are the pedestal {pedestal:g}", holds=bool((stacks["counts"] == pedestal).all()))
 
 
-def clipped(given: Measured, found: Findings) -> None:
+def clipped(phantom: Phantom, scanner: Scanner, stacks: Stacks, found: Findings) -> None:
     """Look at an open field that fills the ADC: noise clips at full scale and does not wrap round."""
-    full, readings = given.scanner.noise.full_scale, given.stacks["counts"][given.depth == 0]
+    full, readings = scanner.noise.full_scale, stacks["counts"][stacks["depth"] == 0]
     # half of a symmetric distribution lies above its mean; Poisson's at 1e4 is skewed by 1 %
     found.at_most("share of open readings at full scale off a half by", abs(np.mean(readings == full) - 0.5), 0.05)
     found.at_most("largest drop of an open reading", float(1 - readings.min() / full), 0.1)
 
 
-def no_twin(given: Measured, found: Findings) -> None:
+def no_twin(phantom: Phantom, scanner: Scanner, stacks: Stacks, found: Findings) -> None:
     """Compare a scan without metal with the twin of one with metal, count by count."""
-    with_metal = in_air(*given.phantom.solids, RODS["titanium"].solid())
-    twin, _ = simulated(with_metal, given.scanner, Truth(), subrays=34)
-    bare, _ = simulated(with_metal.without_metal(), given.scanner, Truth(), subrays=34)
+    with_metal = in_air(*phantom.solids, RODS["titanium"].solid())
+    twin, _ = simulated(with_metal, scanner, Truth(), subrays=34)
+    bare, _ = simulated(with_metal.without_metal(), scanner, Truth(), subrays=34)
     found.same("counts of the twin and of the bare body are", twin["metal_free/counts"], bare["counts"])
     found.say("no twin of its own", holds="metal_free/counts" not in bare)
 
 
-def equal_views(given: Measured, found: Findings) -> None:
+def equal_views(phantom: Phantom, scanner: Scanner, stacks: Stacks, found: Findings) -> None:
     """Compare the views at equal angles, which are equal before noise."""
-    found.same("views at one angle are", given.stacks["noise_free"][::2], given.stacks["noise_free"][1::2])
+    found.same("views at one angle are", stacks["noise_free"][::2], stacks["noise_free"][1::2])
 
 
-def table_ends(given: Measured, found: Findings) -> None:
+def table_ends(phantom: Phantom, scanner: Scanner, stacks: Stacks, found: Findings) -> None:
     """Ask the bundled table for a tube that only the closed-form one reaches."""
-    found.refused("covers 10 to 500", lambda: Tube(kvp=given.scanner.tube.kvp))
+    found.refused("covers 10 to 500", lambda: Tube(kvp=scanner.tube.kvp))
 
 
-CHECKS: dict[str, Callable[[Measured, Findings], None]] = {
+CHECKS: dict[str, Callable[[Phantom, Scanner, Stacks, Findings], None]] = {
     "ten-photons": unbiased,
     "tungsten-120mm": dark,
     "full-scale": clipped,
