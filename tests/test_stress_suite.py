@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from test_imports import loaded
+from test_imports import SLOW, loaded
 
 from ctsim.benchmarks.studies.stress import methods as stress_methods
 from ctsim.benchmarks.studies.stress import study
@@ -225,3 +225,9 @@ def test_the_page_names_every_key():
 
 def test_the_rows_are_listed_without_torch():
     assert "torch" not in loaded("from ctsim.benchmarks.studies.stress.study import catalogue\ncatalogue()")
+
+
+def test_help_is_printed_before_scenes_and_kernels_are_loaded():
+    words = "'run-benchmark stress', 'ctsim.benchmarks.studies.stress.study', ['--help']"
+    code = f"from ctsim.benchmarks.cli import guarded\ntry:\n    guarded({words})\nexcept SystemExit:\n    pass"
+    assert not loaded(code) & SLOW

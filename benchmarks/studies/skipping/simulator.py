@@ -6,6 +6,7 @@ Each pair differs in one skip. Those of methods and commands are in `methods`.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -62,8 +63,8 @@ def bricks(setup: Setup) -> Iterator[Pair]:
     yield Pair(
         scene=scan.scene.name,
         what="bricks of one label, air among them, crossed in one step",
-        skipping=lambda: lengths(fast),
-        whole=lambda: lengths(slow),
+        skipping=partial(lengths, fast),
+        whole=partial(lengths, slow),
         unit="mm",
         # both add up in 2⁻⁴⁰ mm or float64, and are then rounded to float32
         limit=float(np.spacing(np.float32(longest))),
@@ -102,12 +103,13 @@ def energies(setup: Setup) -> Iterator[Pair]:
     few, every = (Response.of(rule, tracer.materials) for rule in (plan.rule, fine))
     # an edge's sub-rays are counted by the mean attenuation, in which both differ by 6e-5
     alike = replace(every, edge_mu=few.edge_mu)
-    moved = in_logarithm(*(signals(setup, scan, tracer, response) for response in (every, alike)))
+    measured = partial(signals, setup, scan, tracer)
+    moved = in_logarithm(measured(every), measured(alike))
     yield Pair(
         scene=scan.scene.name,
         what=f"{len(plan.rule.energies)} energies instead of {len(fine.energies)}",
-        skipping=lambda: signals(setup, scan, tracer, few),
-        whole=lambda: signals(setup, scan, tracer, alike),
+        skipping=partial(measured, few),
+        whole=partial(measured, alike),
         difference=in_logarithm,
         limit=1.1 * plan.settings.tolerance,  # between the paths tried it is up to a tenth more
         stated="simulation.tolerance and docs/explanation/physics.md",
@@ -141,12 +143,13 @@ def edges(setup: Setup) -> Iterator[Pair]:
     def difference(a: Signals, b: Signals) -> float:
         return in_logarithm(*([signal[view][kept] for view, kept in enumerate(central)] for signal in (a, b)))
 
-    moved = in_logarithm(*(signals(setup, scan, tracer, response) for response in (few, every)))
+    measured = partial(signals, setup, scan, tracer)
+    moved = in_logarithm(measured(few), measured(every))
     yield Pair(
         scene=scan.scene.name,
         what=f"sub-rays where solids have no edge: {np.mean(central):.0%} of pixels",
-        skipping=lambda: signals(setup, scan, tracer, few),
-        whole=lambda: signals(setup, scan, tracer, every),
+        skipping=partial(measured, few),
+        whole=partial(measured, every),
         difference=difference,
         # of concave thickness: two thirds of the change in the mean, an eighth of its range's square in the logarithm
         limit=2 / 3 * EDGE_THRESHOLD + (2 * EDGE_THRESHOLD) ** 2 / 8,

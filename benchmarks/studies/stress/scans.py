@@ -20,17 +20,8 @@ from numpy.typing import NDArray
 
 from ctsim.baselines.morphology import dilate
 from ctsim.benchmarks.oracles import central_rays, relative, slab_span, upright_span
-from ctsim.benchmarks.studies.stress.suite import (
-    AnyChange,
-    Circle,
-    Filled,
-    Machine,
-    Magnified,
-    Rounded,
-    Scene,
-    Turned,
-    Twice,
-)
+from ctsim.benchmarks.studies.stress import suite
+from ctsim.benchmarks.studies.stress.suite import AnyChange, Machine, Scene, Twice
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
@@ -140,17 +131,17 @@ def changed(given: Example, change: AnyChange) -> Example:
     """Return an example with other counts, or with another geometry said of the same ones."""
     g, counts, factor = given.scan.geometry, given.scan.counts, 1.0
     match change:
-        case Twice():
+        case suite.Twice():
             g, counts = doubled(g), counts.repeat_interleave(2, 0)
-        case Filled():
+        case suite.Filled():
             counts = torch.full_like(counts, change.value)
-        case Rounded():
+        case suite.Rounded():
             ulps = np.random.Generator(np.random.Philox(key=5)).uniform(-1, 1, counts.shape)
             counts = counts.float() * torch.from_numpy((1 + ulps * 2.0**-24).astype(np.float32))
-        case Turned():
+        case suite.Turned():
             angles = None if g.angles_deg is None else tuple(a + change.deg for a in g.angles_deg)
             g = msgspec.structs.replace(g, start_deg=g.start_deg + change.deg, angles_deg=angles)
-        case Magnified():
+        case suite.Magnified():
             factor = change.voxel_mm / g.d_voxel[2]
             sizes = {name: tuple(d * factor for d in getattr(g, name)) for name in ("d_voxel", "d_detector")}
             g = msgspec.structs.replace(g, dso=g.dso * factor, dsd=g.dsd * factor, **sizes)
@@ -223,7 +214,7 @@ def few_views(scene: Scene, side: int) -> Scanner:
 
 def usual(side: int, **geometry: Any) -> tuple[Phantom, Scanner]:
     """Return water with a rod of bone and one of titanium, on a circle that differs from the usual one as given."""
-    return USUAL.phantom(), Machine(geometry=Circle(**geometry)).resolve(side)
+    return USUAL.phantom(), Machine(geometry=suite.Circle(**geometry)).resolve(side)
 
 
 # --- closed forms, float64 ----------------------------------------------------------------------------
