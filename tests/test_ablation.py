@@ -1,15 +1,19 @@
 import contextlib
+import functools
+import pickle
 import shutil
 import sys
 
-import msgspec
 import pytest
 from conftest import SMALLEST
+from msgspec.structs import replace
+from run_records import changed
 
 from ctsim.benchmarks import cli, methods
 from ctsim.benchmarks.engine import study as engine
 from ctsim.benchmarks.studies import ablation
 from ctsim.benchmarks.studies.methods import records
+from ctsim.benchmarks.studies.paper import tables as paper_tables
 from ctsim.benchmarks.suites import load as load_suite
 from ctsim.store import list_scans, open_scan
 
@@ -41,11 +45,16 @@ def command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
     for name in ("splat-paper", "splat-r2"):
         monkeypatch.setitem(methods.TABLE, name, ("stub_splat:reconstruct", methods.COUNTS_ONLY))
-    monkeypatch.setattr(
-        "ctsim.benchmarks.make_dataset.work.load",
-        lambda suite: load_suite("tiny.toml" if suite == "ablation" else suite),
-    )
+
+    @functools.cache
+    def load(suite):
+        return load_suite("tiny.toml" if suite == "ablation" else suite)
+
+    monkeypatch.setattr("ctsim.benchmarks.make_dataset.work.load", load)
+    monkeypatch.setattr(paper_tables, "_scenes", load)
+    paper_tables.identities.cache_clear()
     yield lambda *more: run(monkeypatch, capsys, more)
+    paper_tables.identities.cache_clear()
     sys.modules.pop("stub_splat", None)
 
 
@@ -126,14 +135,14 @@ def test_runs_are_the_workers_where_some_are_asked_for(command, tmp_path, monkey
         def answers(self, function, jobs):
             for k, job in enumerate(jobs):
                 done.append(job[1][0].hints["overrides"])
-                yield k, function(job)
+                yield k, function(pickle.loads(pickle.dumps(job)))
 
     monkeypatch.setattr(engine, "open_jobs", lambda n, _: contextlib.nullcontext(Here() if n == 2 else None))
     assert command("--table", "7")[0] == 0 and not done
     for line in (tmp_path / "results").iterdir():
         line.unlink() if line.is_file() else shutil.rmtree(line)
     assert command("--table", "7", "--workers", "2")[0] == 0
-    assert done == [v.params for v in ablation.variants((7,))]
+    assert sorted(map(str, done)) == sorted(str(v.params) for v in ablation.variants((7,)))
     found = records.read(tmp_path / "results")
     assert len(found) == len(done) and {r.status for r in found} == {"ok"}
 
@@ -144,11 +153,10 @@ def test_a_dry_run_prints_rows_and_cost_and_writes_nothing(command, tmp_path):
     seconds = 3 * (2000 * ablation.SECONDS["splat-paper"] + 3000 * ablation.SECONDS["splat-r2"])
     assert f"total: 6 of 6 runs, {ablation.human_time(seconds)}" in shown.out
     assert "scans to be made first: ablation-broccoli-Al ablation-lung-Fe ablation-teeth-Ti" in shown.out
-    assert shown.out.count(" to run ") == 6
     assert command("--table", "7")[0] == 0
     code, shown = command("--dry-run", "--table", "7", "--table", "5")
-    lines = {line.partition("  ")[0]: line for line in shown.out.splitlines() if LUNG in line}
-    assert code == 0 and " recorded " in lines[label()] and "5: Baseline with both; 7: Lung, Ours" in lines[label()]
+    lines = [line for line in shown.out.splitlines() if LUNG in line]
+    assert code == 0 and len(lines) == 3 and all("  5: " in line and "7:" not in line for line in lines)
     assert "total: 3 of 9 runs" in shown.out and "scans to be made" not in shown.out
 
 
@@ -156,7 +164,7 @@ def test_the_cost_of_a_step_is_what_records_say():
     from test_paper_tables import record
 
     found = [record("splat-paper", LUNG, wall=50.0, params=BASE), record("splat-paper", LUNG, wall=70.0, params=BASE)]
-    found[0] = msgspec.structs.replace(found[0], cost=msgspec.structs.replace(found[0].cost, warm_up=30.0))
+    found[0] = changed(found[0], cost=replace(found[0].cost, warm_up=30.0))
     # (50 + 30) and 70 s for 2000 steps, the median between them
     assert ablation._rates(found) == ablation.SECONDS | {"splat-paper": pytest.approx(75 / 2000)}
 

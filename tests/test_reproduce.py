@@ -58,7 +58,7 @@ def test_claims_that_do_not(changes, fails):
 def test_what_was_not_measured_is_not_said_to_hold():
     assert [c.holds for c in reproduce.judged([])] == [None] * 4
     assert [c.holds for c in reproduce.judged([record("fdk", 1), record("limar", 2)])] == [None] * 4
-    assert "not measured" in reproduce.markdown(reproduce.judged([]))
+    assert "not measured" in reproduce.table(reproduce.judged([])).markdown()
 
 
 def test_a_dry_run_plans_scans_and_lists_runs(tmp_path, capsys):
@@ -80,8 +80,8 @@ def test_a_dry_run_plans_scans_and_lists_runs(tmp_path, capsys):
     out = capsys.readouterr().out
     # scan and twin, 2 × (3 + 5) s, and what this machine's time of an FDK makes of the others
     assert out.count("already complete") == 1 and re.search(r"total: 8 of 8 runs, [\d.]+ (s|min)", out)
-    assert re.search(r"^lung-Fe, seed 1 +limar +2 runs, 10 s$", out, re.M)
-    assert re.search(r"^lung-Fe, seed 1 +nmar +2 runs, [\d.]+ (s|min)$", out, re.M)
+    assert re.search(r"^lung-Fe, seed 1 +limar +2 x 10 s$", out, re.M)
+    assert re.search(r"^lung-Fe, seed 1 +nmar +2 x [\d.]+ (s|min)$", out, re.M)
     assert "on 1 scans to be made and their twins: 16 s" in out
 
 

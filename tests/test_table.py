@@ -124,13 +124,48 @@ def test_html():
     named = table(("a", "one", 1.0), ("a", "two", None), ("a", "three", 2.5), title="T", caption="C", notes=("N",))
     assert named.html() == (
         "<h2>T</h2>\n<p>C</p>\n"
-        "<table>\n<thead><tr><th>class</th><th>name</th><th>image: PSNR</th></tr></thead>\n<tbody>\n"
-        '<tr><td>a</td><td>one</td><td data-number="1.0"><u>1</u></td></tr>\n'
-        "<tr><td>a</td><td>two</td><td>–</td></tr>\n"
-        '<tr><td>a</td><td>three</td><td data-number="2.5"><strong>2.5</strong></td></tr>\n'
-        "</tbody>\n</table>\n<ul>\n<li>N</li>\n</ul>\n"
+        '<div class="wide"><table>\n<thead><tr>'
+        '<th rowspan="2" scope="col" data-column="0">class</th><th rowspan="2" scope="col" data-column="1">name</th>'
+        '<th class="group" scope="colgroup" colspan="1">image</th></tr>'
+        '<tr><th class="num" scope="col" data-column="2">PSNR</th></tr></thead>\n<tbody>\n'
+        '<tr><td>a</td><td>one</td><td class="num" data-number="1.0"><u>1</u></td></tr>\n'
+        '<tr><td>a</td><td>two</td><td class="num">–</td></tr>\n'
+        '<tr><td>a</td><td>three</td><td class="num" data-number="2.5"><strong>2.5</strong></td></tr>\n'
+        "</tbody>\n</table></div>\n<ul>\n<li>N</li>\n</ul>\n"
     )
-    assert PLAIN.html().startswith("<table>") and PLAIN.html().endswith("</table>\n")
+    assert PLAIN.html().startswith('<div class="wide"><table>') and PLAIN.html().endswith("</table></div>\n")
+    head = '<tr><th scope="col" data-column="0">a</th><th class="num" scope="col" data-column="1">b</th></tr>'
+    assert f"<thead>{head}</thead>" in simple(["a", "b"], [[1, 2]], numbers=("b",)).html()
+
+
+def test_code_in_prose_is_code_on_a_page():
+    found = simple(["`a`"], [["`b`"]], caption="By `x <y> --z`, <i>.", notes=["`n`"]).html()
+    assert "<p>By <code>x &lt;y&gt; --z</code>, &lt;i&gt;.</p>" in found and "<li><code>n</code></li>" in found
+    assert ">`a`<" in found and ">`b`<" in found
+
+
+def test_the_parts_of_a_column_stand_under_its_title():
+    columns = [Column("Method")] + [
+        Column(title, group, True, part=part)
+        for group, title in (("Lung", "SSIM"), ("Lung", "PSNR"), ("Teeth", "PSNR"))
+        for part in ("paper", "here")
+    ]
+    found = Table(columns=columns, rows=[[Cell("a"), *[Cell("1")] * 6]], caption="C", notes=["by `a --b`"])
+    assert found.markdown().startswith("C\n\n| Method | Lung: SSIM, paper | Lung: SSIM, here | Lung: PSNR, paper |")
+    # of two groups, PSNR stays two
+    titles = " & ".join(rf"\multicolumn{{2}}{{c}}{{{title}}}" for title in ("SSIM", "PSNR", "PSNR"))
+    assert (
+        "\\toprule\n"
+        " & \\multicolumn{4}{c}{Lung} & \\multicolumn{2}{c}{Teeth} \\\\\n"
+        "\\cmidrule(lr){2-5}\\cmidrule(lr){6-7}\n"
+        f" & {titles} \\\\\n"
+        "\\cmidrule(lr){2-3}\\cmidrule(lr){4-5}\\cmidrule(lr){6-7}\n"
+        "Method & paper & here & paper & here & paper & here \\\\\n"
+    ) in found.latex()
+    assert found.latex().endswith("\\end{table}\n% by `a --b`\n")
+    note = "\\end{tabular}\n\\par\\footnotesize by \\texttt{a -{}-b}\n\\end{table}\n"
+    assert found.latex(footnotes=True).endswith(note)
+    assert ">SSIM, paper</th>" in found.html()
 
 
 def test_csv():

@@ -11,8 +11,8 @@ import pandas as pd
 import pytest
 from run_records import changed, make_record
 
-from ctsim.benchmarks.engine import latex
-from ctsim.benchmarks.engine.texts import escape, ranked
+from ctsim.benchmarks.engine.table import simple
+from ctsim.benchmarks.engine.texts import escape
 from ctsim.benchmarks.scores.protocol import Score
 from ctsim.benchmarks.studies.methods import records, tables
 from ctsim.benchmarks.studies.methods.records import Cost
@@ -49,14 +49,6 @@ def test_ranks_stay_within_an_input_class():
     assert cells(text, "| counts only | b")[2] == "<u>25.00</u>"
     assert cells(text, "| counts only | c")[2] == "**30.00**"
     assert cells(text, "| mask | d")[2] == "50.00"
-
-
-def test_ranked_knows_directions_and_ties():
-    assert ranked([1.0, 3.0, 2.0], "max") == {1: "best", 2: "second"}
-    assert ranked([1.0, 3.0, 2.0], "min") == {0: "best", 2: "second"}
-    assert ranked([0.8, 1.1, 1.5], "one") == {1: "best", 0: "second"}
-    assert ranked([2.0, 2.0, None, 1.0], "max") == {0: "best", 1: "best", 3: "second"}
-    assert ranked([1.0, 2.0], "") == {} and ranked([1.0, None], "max") == {}
 
 
 def test_captions_state_protocol_region_and_range():
@@ -239,7 +231,7 @@ def test_latex_compiles_with_whatever_a_caption_or_a_reason_holds(tmp_path):
     odd = "50 % of {a_b} & c^2 ≤ 3 µm ~ $x$ # \\n ± − – > 2×10³ μ γ ² ° ·"
     failed = record("net", status="error", scene="teeth")
     given = [record(odd), record("b", scene="teeth"), changed(failed, reason=f"{odd}\nand more")]
-    sheet = tables.render(given, "tex") + latex.table(latex.prose(f"{odd} `--flag {odd}`"), "l", [], [latex.row(["1"])])
+    sheet = tables.render(given, "tex") + simple([odd], [[odd]], caption=f"{odd} `--flag {odd}`").latex()
     page = "\\documentclass{article}\\usepackage{booktabs}\\begin{document}" + sheet + "\\end{document}"
     (tmp_path / "page.tex").write_text(page, encoding="utf-8")
     told = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex"]

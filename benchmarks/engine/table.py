@@ -24,13 +24,15 @@ class Cell(NamedTuple):
 class Column(NamedTuple):
     """A column: title, the group it stands in, whether it holds numbers, and which number is best.
 
-    `better` is "max", "min", "one" (nearest to 1), or "" for a column without ranks.
+    `better` is "max", "min", "one" (nearest to 1), or "" for a column without ranks. Neighbouring columns that are
+    parts of one, such as "paper" and "here", have its title and a `part` each.
     """
 
     title: str
     group: str = ""
     number: bool = False
     better: Better = ""
+    part: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,18 +79,38 @@ class Table:
     def html(self) -> str:
         """Return the table as HTML; a cell with a number has it in `data-number`, by which a page sorts."""
         marks = {"best": "<strong>{}</strong>", "second": "<u>{}</u>"}
-        head = "".join(f"<th>{_html(_title(c))}</th>" for c in self.columns)
         lines = []
         for row, texts in zip(self.rows, self._marked(_html, marks), strict=True):
-            numbers = ("" if cell.number is None else f' data-number="{float(cell.number)!r}"' for cell in row)
-            lines.append("<tr>" + "".join(f"<td{n}>{t}</td>" for n, t in zip(numbers, texts, strict=True)) + "</tr>\n")
-        notes = "".join(f"<li>{_html(note)}</li>\n" for note in self.notes)
+            kinds = (
+                _kind(column) + ("" if cell.number is None else f' data-number="{float(cell.number)!r}"')
+                for column, cell in zip(self.columns, row, strict=True)
+            )
+            lines.append("<tr>" + "".join(f"<td{k}>{t}</td>" for k, t in zip(kinds, texts, strict=True)) + "</tr>\n")
+        notes = "".join(f"<li>{html_prose(note)}</li>\n" for note in self.notes)
         return (
             (f"<h2>{_html(self.title)}</h2>\n" if self.title else "")
-            + (f"<p>{_html(self.caption)}</p>\n" if self.caption else "")
-            + f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{''.join(lines)}</tbody>\n</table>\n"
+            + (f"<p>{html_prose(self.caption)}</p>\n" if self.caption else "")
+            + f'<div class="wide"><table>\n<thead>{self._html_head()}</thead>\n<tbody>\n{"".join(lines)}</tbody>\n'
+            + "</table></div>\n"
             + (f"<ul>\n{notes}</ul>\n" if notes else "")
         )
+
+    def _html_head(self) -> str:
+        """Return a line of heads, or two where columns stand in groups; each column's own has its number."""
+        grouped = any(column.group for column in self.columns)
+        upper, lower = "", ""
+        for group, members in itertools.groupby(enumerate(self.columns), lambda member: member[1].group):
+            span = ' rowspan="2"' if grouped and not group else ""
+            heads = [
+                f'<th{_kind(c)}{span} scope="col" data-column="{k}">{_html(_title(c._replace(group="")))}</th>'
+                for k, c in members
+            ]
+            if group:
+                upper += f'<th class="group" scope="colgroup" colspan="{len(heads)}">{_html(group)}</th>'
+                lower += "".join(heads)
+            else:
+                upper += "".join(heads)
+        return f"<tr>{upper}</tr>" + (f"<tr>{lower}</tr>" if grouped else "")
 
     def csv(self) -> str:
         """Return columns and cells as CSV that no spreadsheet takes for formulas."""
@@ -98,13 +120,15 @@ class Table:
         writer.writerows([_csv(cell.text) for cell in row] for row in self.rows)
         return out.getvalue()
 
-    def latex(self, label: str = "") -> str:
-        """Return a table environment by booktabs, its notes as comments below it."""
+    def latex(self, label: str = "", *, footnotes: bool = False) -> str:
+        """Return a table environment by booktabs, its notes as comments below it, or as `footnotes` within it."""
         marks = {"best": r"\textbf{{{}}}", "second": r"\underline{{{}}}"}
         head = []
         if any(c.group for c in self.columns):
             head += latex_groups([c.group for c in self.columns])
-        head.append(latex_row(latex_prose(c.title) for c in self.columns))
+        if any(c.part for c in self.columns):
+            head += latex_groups([c.title if c.part else "" for c in self.columns], [c.group for c in self.columns])
+        head.append(latex_row(latex_prose(c.part or c.title) for c in self.columns))
         body = [latex_row(row) for row in self._marked(lambda text: escape(text, "tex"), marks)]
         lines = [
             r"\begin{table}",
@@ -118,9 +142,10 @@ class Table:
             *body,
             r"\bottomrule",
             r"\end{tabular}",
+            *(rf"\par\footnotesize {latex_prose(note)}" for note in self.notes if footnotes),
             r"\end{table}",
         ]
-        return "\n".join(lines) + "\n" + "".join(map(latex_comment, self.notes))
+        return "\n".join(lines) + "\n" + ("" if footnotes else "".join(map(latex_comment, self.notes)))
 
     def _marked(self, write: Callable[[str], str], marks: dict[str, str]) -> list[list[str]]:
         """Return the texts of all cells, written for a format, with the marks of the best and the second."""
@@ -152,11 +177,22 @@ def ranked(numbers: Sequence[float | None], better: str) -> dict[int, str]:
 
 
 def _title(column: Column) -> str:
-    return f"{column.group}: {column.title}" if column.group else column.title
+    title = f"{column.title}, {column.part}" if column.part else column.title
+    return f"{column.group}: {title}" if column.group else title
 
 
 def _html(text: str) -> str:
     return html.escape(one_line(text))
+
+
+def html_prose(text: str) -> str:
+    """Return prose as HTML; what stands in backquotes is code."""
+    parts = _html(text).split("`")
+    return "".join(f"<code>{part}</code>" if n % 2 else part for n, part in enumerate(parts))
+
+
+def _kind(column: Column) -> str:
+    return ' class="num"' if column.number else ""
 
 
 def _csv(text: str) -> str:
@@ -188,10 +224,13 @@ def latex_row(cells: Any) -> str:
     return " & ".join(cells) + r" \\"
 
 
-def latex_groups(groups: Sequence[str]) -> list[str]:
-    """Return a head line of group titles, each over its neighbouring columns, and the rules below them."""
+def latex_groups(groups: Sequence[str], within: Sequence[str] = ()) -> list[str]:
+    """Return a head line of group titles, each over its neighbouring columns, and the rules below them.
+
+    Equal titles stay two where they stand `within` different groups.
+    """
     cells, rules, first = [], "", 1
-    for title, of in itertools.groupby(groups):
+    for (title, _), of in itertools.groupby(zip(groups, within or groups, strict=True)):
         n = len(list(of))
         cells += [rf"\multicolumn{{{n}}}{{c}}{{{latex_prose(title)}}}"] if title else [""] * n
         rules += rf"\cmidrule(lr){{{first}-{first + n - 1}}}" if title else ""

@@ -1,4 +1,4 @@
-"""Small helpers of the tables: escaping for Markdown, LaTeX, CSV and pictures, and who is best and second."""
+"""Small helpers of the tables: escaping for Markdown, LaTeX, CSV and pictures."""
 
 from typing import Literal
 
@@ -56,17 +56,3 @@ def harmless(text: str) -> str:
     """Return a text as a cell of CSV that no spreadsheet takes for a formula, on one line."""
     text = one_line(text)
     return f"'{text}" if text.lstrip().startswith(_FORMULA) else text
-
-
-def ranked(numbers: list[float | None], better: str) -> dict[int, str]:
-    """Return {index: "best" or "second"}; equal numbers share a place, and a lone number has none.
-
-    `better` is "max", "min", "one" (nearest to 1), or "" for no ranking.
-    """
-    keys = {"max": lambda v: -v, "min": lambda v: v, "one": lambda v: abs(v - 1)}
-    if better not in keys or sum(n is not None for n in numbers) < 2:
-        return {}
-    key = keys[better]
-    found = {i: key(n) for i, n in enumerate(numbers) if n is not None}
-    places = dict(zip(sorted(set(found.values())), ("best", "second"), strict=False))
-    return {i: places[n] for i, n in found.items() if n in places}

@@ -10,18 +10,19 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
 from ctsim.benchmarks import make_dataset
+from ctsim.benchmarks.engine.dask import check_workers
 from ctsim.benchmarks.engine.process import check_limit
 from ctsim.benchmarks.engine.study import listing, measure_all
 from ctsim.benchmarks.methods import Method, find
 from ctsim.benchmarks.studies.methods import plan, records
 from ctsim.benchmarks.studies.methods.records import METAL, Run, RunRecord, RunTask, task_of
 from ctsim.benchmarks.studies.methods.study import Flags, Methods
-from ctsim.benchmarks.studies.paper.layout import load
+from ctsim.benchmarks.studies.paper.layout import Planned, load
 from ctsim.benchmarks.studies.paper.tables import ABLATION, text_of
 from ctsim.durable import write_synced
 from ctsim.errors import InputError
@@ -56,74 +57,61 @@ class Arguments:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Variant:
-    """One run: scene, method, parameters, the label of its records, and the rows "table: name" that show it."""
+class Variant(Planned):
+    """One run, and the rows "table: name" that show it."""
 
-    scene: str
-    method: str
-    params: dict[str, Any]
-    label: str
     rows: tuple[str, ...]
 
 
 class Ablation(Methods):
-    """The study of methods, on the paper's variants."""
+    """The study of methods, on the paper's variants; `rates` are the seconds of a step by method."""
 
-    def __init__(self, listed: "Sequence[Variant]") -> None:
+    def __init__(self, listed: Sequence[Variant], rates: dict[str, float]) -> None:
         super().__init__()
         self._listed = {(v.scene, v.label): v for v in listed}
-        self.rates = dict(SECONDS)
+        self._chosen, self._rates = methods_of(listed), rates
 
     def jobs(self, given: Flags) -> list[plan.Job]:
         """List the runs scene by scene; those of scenes that are not in the data folder are left out."""
-        chosen = methods_of(list(self._listed.values()))
         folders = {folder.name: folder for folder in list_scans(given.data)} if given.data.is_dir() else {}
         found: list[plan.Job] = []
         for scene in dict.fromkeys(scene for scene, _ in self._listed):
             if scene in folders:
-                placed = [(chosen[label], (0, 0)) for where, label in self._listed if where == scene]
+                placed = [(self._chosen[label], (0, 0)) for where, label in self._listed if where == scene]
                 found += plan.jobs_on(open_scan(folders[scene]), (METAL,), placed)
         return found
-
-    def pending(self, tasks: Sequence[RunTask], records: Sequence[RunRecord], given: Flags) -> list[RunTask]:
-        """Return the runs that have no record."""
-        self.rates = _rates(records)
-        return super().pending(tasks, records, given)
 
     def expected(self, task: RunTask, given: Flags) -> float | None:
         """Return the seconds of a run by the time of a step."""
         variant = self._listed[task.settings.scene, task.subject]
-        return self.rates[variant.method] * variant.params["steps"]
+        return self._rates[variant.method] * variant.params["steps"]
 
     def line(self, task: RunTask) -> tuple[str, str]:
         """Return the run and the rows of the paper's tables that show it."""
         variant = self._listed[task.settings.scene, task.subject]
         return f"{variant.label}  {variant.scene}", "; ".join(variant.rows)
 
-    def to_come(self, given: Flags) -> list[RunTask]:
-        """Return the runs on scans that are to be made first, whose data nobody knows yet."""
-        there = {job.stored.name for job in self.jobs(given)}
-        missing = [v for v in self._listed.values() if v.scene not in there]
-        runs = (Run(scene=v.scene, scene_id="", seed=0, method=v.method, params=v.params) for v in missing)
-        return [task_of(run, v.label, data="", code="") for run, v in zip(runs, missing, strict=True)]
-
 
 def main(arguments: list[str]) -> int:
     """Run the command; 0 if every run ended well, 1 if one failed."""
     asked = tyro.cli(Arguments, prog="run-benchmark ablation", args=arguments)
     check_limit(asked.seconds)
-    listed = variants(asked.table)
-    methods_of(listed)
-    study = Ablation(listed)
+    check_workers(asked.workers, None)
+    listed, known = variants(asked.table), records.read(asked.results)
+    rates = _rates(known)
+    study = Ablation(listed, rates)
     given = Flags(data=asked.data, results=asked.results, seconds=asked.seconds, workers=asked.workers, anchor=False)
-    scenes = list(dict.fromkeys(v.scene for v in listed))
     if asked.dry_run:
-        sys.stdout.write(_planned(study, given))
+        sys.stdout.write(_planned(study, listed, known, given))
+        steps = ", ".join(f"{method} {human_time(rate)}" for method, rate in rates.items())
+        how = "the records" if rates != SECONDS else "one core, measured once"
+        sys.stdout.write(f"by the time of a step ({steps}): of {how}\n")
         return 0
+    scenes = dict.fromkeys(v.scene for v in listed)
     code = make_dataset.main([ABLATION, str(given.data), "--only", *scenes, "--workers", str(given.workers)])
     if code:
         return code
-    failed = measure_all(study, study.tasks(given), records.read(given.results), given)
+    failed = measure_all(study, study.tasks(given), known, given)
     found = records.read(given.results)
     study.write(found, given)
     text = text_of(found, "md", "paper", asked.table or ablations())
@@ -132,17 +120,18 @@ def main(arguments: list[str]) -> int:
     return 1 if failed else 0
 
 
-def _planned(study: Ablation, given: Flags) -> str:
-    """Return what --dry-run prints: the runs that are left with the rows that show them, and scans to be made."""
-    known, tasks, later = records.read(given.results), study.tasks(given), study.to_come(given)
-    left = [*study.pending(tasks, known, given), *later]
-    text = listing(study, left, known, given, len(tasks) + len(later))
+def _planned(study: Ablation, listed: Sequence[Variant], known: Sequence[RunRecord], given: Flags) -> str:
+    """Return the runs that are left with the rows that show them, those last whose scans are to be made first."""
+    tasks = study.tasks(given)
+    there = {task.settings.scene for task in tasks}
+    missing = [v for v in listed if v.scene not in there]
+    runs = [Run(scene=v.scene, scene_id="", seed=0, method=v.method, params=v.params) for v in missing]
+    later = [task_of(run, v.label, data="", code="") for run, v in zip(runs, missing, strict=True)]
+    text = listing(study, [*study.pending(tasks, known, given), *later], known, given, len(tasks) + len(later))
     if later:
-        names = " ".join(dict.fromkeys(task.settings.scene for task in later))
+        names = " ".join(dict.fromkeys(v.scene for v in missing))
         text += f"scans to be made first: {names} (make-dataset {ABLATION} {given.data} --dry-run --only {names})\n"
-    steps = ", ".join(f"{method} {human_time(rate)}" for method, rate in study.rates.items())
-    how = "the records" if study.rates != SECONDS else "one core, measured once"
-    return f"{text}by the time of a step ({steps}): of {how}\n"
+    return text
 
 
 def variants(numbers: tuple[int, ...] = ()) -> list[Variant]:
@@ -154,23 +143,23 @@ def variants(numbers: tuple[int, ...] = ()) -> list[Variant]:
     for number in numbers:
         if number not in known:
             raise InputError(f"--table {number}: the ablations are tables {', '.join(map(str, known))}")
-    found: dict[tuple[str, str], Variant] = {}
-    for table in load().table:
-        for row in table.rows if table.number in (numbers or known) else ():
-            for column in table.columns:
-                p = table.planned(row, column)
-                name = f"{table.number}: {', '.join(filter(None, (*row.stubs, column.group)))}"
-                before = found[p.scene, p.label].rows if (p.scene, p.label) in found else ()
-                rows = tuple(dict.fromkeys((*before, name)))
-                found[p.scene, p.label] = Variant(
-                    scene=p.scene, method=p.method, params=p.params, label=p.label, rows=rows
-                )
-    return list(found.values())
+    found: dict[tuple[str, str], Planned] = {}
+    rows: dict[tuple[str, str], dict[str, None]] = {}
+    for layout in (layout for layout in load().table if layout.number in (numbers or known)):
+        for row, planned in zip(layout.rows, layout.plan(), strict=True):
+            for column, p in zip(layout.columns, planned, strict=True):
+                name = f"{layout.number}: {', '.join(filter(None, (*row.stubs, column.group)))}"
+                rows.setdefault((p.scene, p.label), {})[name] = None
+                found[p.scene, p.label] = p
+    return [
+        Variant(suite=p.suite, scene=p.scene, method=p.method, params=p.params, rows=tuple(rows[key]))
+        for key, p in found.items()
+    ]
 
 
 def ablations() -> tuple[int, ...]:
     """Return the numbers of the paper's tables that are ablations."""
-    return tuple(table.number for table in load().table if table.suite == ABLATION)
+    return tuple(layout.number for layout in load().table if layout.suite == ABLATION)
 
 
 def methods_of(listed: Sequence[Variant]) -> dict[str, Method]:

@@ -6,26 +6,31 @@ claim what was found and whether it holds. All of it resumes; `--table` judges t
 
 import statistics
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 
 from ctsim.benchmarks import make_dataset
+from ctsim.benchmarks.engine.record import OK
+from ctsim.benchmarks.engine.table import Table, simple
 from ctsim.benchmarks.studies.methods import records, study, tables
 from ctsim.benchmarks.studies.methods.plan import Costs
-from ctsim.benchmarks.studies.methods.records import RunRecord
+from ctsim.benchmarks.studies.methods.records import METAL, RunRecord
 from ctsim.benchmarks.suites import load, select
 from ctsim.errors import InputError
 from ctsim.folder import is_complete
 from ctsim.human import human_time
-from ctsim.phantoms.scene import Scene, scene_id
+from ctsim.phantoms.scene import scene_id
 
 METHODS = ("fdk", "limar", "nmar", "os-sart")
 SCENE, SHARE = "lung-Fe", 0.6
 SLOWEST = {"limar": 2.5, "nmar": 5.0}
 PASSES = 10
 NAME = "reproduce.md"
+
+Runs = dict[tuple[str, int, str], RunRecord]
 
 
 @dataclass(frozen=True)
@@ -61,91 +66,65 @@ class Claim:
 def main(arguments: list[str]) -> int:
     """Run the command; 0 if every claim holds, 1 if one does not or cannot be judged."""
     given = tyro.cli(Arguments, prog="run-benchmark reproduce", args=arguments)
-    if given.dry_run:
-        return _dry_run(given)
-    if not given.table and (code := _compute(given)) not in (0, 1):  # a method's failure is shown below
-        return code
+    if not given.table:
+        code = _compute(given)
+        if given.dry_run or code not in (0, 1):  # a method's failure is shown below
+            return code
     found = records.latest(records.read(given.results))
     if not found:
         raise InputError(f"{given.results}: there are no records; run without --table first")
     claims = judged(found)
-    shown = [r for r in found if r.label in METHODS]
-    text = f"{markdown(claims)}\n{tables.render(shown, 'md', ('against', 'anchored'))}"
+    shown = tables.render([r for r in found if r.label in METHODS], "md", ("against", "anchored"))
+    text = f"{table(claims).markdown()}\n{shown}"
     (given.results / NAME).write_text(text, encoding="utf-8")
     sys.stdout.write(f"\n{text}\nWritten: {given.results / NAME}\n")
     return 0 if all(claim.holds for claim in claims) else 1
 
 
 def _compute(given: Arguments) -> int:
-    """Make the scans that are missing, then run what has no record."""
-    code = make_dataset.main(_scans_of(given))
-    return code or study.main(_runs_of(given, [scene.name for scene in _scenes(given)]))
-
-
-def _scans_of(given: Arguments) -> list[str]:
-    """Return the words of make-dataset."""
-    return [given.suite, str(given.data), "--seeds", *map(str, given.seeds)]
-
-
-def _runs_of(given: Arguments, scenes: list[str]) -> list[str]:
-    """Return the words of run-benchmark on these scenes."""
-    methods = [word for name in METHODS for word in ("--method", name)]
-    return [str(given.data), str(given.results), *methods, *(word for name in scenes for word in ("--scene", name))]
-
-
-def _scenes(given: Arguments) -> tuple[Scene, ...]:
-    return select(load(given.suite), (), given.seeds)
-
-
-def _dry_run(given: Arguments) -> int:
-    """Print the plans of scans to make, the runs on those that are there, and what runs on the others will take."""
-    if code := make_dataset.main([*_scans_of(given), "--dry-run"]):
+    """Make the scans that are missing and run what has no record, or print the plans of both; return the exit code."""
+    plan = ["--dry-run"] if given.dry_run else []
+    if code := make_dataset.main([given.suite, str(given.data), "--seeds", *map(str, given.seeds), *plan]):
         return code
-    scenes = _scenes(given)
+    scenes = select(load(given.suite), (), given.seeds)
     there = [scene.name for scene in scenes if is_complete(given.data, scene.name, scene_id(scene))]
-    if there and (code := study.main([*_runs_of(given, there), "--dry-run"])):
-        return code
-    if later := len(scenes) - len(there):
-        known = Costs(records.read(given.results))
-        usual = {method: known.method(method) for method in METHODS}
-        seconds = sum(2 * later * s for s in usual.values() if s is not None)
-        sys.stdout.write(f"on {later} scans to be made and their twins: {human_time(seconds)}, by the records' medians")
-        unknown = [method for method, s in usual.items() if s is None]
-        sys.stdout.write(f"; never measured: {', '.join(unknown)}\n" if unknown else "\n")
-    return 0
+    flags = [*(f"--method={name}" for name in METHODS), *(f"--scene={name}" for name in there), *plan]
+    code = study.main([str(given.data), str(given.results), *flags]) if there else 0
+    if given.dry_run and not code and (later := len(scenes) - len(there)):
+        _guess(later, Costs(records.read(given.results)))
+    return code
 
 
-def judged(found: list[RunRecord]) -> list[Claim]:
+def _guess(later: int, known: Costs) -> None:
+    """Print what the runs on scans will take that are to be made first."""
+    usual = {method: known.method(method) for method in METHODS}
+    seconds = sum(2 * later * s for s in usual.values() if s is not None)
+    sys.stdout.write(f"on {later} scans to be made and their twins: {human_time(seconds)}, by the records' medians")
+    unknown = [method for method, s in usual.items() if s is None]
+    sys.stdout.write(f"; never measured: {', '.join(unknown)}\n" if unknown else "\n")
+
+
+def judged(found: Sequence[RunRecord]) -> list[Claim]:
     """Judge every claim by the newest records of the scans with metal."""
-    runs = {(r.run.scene, r.run.seed, r.label): r for r in found if r.run.variant == "metal"}
+    runs = {(r.run.scene, r.run.seed, r.label): r for r in found if r.run.variant == METAL}
     return [_ordering(runs), *(_time(runs, method) for method in SLOWEST), _passes(runs)]
-
-
-Runs = dict[tuple[str, int, str], RunRecord]
 
 
 def _ordering(runs: Runs) -> Claim:
     """Compare the tissue's RMSE against the metal-free twin, seed by seed."""
     text = f"{SCENE}: RMSE of the tissue against the metal-free twin, NMAR < LIMAR < {SHARE:g} FDK, for every seed"
-    errors = {m: _values(runs, SCENE, m) for m in ("fdk", "limar", "nmar")}
-    seeds = set.intersection(*(set(e) for e in errors.values()))
-    if not seeds:
+    errors: dict[int, dict[str, float]] = {}
+    for (scene, seed, label), record in runs.items():
+        score = record.scores.get("artefact")
+        value = score.values.get("rmse") if score and scene == SCENE else None
+        if value is not None:
+            errors.setdefault(seed, {})[label] = value
+    known = [e for _, e in sorted(errors.items()) if {"fdk", "limar", "nmar"} <= e.keys()]
+    if not known:
         return Claim(text=text, found="no seed has all three", holds=None)
-    fdk, limar, nmar = ([errors[m][seed] for seed in sorted(seeds)] for m in errors)
-    shown = ", ".join(f"{m} {spread(e, 1)}" for m, e in zip(errors, (fdk, limar, nmar), strict=True))
-    holds = all(n < li < SHARE * f for f, li, n in zip(fdk, limar, nmar, strict=True))
-    return Claim(text=text, found=f"{shown} HU ({len(seeds)} seeds)", holds=holds)
-
-
-def _values(runs: Runs, scene: str, method: str) -> dict[int, float]:
-    """Return a method's RMSE under `artefact` by seed, where it is known."""
-    found = {}
-    for (name, seed, label), record in runs.items():
-        if (name, label) == (scene, method) and "artefact" in record.scores:
-            value = record.scores["artefact"].values.get("rmse")
-            if value is not None:
-                found[seed] = value
-    return found
+    shown = ", ".join(f"{m} {spread([e[m] for e in known])}" for m in ("fdk", "limar", "nmar"))
+    holds = all(e["nmar"] < e["limar"] < SHARE * e["fdk"] for e in known)
+    return Claim(text=text, found=f"{shown} HU ({len(known)} seeds)", holds=holds)
 
 
 def _time(runs: Runs, method: str) -> Claim:
@@ -154,7 +133,7 @@ def _time(runs: Runs, method: str) -> Claim:
     ratios = []
     for (scene, seed, label), record in runs.items():
         base = runs.get((scene, seed, "fdk"))
-        if label == method and record.status == "ok" and record.cost and base is not None and base.cost:
+        if label == method and record.status == OK and record.cost and base is not None and base.cost:
             ratios.append(record.cost.wall / base.cost.wall)
     if not ratios:
         return Claim(text=text, found="no scan has both", holds=None)
@@ -169,22 +148,21 @@ def _passes(runs: Runs) -> Claim:
     mine = [record for (_, _, label), record in runs.items() if label == "os-sart"]
     if not mine:
         return Claim(text=text, found="no run", holds=None)
-    walls = [r.cost.wall for r in mine if r.cost is not None]
-    updates = sorted({r.cost.view_updates for r in mine if r.cost is not None})
-    holds = all(r.status == "ok" and r.run.params.get("iterations") == PASSES for r in mine)
-    took = f"{spread(walls, 1)} s" if walls else "no time"
-    return Claim(text=text, found=f"{took} for {', '.join(map(str, updates))} view updates", holds=holds)
+    costs = [r.cost for r in mine if r.cost is not None]
+    updates = ", ".join(map(str, sorted({cost.view_updates for cost in costs})))
+    took = f"{spread([cost.wall for cost in costs])} s" if costs else "no time"
+    holds = all(r.status == OK and r.run.params.get("iterations") == PASSES for r in mine)
+    return Claim(text=text, found=f"{took} for {updates} view updates", holds=holds)
 
 
-def spread(values: list[float], digits: int) -> str:
+def spread(values: Sequence[float]) -> str:
     """Return mean ± standard deviation; the mean alone of a single value."""
-    text = f"{statistics.fmean(values):.{digits}f}"
-    return text + (f" ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else "")
+    text = f"{statistics.fmean(values):.1f}"
+    return text + (f" ± {statistics.stdev(values):.1f}" if len(values) > 1 else "")
 
 
-def markdown(claims: list[Claim]) -> str:
+def table(claims: Sequence[Claim]) -> Table:
     """Return the claims as a table."""
     words = {True: "yes", False: "**no**", None: "not measured"}
-    lines = ["| claim | found | holds |", "|---|---|---|"]
-    lines += [f"| {c.text} | {c.found} | {words[c.holds]} |" for c in claims]
-    return "## Claims\n\n" + "\n".join(lines) + "\n"
+    rows = [[claim.text, claim.found, words[claim.holds]] for claim in claims]
+    return simple(("claim", "found", "holds"), rows, title="Claims")

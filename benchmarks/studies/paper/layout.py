@@ -1,31 +1,22 @@
 """The paper's tables as data: their layout, the paper's own figures, and what is run here for each cell.
 
-`tables.toml` holds them. A table is printed with a pair of columns, "paper" and "here", for each
-of the paper's, as Markdown or as LaTeX (booktabs).
+`tables.toml` holds them.
 """
 
 import re
 import shlex
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import resources
 from typing import Any, Literal
 
 import msgspec
 
-from ctsim.benchmarks.engine import latex
-from ctsim.benchmarks.engine.texts import escape, ranked
+from ctsim.benchmarks.engine.table import Cell
 from ctsim.benchmarks.methods import Method
 from ctsim.benchmarks.scores.columns import COLUMNS, Metric
-from ctsim.benchmarks.studies.paper.scenes import title
 from ctsim.errors import InputError
 
-Form = Literal["md", "tex"]
-SIDES = ("paper", "here")
-NONE = "–"
-MARKS: dict[Form, dict[str, str]] = {
-    "md": {"best": "**{}**", "second": "<u>{}</u>", "": "{}"},
-    "tex": {"best": r"\textbf{{{}}}", "second": r"\underline{{{}}}", "": "{}"},
-}
+NONE = Cell("–")
 _TIME = re.compile(r"(?:(\d+)h )?(?:(\d+)m )?(\d+)s")
 
 
@@ -46,7 +37,7 @@ class Heading(What, frozen=True, kw_only=True, forbid_unknown_fields=True):
     group: str = ""
 
     @property
-    def column(self) -> Metric:
+    def shown(self) -> Metric:
         """How its metric is shown."""
         return COLUMNS["cost" if self.metric == "wall" else "paper"][self.metric]
 
@@ -70,7 +61,7 @@ class Planned:
     @property
     def place(self) -> str:
         """The scene as tables call it."""
-        return title((self.suite, self.scene))
+        return f"{self.suite}/{self.scene}"
 
     @property
     def label(self) -> str:
@@ -85,7 +76,7 @@ class Planned:
         return " --set ".join([f"--method {self.method}", *settings])
 
 
-class Table(What, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Layout(What, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One of the paper's tables; `rank` says which cells compete, see the file.
 
     Raises InputError where a row has more or fewer cells than the table, or a cell has no suite, scene or method.
@@ -101,49 +92,46 @@ class Table(What, frozen=True, kw_only=True, forbid_unknown_fields=True):
     note: str = ""
 
     def __post_init__(self) -> None:
-        for row in self.rows:
+        for row, planned in zip(self.rows, self.plan(), strict=True):
             where = f"table {self.number}, row {' '.join(row.stubs)}"
             if len(row.stubs) != len(self.stubs) or len(row.figures) not in (0, len(self.columns)):
                 raise InputError(
                     f"{where}: expected {len(self.stubs)} stubs and {len(self.columns)} figures or none, "
                     f"got {len(row.stubs)} and {len(row.figures)}"
                 )
-            for column in self.columns:
-                planned = self.planned(row, column)
-                if not (planned.suite and planned.scene and planned.method):
+            for column, cell in zip(self.columns, planned, strict=True):
+                if not (cell.suite and cell.scene and cell.method):
                     raise InputError(f"{where}, column {column.title}: expected suite, scene and method")
-
-    def planned(self, row: Row, column: Heading) -> Planned:
-        """Return what is run for a cell."""
-        return Planned(
-            suite=row.suite or column.suite or self.suite,
-            scene=row.scene or column.scene or self.scene,
-            method=row.method or column.method or self.method,
-            params={**self.set, **column.set, **row.set},
-        )
 
     def plan(self) -> list[list[Planned]]:
         """Return what is run for each cell [row][column]."""
-        return [[self.planned(row, column) for column in self.columns] for row in self.rows]
+        return [
+            [
+                Planned(
+                    suite=row.suite or column.suite or self.suite,
+                    scene=row.scene or column.scene or self.scene,
+                    method=row.method or column.method or self.method,
+                    params={**self.set, **column.set, **row.set},
+                )
+                for column in self.columns
+            ]
+            for row in self.rows
+        ]
 
-    def printed(self, k: int) -> list[str]:
-        """Return the paper's figures in column `k`."""
+    def published(self, k: int) -> list[str]:
+        """Return the paper's figures in column `k`; none in a column that is ours alone."""
         return [row.figures[k] for row in self.rows if row.figures and row.figures[k]]
 
     def digits(self, k: int) -> int:
         """Return the decimals of column `k`: as many as the paper prints, in a column of ours the metric's own."""
-        return max((len(text.partition(".")[2]) for text in self.printed(k)), default=self.columns[k].column.digits)
-
-    def sides(self, k: int) -> tuple[str, ...]:
-        """Return under which titles column `k` is printed."""
-        return SIDES if self.printed(k) else SIDES[1:]
+        return max((len(text.partition(".")[2]) for text in self.published(k)), default=self.columns[k].shown.digits)
 
 
 class Paper(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The paper and its tables."""
 
     source: str
-    table: tuple[Table, ...]
+    table: tuple[Layout, ...]
 
 
 def load() -> Paper:
@@ -152,20 +140,11 @@ def load() -> Paper:
     return msgspec.toml.decode(text, type=Paper)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Cell:
-    """A cell: the number to rank by, if it has one, its text, and its place, "best", "second" or ""."""
-
-    number: float | None = None
-    text: str = NONE
-    place: str = ""
-
-
 def printed(text: str) -> Cell:
     """Return a figure of the paper as a cell; a time is ranked by its seconds."""
     if not text:
-        return Cell()
-    return Cell(number=seconds(text) if text.endswith("s") else float(text), text=text)
+        return NONE
+    return Cell(text, seconds(text) if text.endswith("s") else float(text))
 
 
 def seconds(text: str) -> float:
@@ -186,78 +165,3 @@ def duration(s: float) -> str:
     if hours:
         return f"{hours}h {minutes:02d}m {rest:02d}s"
     return f"{minutes}m {rest:02d}s" if minutes else f"{rest}s"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sheet:
-    """A table that is filled: for each side ("paper", "here") the cells [row][column]; and what stands around it."""
-
-    table: Table
-    caption: str
-    cells: dict[str, list[list[Cell]]]
-    notes: list[str]
-
-    def ranked(self) -> "Sheet":
-        """Return the sheet with the best and the second of each side marked."""
-        return replace(self, cells={side: _ranked(self.table, grid) for side, grid in self.cells.items()})
-
-
-def _ranked(table: Table, grid: list[list[Cell]]) -> list[list[Cell]]:
-    """Mark the best and the second among the cells that compete, which those of different scenes never do."""
-    groups: dict[tuple[Any, ...], list[tuple[int, int]]] = {}
-    for i, row in enumerate(table.rows if table.rank else ()):
-        for k, column in enumerate(table.columns):
-            key = (column.metric, table.planned(row, column).place, i if table.rank == "across" else k)
-            groups.setdefault(key, []).append((i, k))
-    out = [list(row) for row in grid]
-    for group in groups.values():
-        better = table.columns[group[0][1]].column.better
-        for n, place in ranked([grid[i][k].number for i, k in group], better).items():
-            i, k = group[n]
-            out[i][k] = replace(grid[i][k], place=place)
-    return out
-
-
-def render(sheet: Sheet, form: Form) -> str:
-    """Render a filled table."""
-    sides = [sheet.table.sides(k) for k in range(len(sheet.table.columns))]
-    body = [
-        [escape(stub, form) if form == "md" else latex.prose(stub) for stub in row.stubs]
-        + [_text(sheet.cells[side][i][k], form) for k in range(len(sides)) for side in sides[k]]
-        for i, row in enumerate(sheet.table.rows)
-    ]
-    return _markdown(sheet, body) if form == "md" else _latex(sheet, body)
-
-
-def _text(cell: Cell, form: Form) -> str:
-    return MARKS[form][cell.place].format(escape(cell.text, form))
-
-
-def _markdown(sheet: Sheet, body: list[list[str]]) -> str:
-    table = sheet.table
-    titles = [f"{c.group}: {c.title}" if c.group else c.title for c in table.columns]
-    heads = [*table.stubs, *(f"{title}, {side}" for k, title in enumerate(titles) for side in table.sides(k))]
-    rule = "|" + "---|" * len(table.stubs) + "---:|" * (len(heads) - len(table.stubs))
-    lines = ["| " + " | ".join(escape(t, "md") for t in heads) + " |", rule]
-    lines += ["| " + " | ".join(line) + " |" for line in body]
-    notes = "".join(f"- {note}\n" for note in sheet.notes)
-    title = f"## Table {table.number}. {table.title}"
-    return f"{title}\n\n{sheet.caption}\n\n" + "\n".join(lines) + "\n" + (f"\n{notes}" if notes else "")
-
-
-def _latex(sheet: Sheet, body: list[list[str]]) -> str:
-    table, n_stubs = sheet.table, len(sheet.table.stubs)
-    head: list[str] = []
-    sides = [table.sides(k) for k in range(len(table.columns))]
-    if any(column.group for column in table.columns):
-        head += latex.spanning(n_stubs, [(c.group, len(s)) for c, s in zip(table.columns, sides, strict=True)])
-    head += latex.spanning(n_stubs, [(c.title, len(s)) for c, s in zip(table.columns, sides, strict=True)], merge=False)
-    head.append(latex.row([*(latex.prose(stub) for stub in table.stubs), *(side for pair in sides for side in pair)]))
-    return latex.table(
-        latex.prose(f"{table.title}. {sheet.caption}"),
-        "l" * n_stubs + "r" * sum(map(len, sides)),
-        head,
-        [latex.row(line) for line in body],
-        label=f"tab:paper-{table.number}",
-        notes=[latex.prose(note) for note in sheet.notes],
-    )
