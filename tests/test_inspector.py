@@ -9,8 +9,8 @@ from test_metrics import truth
 
 from ctsim.benchmarks import cli
 from ctsim.benchmarks.scores.protocol import AT_50KEV, evaluate
-from ctsim.benchmarks.studies import inspect as inspector
-from ctsim.benchmarks.studies.inspect import BASE, SINGLE, WHOLE, Convention, score
+from ctsim.benchmarks.studies.inspect import study as inspector
+from ctsim.benchmarks.studies.inspect.study import BASE, SINGLE, WHOLE, Convention, Inspected
 from ctsim.benchmarks.studies.methods import records
 from ctsim.benchmarks.studies.methods.volumes import at_50kev_of, write_volume
 from ctsim.reconstruct.fdk import reconstruct as fdk
@@ -21,6 +21,12 @@ def case():
     t = truth()
     noise = 0.003 * np.random.default_rng(4).standard_normal(t.metal.shape)
     return (t.references["effective"] + noise).astype(np.float32), t
+
+
+def score(values, t, convention, at_50kev=None):
+    """PSNR, SSIM and data range."""
+    found = inspector.score(Inspected(label="fdk", values=values, at_50kev=at_50kev), t, convention)
+    return found.psnr, found.ssim, found.data_range
 
 
 def how(title):
@@ -48,8 +54,8 @@ def test_what_is_held_against_50_kev_is_the_methods_own_volume_there(case):
     paper = evaluate(volume, t, at_50kev=own)["paper"].values
     assert score(volume, t, how("protocol paper"), own)[:2] == (paper["psnr3d"], paper["ssim3d"])
     at_50kev = {c.title for c in (*WHOLE, *SINGLE["reference"]) if c.reference == "50kev"}
-    pairs = zip(inspector.table(volume, t, own), inspector.table(volume, t), strict=True)
-    assert {a[1] for a, b in pairs if a != b} == at_50kev
+    tables = (inspector.table(Inspected(label="", values=volume, at_50kev=v), t) for v in (own, None))
+    assert {a[1].text for a, b in zip(*(table.rows for table in tables), strict=True) if a != b} == at_50kev
 
 
 def test_a_range_moves_the_psnr_by_its_ratio(case):
@@ -140,7 +146,7 @@ def test_the_command_shows_a_kept_volume_and_writes_the_table(smallest, results,
     assert code == 0
     text = (results / "inspect-smallest-fdk.md").read_text(encoding="utf-8")
     assert said.out.startswith(text)
-    rows = [line for line in text.splitlines() if line.startswith("| ")][2:]
+    rows = [line for line in text.splitlines() if line.startswith("| ")][1:]
     assert len(rows) == 1 + sum(map(len, SINGLE.values())) + len(WHOLE)
     (record,) = (r for r in records.read(results) if r.run.variant == "metal")
     tissue = record.scores["tissue"]
@@ -191,9 +197,9 @@ def test_a_volume_that_has_no_scores_is_refused(case, smallest):
 
     stored = open_scan(list_scans(smallest)[0])
     with pytest.raises(InputError, match="shape"):
-        inspector.markdown(case[0], stored, "fdk")
+        inspector.markdown(Inspected(label="fdk", values=case[0]), stored)
     right = np.zeros((10, 12, 12), np.float32)
     with pytest.raises(InputError, match="volume at 50 keV has shape"):
-        inspector.markdown(right, stored, "fdk", case[0])
+        inspector.markdown(Inspected(label="fdk", values=right, at_50kev=case[0]), stored)
     with pytest.raises(InputError, match="not finite"):
-        inspector.markdown(np.full((10, 12, 12), np.nan), stored, "fdk")
+        inspector.markdown(Inspected(label="fdk", values=np.full((10, 12, 12), np.nan)), stored)

@@ -25,17 +25,20 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from ctsim.benchmarks.studies import inspect as inspector
+from ctsim.benchmarks.studies.inspect import study as inspector
 from ctsim.reports import kept, show
 from ctsim.reports.figures import COLOURS, INK
 
 DATA, RESULTS = (Path(os.environ.get(f"CTSIM_{name.upper()}", name)) for name in ("data", "results"))
 case = kept.open_case(DATA, RESULTS)
-first = case.kept[0]
-values = np.asarray(first.values)
+
+kept_volumes = [
+    inspector.Inspected(label=k.record.label, values=np.asarray(k.values), at_50kev=k.at_50kev) for k in case.kept
+]
+first = kept_volumes[0]
 
 # %%
-show.text(inspector.markdown(values, case.stored, first.record.label, first.at_50kev))
+show.text(inspector.markdown(first, case.stored))
 
 # %% [markdown]
 # ## How far each convention moves the scores
@@ -43,20 +46,21 @@ show.text(inspector.markdown(values, case.stored, first.record.label, first.at_5
 # volume.
 
 # %%
-base_psnr, base_ssim, _ = inspector.score(values, case.truth, inspector.BASE)
+base = inspector.score(first, case.truth, inspector.BASE)
 named = [(what, how) for what, group in (*inspector.SINGLE.items(), ("all of it", inspector.WHOLE)) for how in group]
-moved = [(what, how, inspector.score(values, case.truth, how, first.at_50kev)) for what, how in named]
+moved = [(what, how, inspector.score(first, case.truth, how)) for what, how in named]
 kinds = list(dict.fromkeys(what for what, _ in named))
 
 drawing = Figure(figsize=(9.5, 0.27 * len(moved) + 1.2), layout="constrained")
 left, right = drawing.subplots(1, 2, sharey=True)
-for axes, number, base, title in ((left, 0, base_psnr, "PSNR3D (dB)"), (right, 1, base_ssim, "SSIM3D")):
+for axes, name, title in ((left, "psnr", "PSNR3D (dB)"), (right, "ssim", "SSIM3D")):
+    start = getattr(base, name)
     for line, (what, _, found) in enumerate(moved):
-        value = found[number]
-        if value is not None and base is not None:
-            axes.barh(line, value - base, color=COLOURS[kinds.index(what) % len(COLOURS)])
+        value = getattr(found, name)
+        if value is not None and start is not None:
+            axes.barh(line, value - start, color=COLOURS[kinds.index(what) % len(COLOURS)])
     axes.axvline(0, color=INK, lw=0.8)
-    axes.set_xlabel(f"change in {title}" + ("" if base is None else f"; tissue: {base:.3g}"))
+    axes.set_xlabel(f"change in {title}" + ("" if start is None else f"; tissue: {start:.3g}"))
 left.set_yticks(range(len(moved)), labels=[how.title for _, how, _ in moved], fontsize=8)
 left.invert_yaxis()
 show.figure(drawing, "metrics-conventions")
@@ -69,7 +73,7 @@ show.figure(drawing, "metrics-conventions")
 # %%
 rows = []
 for how in (inspector.BASE, *(how for _, how in named)):
-    found = {k.record.label: inspector.score(k.values, case.truth, how, k.at_50kev)[0] for k in case.kept}
+    found = {volume.label: inspector.score(volume, case.truth, how).psnr for volume in kept_volumes}
     known = {label: psnr for label, psnr in found.items() if psnr is not None}
     rows.append([how.title, " > ".join(sorted(known, key=lambda label: -known[label])) or "–"])
 show.table(["convention", "order by PSNR3D"], rows)

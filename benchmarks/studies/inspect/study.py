@@ -1,4 +1,4 @@
-"""The metric inspector: how the PSNR and SSIM of one volume move with the convention they are computed by.
+"""The metric inspector: one volume under many conventions of PSNR and SSIM.
 
 `run-benchmark inspect DATA RESULTS` reads a kept volume, `run-benchmark inspect DATA --method NAME`
 reconstructs one. Each row of the table changes one convention of the protocol `tissue`; conventions
@@ -7,39 +7,41 @@ that are known from the literature as a whole follow. Where the reference is tha
 """
 
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import tyro
 from numpy.typing import NDArray
+from skimage.metrics import structural_similarity
 
+from ctsim.benchmarks import methods
+from ctsim.benchmarks.engine.record import OK
+from ctsim.benchmarks.engine.table import Table, simple
+from ctsim.benchmarks.scores import metrics
+from ctsim.benchmarks.scores.protocol import TISSUE, Stored, Truth, tissue_range, truth_of
+from ctsim.benchmarks.scores.ssim import ssim_along_axes
+from ctsim.benchmarks.studies.inspect import Flags
+from ctsim.benchmarks.studies.methods import records
+from ctsim.benchmarks.studies.methods.attempt import attempt, scan_for
+from ctsim.benchmarks.studies.methods.records import METAL
+from ctsim.benchmarks.studies.methods.volumes import identity_of, own_at_50kev, read_volume
 from ctsim.errors import InputError
 from ctsim.human import human_choice
-
-if TYPE_CHECKING:
-    from ctsim.benchmarks.scores.protocol import Stored, Truth
+from ctsim.store import list_scans, open_scan
 
 Volume = NDArray[Any]
 Window = Literal["gauss", "gauss_zero", "r2", "uniform7"]
 
 
-@dataclass(frozen=True)
-class Arguments:
-    """Show how the scores of one volume move under each convention, as a table in Markdown."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inspected:
+    """A volume [z, y, x] in 1/mm with its method's label, and the method's own volume at 50 keV where it has one."""
 
-    data: tyro.conf.Positional[Path]
-    """The folder that make-dataset wrote."""
-    results: tyro.conf.Positional[Path | None] = None
-    """A results folder with kept volumes; the table is written into it."""
-    method: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Which row of the results (default: the only one); without RESULTS, the method to reconstruct by."""
-    scene: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Which scene (default: the first)."""
-    out: Path | None = None
-    """The file to write (default: inspect-SCENE-METHOD.md in RESULTS, or here)."""
+    label: str
+    values: Volume
+    at_50kev: Volume | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,6 +59,18 @@ class Convention:
     alignment: Literal["none", "gain", "gain_offset", "minmax"] = "none"
     clip: Literal["none", "zero", "reference", "one"] = "none"
     window: Window = "gauss"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Score:
+    """PSNR (dB), SSIM, and the data range, in the units that volumes have after alignment.
+
+    None where a number does not exist: identical volumes have no PSNR, an empty region has neither.
+    """
+
+    psnr: float | None
+    ssim: float | None
+    data_range: float
 
 
 BASE = Convention(title="protocol tissue")
@@ -91,62 +105,42 @@ SINGLE: dict[str, tuple[Convention, ...]] = {
         "window", {"Gaussian, zeros beyond the border": "gauss_zero", "uniform 7³, sample covariance": "uniform7"}
     ),
 }
+_AT_50KEV = Convention(title="", region="all", reference="50kev")
 WHOLE: tuple[Convention, ...] = (
     Convention(title="protocol aligned", alignment="gain"),
-    Convention(title="protocol paper", region="all", reference="50kev", data_range="maxmin"),
-    Convention(title="range max, all voxels", region="all", reference="50kev", data_range="max"),
-    Convention(
-        title="R2-Gaussian (peak 1, zero border, empty slices left out)",
-        region="all",
-        reference="50kev",
-        data_range="1",
-        window="r2",
-    ),
-    Convention(title="NAF (7³ window, range 2)", region="all", reference="50kev", data_range="2", window="uniform7"),
+    replace(_AT_50KEV, title="protocol paper", data_range="maxmin"),
+    replace(_AT_50KEV, title="range max, all voxels", data_range="max"),
+    replace(_AT_50KEV, title="R2-Gaussian (peak 1, zero border, empty slices left out)", data_range="1", window="r2"),
+    replace(_AT_50KEV, title="NAF (7³ window, range 2)", data_range="2", window="uniform7"),
 )
 
 
-def score(
-    values: Volume, truth: "Truth", how: Convention, at_50kev: Volume | None = None
-) -> tuple[float | None, float | None, float]:
-    """Return PSNR (dB), SSIM and the data range (in the units the volumes have after alignment).
+def score(found: Inspected, truth: Truth, how: Convention) -> Score:
+    """Score a volume; its own at 50 keV, where there is one, against the reference of 50 keV.
 
-    What is held against 50 keV is `at_50kev` where there is one. Outside the region the volume counts as the reference
-    in SSIM's window. None where a number does not exist: identical volumes have no PSNR, an empty region has neither.
+    Outside the region the volume counts as the reference in SSIM's window.
     """
-    from ctsim.benchmarks.scores import metrics
-
-    if how.reference == "50kev" and at_50kev is not None:
-        values = at_50kev
-    reference = truth.references[how.reference]
-    region = region_of(truth, how.region)
-    data_range = range_of(values, truth, how)
+    own = found.at_50kev if how.reference == "50kev" else None
+    values, reference = found.values if own is None else own, truth.references[how.reference]
+    region, data_range = region_of(truth, how.region), range_of(values, truth, how)
     values = clipped(aligned(values, truth, how), reference, how.clip)
     if how.alignment == "minmax":
         reference = unit(reference)
     if not region.any():
-        return None, None, data_range
+        return Score(psnr=None, ssim=None, data_range=data_range)
     psnr = metrics.psnr3d(values, reference, data_range=data_range, region=region)
-    return psnr, similarity(values, reference, region, data_range, how.window), data_range
+    return Score(psnr=psnr, ssim=similarity(values, reference, region, data_range, how.window), data_range=data_range)
 
 
-def region_of(truth: "Truth", name: str) -> NDArray[np.bool_]:
+def region_of(truth: Truth, name: str) -> NDArray[np.bool_]:
     """Return the mask of a region by its name."""
-    match name:
-        case "tissue":
-            return truth.tissue
-        case "body":
-            return truth.body | truth.metal
-        case "metal":
-            return truth.metal
-        case _:
-            return np.ones_like(truth.metal)
+    if name == "all":
+        return np.ones_like(truth.metal)
+    return {"tissue": truth.tissue, "body": truth.body | truth.metal, "metal": truth.metal}[name]
 
 
-def range_of(values: Volume, truth: "Truth", how: Convention) -> float:
+def range_of(values: Volume, truth: Truth, how: Convention) -> float:
     """Return the data range by its rule; a rule that gives 0 or less is an InputError."""
-    from ctsim.benchmarks.scores.protocol import tissue_range
-
     reference = truth.references[how.reference]
     match how.data_range:
         case "percentile":
@@ -164,10 +158,8 @@ def range_of(values: Volume, truth: "Truth", how: Convention) -> float:
     return found
 
 
-def aligned(values: Volume, truth: "Truth", how: Convention) -> Volume:
+def aligned(values: Volume, truth: Truth, how: Convention) -> Volume:
     """Return the volume after alignment; gains and offsets are fitted as in `aligned`, on the body's tissue."""
-    from ctsim.benchmarks.scores import metrics
-
     if how.alignment == "minmax":
         return unit(values)
     if how.alignment == "none":
@@ -202,11 +194,6 @@ def similarity(
 
     None with "uniform7" where an axis has fewer than 7 voxels, with "r2" where the reference is empty.
     """
-    from skimage.metrics import structural_similarity
-
-    from ctsim.benchmarks.scores import metrics
-    from ctsim.benchmarks.scores.ssim import ssim_along_axes
-
     if window == "gauss":
         return metrics.ssim3d(values, reference, data_range=data_range, region=region)
     if window == "r2":
@@ -223,14 +210,17 @@ def similarity(
     return float(mean) if region.all() else float(full[region].mean(dtype=np.float64))
 
 
-def table(values: Volume, truth: "Truth", at_50kev: Volume | None = None) -> Iterator[list[str]]:
-    """Yield the cells of each row: what changes, the convention, range, PSNR and SSIM with their changes."""
-    base = score(values, truth, BASE)
-    yield ["–", BASE.title, f"{base[2]:.4g}", _cell(base[0], None, 2), _cell(base[1], None, 3)]
+def table(found: Inspected, truth: Truth) -> Table:
+    """Return a row for each convention: what it changes, data range, PSNR and SSIM with their changes."""
+    base = score(found, truth, BASE)
+    rows = [["–", BASE.title, f"{base.data_range:.4g}", _cell(base.psnr, None, 2), _cell(base.ssim, None, 3)]]
     for what, conventions in (*SINGLE.items(), ("all of it", WHOLE)):
         for how in conventions:
-            psnr, ssim, data_range = score(values, truth, how, at_50kev)
-            yield [what, how.title, f"{data_range:.4g}", _cell(psnr, base[0], 2), _cell(ssim, base[1], 3)]
+            new = score(found, truth, how)
+            cells = _cell(new.psnr, base.psnr, 2), _cell(new.ssim, base.ssim, 3)
+            rows.append([what, how.title, f"{new.data_range:.4g}", *cells])
+    numbers = ("range", "PSNR3D (dB)", "SSIM3D")
+    return simple(("changed", "convention", *numbers), rows, numbers=numbers)
 
 
 def _cell(value: float | None, base: float | None, digits: int) -> str:
@@ -239,39 +229,40 @@ def _cell(value: float | None, base: float | None, digits: int) -> str:
     return f"{value:.{digits}f}" + ("" if base is None else f" ({value - base:+.{digits}f})")
 
 
-def markdown(values: Volume, stored: "Stored", label: str, at_50kev: Volume | None = None) -> str:
-    """Return the table in Markdown with what it shows; volumes are [z, y, x] in 1/mm and finite."""
-    from ctsim.benchmarks.scores.protocol import TISSUE, truth_of
-
+def markdown(found: Inspected, stored: Stored) -> str:
+    """Return the table in Markdown with what it shows. Raises InputError for volumes that cannot be scored."""
     truth = truth_of(stored)
-    for volume, which in ((values, "volume"), (at_50kev, "volume at 50 keV")):
+    for volume, which in ((found.values, "volume"), (found.at_50kev, "volume at 50 keV")):
         if volume is not None and volume.shape != truth.metal.shape:
             raise InputError(f"the {which} has shape {volume.shape}, scan {stored.name!r} {truth.metal.shape}")
         if volume is not None and not np.isfinite(volume).all():
-            raise InputError(f"the {which} of {label} has voxels that are not finite: it has no scores")
+            raise InputError(f"the {which} of {found.label} has voxels that are not finite: it has no scores")
     what, own = "volume", "the same volume, the only one there is,"
-    if at_50kev is not None:
+    if found.at_50kev is not None:
         what, own = "run", "the method's own volume at 50 keV"
-    rows = [["changed", "convention", "range", "PSNR3D (dB)", "SSIM3D"], ["---", "---", "---:", "---:", "---:"]]
-    rows += list(table(values, truth, at_50kev))
     return (
-        f"# One {what}, many scores: {stored.name}, {label}\n\n"
+        f"# One {what}, many scores: {stored.name}, {found.label}\n\n"
         f"First the protocol tissue: region {TISSUE}; reference effective spectrum behind {truth.l0:.1f} mm of water; "
         "no alignment; nothing clipped; range the 99.9 percentile of the reference in the region; SSIM with Gaussian "
         "weights in slices along three axes. Each row changes what its first column says; a range follows its rule, so "
         f"that another reference has another one. Where the reference is 50 keV, {own} is scored. "
         "The last rows are conventions as they are printed. In brackets the change; ranges are 1/mm, but for volumes "
-        "scaled to [0, 1].\n\n" + "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
+        f"scaled to [0, 1].\n\n{table(found, truth).markdown()}"
     )
 
 
 def main(arguments: list[str]) -> int:
     """Run the command; return 0. Raises InputError where data, volume or method cannot be used."""
-    given = tyro.cli(Arguments, prog="run-benchmark inspect", args=arguments)
-    stored = _scan(given)
-    values, label, at_50kev = _kept(given, stored) if given.results is not None else _made(given, stored)
-    text = markdown(values, stored, label, at_50kev)
-    name = "".join(c if c.isalnum() or c in "-.=" else "_" for c in f"inspect-{stored.name}-{label}")
+    given = tyro.cli(Flags, prog="run-benchmark inspect", args=arguments)
+    scans = {folder.name: folder for folder in list_scans(given.data)}
+    if not scans:
+        raise InputError(f"{given.data}: the dataset has no scenes")
+    if given.scene is not None and given.scene not in scans:
+        raise InputError(f"--scene {given.scene!r}: {given.data} has {human_choice(scans, given.scene)}")
+    stored = open_scan(scans[given.scene or next(iter(scans))])
+    found = _made(given.method, stored) if given.results is None else _kept(given.results, given.method, stored)
+    text = markdown(found, stored)
+    name = "".join(c if c.isalnum() or c in "-.=" else "_" for c in f"inspect-{stored.name}-{found.label}")
     path = given.out or (given.results or Path()) / f"{name}.md"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
@@ -279,57 +270,34 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def _scan(given: Arguments) -> "Stored":
-    from ctsim.store import list_scans, open_scan
-
-    scans = {folder.name: folder for folder in list_scans(given.data)}
-    if not scans:
-        raise InputError(f"{given.data}: the dataset has no scenes")
-    name = given.scene or next(iter(scans))
-    if name not in scans:
-        raise InputError(f"--scene {name!r}: {given.data} has {human_choice(scans, name)}")
-    return open_scan(scans[name])
-
-
-def _kept(given: Arguments, stored: "Stored") -> tuple[Volume, str, Volume | None]:
+def _kept(results: Path, name: str | None, stored: Stored) -> Inspected:
     """Read the volumes that a results folder keeps of a scan and method."""
-    from ctsim.benchmarks.studies.methods import records
-    from ctsim.benchmarks.studies.methods.volumes import identity_of, own_at_50kev, read_volume
-
-    assert given.results is not None
-    found = records.read(given.results)
-    kept = {
-        r.label: r
-        for r in records.latest(found)
-        if r.task.data == stored.content_hash and r.run.variant == "metal" and r.volume
-    }
+    shown = (r for r in records.latest(records.read(results)) if r.run.variant == METAL and r.volume)
+    kept = {r.label: r for r in shown if r.task.data == stored.content_hash}
     if not kept:
-        raise InputError(f"{given.results}: no volume of scene {stored.name!r} is kept; run a method first")
-    if given.method is None and len(kept) > 1:
-        raise InputError(f"{given.results}: there are several volumes; say --method {', '.join(kept)}")
-    label = given.method or next(iter(kept))
+        raise InputError(f"{results}: no volume of scene {stored.name!r} is kept; run a method first")
+    if name is None and len(kept) > 1:
+        raise InputError(f"{results}: there are several volumes; say --method {', '.join(kept)}")
+    label = name or next(iter(kept))
     if label not in kept:
-        raise InputError(f"--method {label!r}: {given.results} keeps volumes of {', '.join(kept)}")
-    path = given.results / str(kept[label].volume)
+        raise InputError(f"--method {label!r}: {results} keeps volumes of {', '.join(kept)}")
+    path = results / str(kept[label].volume)
     values = read_volume(path)
     if identity_of(path) != kept[label].identity:
         raise InputError(f"{path}: is not the volume of the last record of {label}; run it again with --force")
     own = own_at_50kev(path, kept[label].identity)
-    return values, label, None if own is None else read_volume(own)
+    return Inspected(label=label, values=values, at_50kev=None if own is None else read_volume(own))
 
 
-def _made(given: Arguments, stored: "Stored") -> tuple[Volume, str, Volume | None]:
+def _made(name: str | None, stored: Stored) -> Inspected:
     """Reconstruct the scan."""
-    from ctsim.benchmarks import methods
-    from ctsim.benchmarks.studies.methods.attempt import attempt, scan_for
-
-    if given.method is None:
+    if name is None:
         raise InputError("expected a results folder or --method NAME")
-    method = methods.find(given.method)
-    scan = scan_for(method, stored, "metal")
+    method = methods.find(name)
+    scan = scan_for(method, stored, METAL)
     if reason := method.skip(scan):
-        raise InputError(f"method {given.method!r} does not apply to {stored.name!r}: {reason}")
+        raise InputError(f"method {name!r} does not apply to {stored.name!r}: {reason}")
     outcome = attempt(method, scan, 0.0)
-    if outcome.status != "ok" or outcome.values is None:
-        raise InputError(f"method {given.method!r} ended as {outcome.status}: {outcome.reason}")
-    return outcome.values, method.label, outcome.at_50kev
+    if outcome.status != OK or outcome.values is None:
+        raise InputError(f"method {name!r} ended as {outcome.status}: {outcome.reason}")
+    return Inspected(label=method.label, values=outcome.values, at_50kev=outcome.at_50kev)
