@@ -10,11 +10,15 @@ from pathlib import Path
 import matplotlib
 import matplotlib.patches
 import numpy as np
+import tifffile
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from ctsim.benchmarks.scores.protocol import truth_of
+from ctsim.benchmarks.studies.methods.panels import cut
 from ctsim.errors import InputError
+from ctsim.store import open_scan
 
 DSO, DSD, HALF_U, HALF_V = 5.0, 8.0, 2.6, 2.0
 ANGLE = np.radians(35.0)
@@ -90,12 +94,6 @@ def _panel(axes: Axes) -> None:
 
 def artefact(scene: Path, volumes: list[Path], path: Path) -> None:
     """Draw one slice of a scene through most metal: the reference and reconstructions named SCENE__METHOD.tif."""
-    import tifffile
-
-    from ctsim.benchmarks.scores.protocol import truth_of
-    from ctsim.benchmarks.studies.methods.panels import cut
-    from ctsim.store import open_scan
-
     truth = truth_of(open_scan(scene))
     z = cut(truth.metal, truth.body)[0]
     reference = np.asarray(truth.references["effective"][z])

@@ -6,8 +6,8 @@ const all = (selector, root = document) => [...root.querySelectorAll(selector)];
 function key(cell, numeric) {
   const text = cell.textContent.trim();
   if (!numeric) return text;
-  if (text === "identical") return Infinity;
-  const number = parseFloat(text.replace("−", "-"));
+  const said = cell.dataset.number ?? text.replace("−", "-");
+  const number = said === "inf" ? Infinity : parseFloat(said);
   return Number.isNaN(number) ? null : number; // "–" and a status have no number and go last
 }
 
@@ -25,6 +25,13 @@ function sortBy(table, column, descending) {
   all("th", table).forEach((th) => th.removeAttribute("aria-sort"));
   head.setAttribute("aria-sort", descending ? "descending" : "ascending");
 }
+
+all("th[data-column]").forEach((th) => {
+  const button = document.createElement("button");
+  button.type = "button";
+  button.append(...th.childNodes);
+  th.append(button);
+});
 
 document.addEventListener("click", (event) => {
   const head = event.target.closest("th[data-column]");

@@ -8,7 +8,7 @@ import html
 import json
 import string
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from typing import Any
 
@@ -17,12 +17,13 @@ import matplotlib.colors
 import numpy as np
 
 from ctsim.benchmarks.engine.record import OK
-from ctsim.benchmarks.studies.methods.records import RunRecord
-from ctsim.benchmarks.studies.methods.tables import render
-from ctsim.reports import figures, markdown, slices
+from ctsim.benchmarks.engine.table import html_prose, simple
+from ctsim.benchmarks.studies.methods.records import RunRecord, latest
+from ctsim.benchmarks.studies.methods.tables import tables
+from ctsim.reports import figures, slices
 from ctsim.reports.kept import Case, Kept
 
-PRIMARY = "tissue"
+PRIMARY, FAILURES = "tissue", "Failures and skips"
 TITLES = {
     "tissue": "Tissue, the primary protocol",
     "aligned": "Tissue after one gain",
@@ -41,7 +42,7 @@ SIGNED_STOPS = 17  # of the error colours; the browser interpolates between them
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Content:
-    """What a page shows. `more` are further pages in Markdown by title; `missing` says why there are no slices."""
+    """What a page shows. `more` are further parts in HTML by title; `missing` says why there are no slices."""
 
     title: str
     provenance: str
@@ -54,19 +55,20 @@ class Content:
 
 def page(content: Content, done: Callable[[], Any] = lambda: None) -> str:
     """Return the page; `done` is called after every slice that was encoded."""
-    tables = markdown.sections(render(content.records, "md"))
+    found = {table.title: replace(table, title="").html() for table in tables(content.records)}
+    found |= _failures(content.records)
     scenes = [_scene(case, slices.frame_of(case, content.most), done) for case in content.cases]
     parts = {
-        "scores": ("Scores", _table(PRIMARY, tables.pop(PRIMARY)) if PRIMARY in tables else ""),
+        "scores": ("Scores", _table(PRIMARY, found.pop(PRIMARY)) if PRIMARY in found else ""),
         "figures": ("Figures", _figures(content.records)),
         "slices": ("Slices", _slices(scenes, content.cases) if scenes else f"<p>{html.escape(content.missing)}</p>"),
-        "protocols": ("All protocols", "".join(_folded(name, text) for name, text in tables.items())),
-        "more": ("More", "".join(_folded(name, text) for name, text in content.more.items())),
+        "protocols": ("All protocols", "".join(_folded(name, part) for name, part in found.items())),
+        "more": ("More", "".join(_folded(name, part) for name, part in content.more.items())),
     }
     kept = {name: part for name, part in parts.items() if part[1]}
     return string.Template(_asset("page.html")).substitute(
         title=html.escape(content.title),
-        provenance=markdown.inline(content.provenance),
+        provenance=html_prose(content.provenance),
         style=_asset("page.css"),
         script=_asset("page.js"),
         transfer=_transfer(),
@@ -79,13 +81,19 @@ def _asset(name: str) -> str:
     return resources.files("ctsim.reports").joinpath(name).read_text(encoding="utf-8")
 
 
-def _table(name: str, text: str) -> str:
-    return f'<div id="table-{html.escape(name.replace(" ", "-"))}">{markdown.to_html(text)}</div>'
+def _failures(records: Sequence[RunRecord]) -> dict[str, str]:
+    """Return the table of the runs that did not end well by its title, if there are any."""
+    rows = [[r.run.scene, r.label, r.run.variant, r.status, r.reason] for r in latest(records) if r.status != OK]
+    return {FAILURES: simple(("scene", "method", "variant", "status", "reason"), rows).html()} if rows else {}
 
 
-def _folded(name: str, text: str) -> str:
+def _table(name: str, part: str) -> str:
+    return f'<div id="table-{html.escape(name.replace(" ", "-"))}">{part}</div>'
+
+
+def _folded(name: str, part: str) -> str:
     title = TITLES.get(name, name)
-    return f"<details><summary>{html.escape(title)}</summary>{_table(name, text)}</details>"
+    return f"<details><summary>{html.escape(title)}</summary>{_table(name, part)}</details>"
 
 
 def _figures(records: Sequence[RunRecord]) -> str:

@@ -7,32 +7,27 @@ the environment variable CTSIM_FIGURES names, else `figures/`.
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from matplotlib.figure import Figure
 
-if TYPE_CHECKING:
-    from ctsim.reports.kept import Case
+from ctsim.benchmarks.engine.table import simple
+from ctsim.reports import view
+from ctsim.reports.kept import Case
 
 
 def text(markdown: str) -> None:
     """Show Markdown."""
-    if _in_jupyter():
-        from IPython.display import Markdown, display  # pyright: ignore[reportMissingImports]
-
-        display(Markdown(markdown))
+    if (display := _jupyter()) is not None:
+        display.display(display.Markdown(markdown))
     else:
         sys.stdout.write(markdown + "\n\n")
 
 
 def figure(drawing: Figure, name: str) -> None:
     """Show a figure; `name` is its file's, without suffix."""
-    if _in_jupyter():
-        from IPython.display import Image, display  # pyright: ignore[reportMissingImports]
-
-        from ctsim.reports.view import png
-
-        display(Image(data=png(drawing)))
+    if (display := _jupyter()) is not None:
+        display.display(display.Image(data=view.png(drawing)))
         return
     path = Path(os.environ.get("CTSIM_FIGURES", "figures")) / f"{name}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -40,27 +35,21 @@ def figure(drawing: Figure, name: str) -> None:
     sys.stdout.write(f"Figure: {path}\n\n")
 
 
-def slices(case: "Case", name: str) -> None:
+def slices(case: Case, name: str) -> None:
     """Show a case's viewer; a script draws what it shows first."""
-    from ctsim.reports.view import figure as drawn
-    from ctsim.reports.view import first_state, viewer
-
-    if _in_jupyter():
-        from IPython.display import display  # pyright: ignore[reportMissingImports]
-
-        display(viewer(case))
+    if (display := _jupyter()) is not None:
+        display.display(view.viewer(case))
     else:
-        figure(drawn(case, first_state(case)), name)
+        figure(view.figure(case, view.first_state(case)), name)
 
 
 def table(head: list[str], rows: list[list[str]]) -> None:
     """Show a table, the first column text and the others numbers."""
-    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
-    text("\n".join("| " + " | ".join(line) + " |" for line in lines))
+    text(simple(head, rows, numbers=head[1:]).markdown())
 
 
-def _in_jupyter() -> bool:
-    """Say whether a notebook's kernel runs this code; a kernel has loaded IPython."""
+def _jupyter() -> Any:
+    """Return IPython's display where a notebook's kernel runs this code, which then has loaded it; else None."""
     ipython = sys.modules.get("IPython")
     shell = ipython.get_ipython() if ipython is not None else None
-    return shell is not None and hasattr(shell, "kernel")
+    return ipython.display if ipython is not None and hasattr(shell, "kernel") else None

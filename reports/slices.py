@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from ctsim.benchmarks.scores.metrics import erode
 from ctsim.reports.kept import Case
@@ -80,8 +81,6 @@ def stencil(mask: NDArray[np.bool_], colour: tuple[int, int, int]) -> str:
 
 
 def _encoded(image: Image8, mode: str, palette: Sequence[int] = (), **options: Any) -> str:
-    from PIL import Image
-
     picture = Image.fromarray(np.ascontiguousarray(image), "L")
     if mode == "P":
         picture = Image.frombytes("P", picture.size, picture.tobytes())

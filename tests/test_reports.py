@@ -12,11 +12,15 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
+from run_records import append, make_record
 
+from ctsim import reports
 from ctsim.benchmarks import cli, make_dataset
 from ctsim.benchmarks.engine import host
 from ctsim.benchmarks.engine.record import Task
@@ -25,7 +29,7 @@ from ctsim.benchmarks.studies.methods import tables
 from ctsim.benchmarks.studies.methods.volumes import at_50kev_of, write_volume
 from ctsim.benchmarks.studies.stress import study as stress
 from ctsim.errors import InputError
-from ctsim.reports import figures, kept, markdown, report, slices, view
+from ctsim.reports import figures, kept, report, show, slices, view
 
 ROOT = Path(__file__).parents[1]
 METHODS = ("fdk", "limar", "nmar")
@@ -78,23 +82,7 @@ def images_of(text):
     return json.loads(re.search(r'<script type="application/json">(.*?)</script>', text, re.S)[1])
 
 
-# Markdown
-
-
-def test_a_table_keeps_its_cells_and_marks():
-    text = "## tissue\n\nA caption.\n\n| inputs | method | a: PSNR3D (dB) | a: SSIM3D | mean: SSIM3D |\n"
-    text += "|---|---|---:|---:|---:|\n| counts \\| only | x<b> | **1.50 ± 0.10** | <u>0.5</u> | – |\n"
-    found = markdown.to_html(text)
-    assert rows_of(found) == [["counts | only", "x&lt;b&gt;", "1.50 ± 0.10", "0.5", "–"]]
-    assert "<strong>1.50 ± 0.10</strong>" in found and "<u>0.5</u>" in found and "<p>A caption.</p>" in found
-    assert re.findall(r'colspan="(\d)">(\w+)<', found) == [("2", "a"), ("1", "mean")]
-    assert re.findall(r'data-column="(\d)"', found) == ["0", "1", "2", "3", "4"]
-
-
-def test_nothing_in_a_label_becomes_markup():
-    assert markdown.inline("<script>alert(1)</script> `a` **b**") == (
-        "&lt;script&gt;alert(1)&lt;/script&gt; <code>a</code> <strong>b</strong>"
-    )
+# Tables
 
 
 def test_the_page_holds_every_cell_of_the_tables(results, written):
@@ -192,12 +180,44 @@ def test_without_a_dataset_the_page_says_why_there_are_no_slices(results, monkey
     assert "made without a dataset" in text and "application/json" not in text
 
 
+def stress_record(folder, ok, found, *, case="starved", subject="fdk"):
+    """Append a record of the stress suite to a results folder."""
+    task = Task(
+        study="stress", part="short", case=case, subject=subject, settings={"side": 16, "expected": "finite"},
+        hints={"what": "no photons"},
+    )  # fmt: skip
+    outcome = stress.Outcome(ok=ok, found=found, seconds={"row": (0.5,)})
+    record = stress.StressRecord(
+        task=task, found=(outcome,), host=host.host(), commit="0" * 40, time="2026-01-01T00:00:00"
+    )
+    stress.Stress().store(stress.Flags(results=folder)).append([record])
+
+
 def test_other_tables_in_the_folder_are_shown_too(results, tmp_path):
     folder = tmp_path / "r"
     shutil.copytree(results, folder)
-    (folder / "peers.md").write_text("## Peers\n\n| a | b |\n|---|---:|\n| rtk | 3 |\n", encoding="utf-8")
+    case, subject = next(iter(stress.Stress().rows(stress.Flags(results=folder))))
+    stress_record(folder, False, "3 < 4", subject="gone")
+    assert "<summary>stress" not in report.html_page(folder, None, "")  # there is no such row any more
+    stress_record(folder, True, "finite & <b>", case=case, subject=subject)
+    for name, text in {"stress": "old", "reproduce": "old", "ablation": "old", "mine": "## A | <b>"}.items():
+        (folder / f"{name}.md").write_text(text, encoding="utf-8")
     text = report.html_page(folder, None, "run-benchmark report")
-    assert "<summary>peers</summary>" in text and ["rtk", "3"] in rows_of(text)
+    assert re.findall(r"<summary>(\w[^<]*)</summary>", text)[-4:] == [
+        "stress, small grids", "ablation", "reproduce", "mine",
+    ]  # fmt: skip
+    assert [case, subject, "finite", "finite &amp; &lt;b&gt;", "yes"] in rows_of(text)
+    assert "OS-SART ends well after 10 passes on every scan" in text and "Table 5. Components" in text
+    assert "<pre>## A | &lt;b&gt;</pre>" in text and "<pre>old" not in text
+
+
+def test_what_did_not_end_well_is_a_table(results, tmp_path):
+    folder = tmp_path / "r"
+    append(folder, make_record("net", scene="lung", status="error", reason="out of <luck>"))
+    text = report.html_page(folder, None, "run-benchmark report")
+    assert "<summary>Failures and skips</summary>" in text
+    assert ["lung", "net", "metal", "error", "out of &lt;luck&gt;"] in rows_of(text)
+    assert "Failures and skips" not in report.html_page(results, None, "run-benchmark report")
 
 
 def test_a_figure_takes_the_colours_of_the_page(results):
@@ -355,7 +375,7 @@ def test_the_readmes_command_is_understood():
     lines = re.findall(r"run-benchmark report ([^`\n#]+)", (ROOT / "README.md").read_text(encoding="utf-8"))
     assert lines
     for line in lines:
-        tyro.cli(report.Arguments, args=shlex.split(line))
+        tyro.cli(reports.Flags, args=shlex.split(line))
 
 
 # Viewer
@@ -455,6 +475,21 @@ def notebook(name, data, results, figures_folder):
     return done.stdout
 
 
+def test_in_a_kernel_things_are_displayed(case, monkeypatch, tmp_path):
+    shown = []
+    shell = SimpleNamespace(kernel=None)
+    display = SimpleNamespace(
+        display=shown.append, Markdown=lambda text: ("text", text), Image=lambda data: ("image", data[:4])
+    )
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell, display=display))
+    monkeypatch.chdir(tmp_path)
+    show.table(["a", "b"], [["x", "1"]])
+    show.figure(Figure(), "f")
+    show.slices(case, "s")
+    assert shown[:2] == [("text", "| a | b |\n|---|---:|\n| x | 1 |\n"), ("image", b"\x89PNG")]
+    assert shown[2].children and not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("name", "n_figures", "words"),
     [
@@ -469,15 +504,8 @@ def test_a_notebook_runs_as_a_script(name, n_figures, words, quick, tmp_path):
 
 
 def test_the_stability_notebook_shows_what_the_stress_suite_recorded(smallest, tmp_path):
-    store = stress.Stress().store(stress.Flags(results=tmp_path))
     for ok, found in ((False, "an older row"), (True, "finite"), (False, "3 values are not finite")):
-        task = Task(
-            study="stress", part="short", case="starved", subject="fdk" if "older" in found or ok else "nmar",
-            settings={"side": 16, "expected": "finite"}, hints={"what": "no photons"},
-        )  # fmt: skip
-        outcome = stress.Outcome(ok=ok, found=found, seconds={"row": (0.5,)})
-        time = "2026-01-01T00:00:00"
-        store.append([stress.StressRecord(task=task, found=(outcome,), host=host.host(), commit="0" * 40, time=time)])
+        stress_record(tmp_path, ok, found, subject="fdk" if "older" in found or ok else "nmar")
     said = notebook("stability", smallest, tmp_path, tmp_path)
     assert "1 of 2 rows are as expected" in said and "- starved, nmar: 3 values are not finite" in said
     assert "older" not in said and (tmp_path / "stability-stress.png").exists()

@@ -18,11 +18,10 @@ from ctsim.benchmarks.engine.table import Table, simple
 from ctsim.benchmarks.studies.methods import records, study, tables
 from ctsim.benchmarks.studies.methods.plan import Costs
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord
-from ctsim.benchmarks.suites import load, select
+from ctsim.benchmarks.suites import identity, load, select
 from ctsim.errors import InputError
 from ctsim.folder import is_complete
 from ctsim.human import human_time
-from ctsim.phantoms.scene import scene_id
 
 METHODS = ("fdk", "limar", "nmar", "os-sart")
 SCENE, SHARE = "lung-Fe", 0.6
@@ -87,7 +86,7 @@ def _compute(given: Arguments) -> int:
     if code := make_dataset.main([given.suite, str(given.data), "--seeds", *map(str, given.seeds), *plan]):
         return code
     scenes = select(load(given.suite), (), given.seeds)
-    there = [scene.name for scene in scenes if is_complete(given.data, scene.name, scene_id(scene))]
+    there = [scene.name for scene in scenes if is_complete(given.data, scene.name, identity(scene))]
     flags = [*(f"--method={name}" for name in METHODS), *(f"--scene={name}" for name in there), *plan]
     code = study.main([str(given.data), str(given.results), *flags]) if there else 0
     if given.dry_run and not code and (later := len(scenes) - len(there)):

@@ -4,6 +4,8 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from ctsim.errors import InputError
 from ctsim.human import human_choice
 
@@ -35,6 +37,13 @@ def load(suite: str) -> "tuple[Scene, ...]":
     return load_suite(Path(suite))
 
 
+def identity(scene: "Scene") -> str:
+    """Return the hash of a scene's recipe; for what only lists scenes, and need not load what builds them."""
+    from ctsim.phantoms.scene import scene_id
+
+    return scene_id(scene)
+
+
 def bundled() -> "dict[str, Traversable]":
     """Return the bundled suites by name, those of `STUDY_SUITES` apart."""
     folder = resources.files("ctsim.benchmarks.suites")
@@ -44,8 +53,6 @@ def bundled() -> "dict[str, Traversable]":
 
 def select(scenes: "tuple[Scene, ...]", only: tuple[str, ...], seeds: tuple[int, ...]) -> "tuple[Scene, ...]":
     """Return the named scenes (all when none is named), once for each seed when seeds are given."""
-    import msgspec
-
     names = [scene.name for scene in scenes]
     for name in only:
         if name not in names:

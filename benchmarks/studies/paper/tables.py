@@ -25,7 +25,6 @@ from ctsim.benchmarks.studies.methods import records, tables
 from ctsim.benchmarks.studies.methods.records import METAL, Run, RunRecord, case_of
 from ctsim.benchmarks.studies.paper.layout import NONE, Layout, Planned, duration, load, printed
 from ctsim.errors import InputError
-from ctsim.phantoms.scene import scene_id
 
 Form = Literal["md", "tex"]
 Protocol = Literal["paper", "tissue", "aligned", "aligned_50kev"]
@@ -209,7 +208,7 @@ def identities(suite: str, name: str, seed: int) -> tuple[str, ...]:
     scene = next(scene for scene in _scenes(suite) if scene.name == name)
     try:
         of = [msgspec.structs.replace(scene, name=called, seed=seed) for called in (name, f"{name}-s{seed}")]
-        return tuple(map(scene_id, of))
+        return tuple(map(suites.identity, of))
     except InputError:  # no scene has such a seed
         return ()
 
