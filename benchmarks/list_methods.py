@@ -4,7 +4,10 @@ import sys
 from dataclasses import dataclass
 from typing import Annotated, Any
 
+import msgspec
 import tyro
+
+from ctsim.benchmarks.methods import TABLE, find, parameters, resolve
 
 WIDEST = 24  # characters of a default that others are aligned with
 
@@ -19,8 +22,6 @@ class Arguments:
 
 def main(arguments: list[str]) -> int:
     """Print the list; return 0."""
-    from ctsim.benchmarks.methods import TABLE
-
     given = tyro.cli(Arguments, prog="run-benchmark methods", args=arguments)
     sys.stdout.write("\n".join(described(name) for name in given.method or TABLE))
     return 0
@@ -28,8 +29,6 @@ def main(arguments: list[str]) -> int:
 
 def described(name: str) -> str:
     """Describe a method: a line with its inputs, and one for each parameter."""
-    from ctsim.benchmarks.methods import find, parameters, resolve
-
     method = find(name)
     known = parameters(name, resolve(method.target))
     defaults = {key: _default(method.params[key]) for key in known}
@@ -43,8 +42,6 @@ def described(name: str) -> str:
 
 def _default(value: Any) -> str:
     """Write a default as --set takes it."""
-    import msgspec
-
     if value == float("inf"):
         return "no limit"
     return value or '""' if isinstance(value, str) else msgspec.json.encode(value).decode()

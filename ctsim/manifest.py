@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
 from ctsim.durable import append_synced, cut_torn, write_synced
 from ctsim.errors import InputError
@@ -241,8 +242,6 @@ def check_sizes(folder: Path, manifest: Manifest) -> list[str]:
 
 def _array_problem(entry: FileEntry) -> str:
     """Say why an entry's array cannot lie in its file; empty where it can, or where there is none."""
-    import numpy as np
-
     shape, dtype, offset = entry.shape, entry.dtype, entry.offset
     if shape is None and dtype is None and offset is None:
         return ""

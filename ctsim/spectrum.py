@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctsim import anode
 from ctsim.errors import InputError
 from ctsim.materials import E_MIN, attenuation, mass_energy_transfer, material
 
@@ -200,8 +201,6 @@ def _anode(
     tube: Tube, takeoff: float, e: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Unfiltered continuum per keV at `e`, and the lines' energies and photons."""
-    from ctsim import anode
-
     if tube.model == "finkelshtein-pavlova":
         return anode.continuum(tube.kvp, takeoff, e), *anode.lines(tube.kvp, takeoff)
     if tube.model == "spekpy":

@@ -9,6 +9,7 @@ import numpy as np
 
 from ctsim.errors import InputError
 from ctsim.geometry import Triple
+from ctsim.materials import material
 from ctsim.phantoms.shapes import cylinder
 from ctsim.solids import Solid
 from ctsim.types import Phantom
@@ -48,8 +49,6 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
                 f"insert_mm must be at least 0.001 mm and at most a quarter of size {self.size}: {self.insert_mm}"
             )
         if self.metal != "none":
-            from ctsim.materials import material
-
             try:
                 material(self.metal)
             except InputError as error:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 from ctsim.geometry import Triple
 from ctsim.phantoms.bodies import REACH, Recipe, Shape, assemble
@@ -77,8 +78,6 @@ def _ripples(rng: np.random.Generator, wave: float, terms: int = 10) -> Callable
 
 def _drop_crumbs(labels: NDArray[np.uint8], of: int) -> None:
     """Clear, in place, loose pieces of the label `of` below a hundredth of it, which a fold may have undercut."""
-    from scipy import ndimage
-
     pieces = np.zeros(labels.shape, np.int32)
     ndimage.label(labels > 0, np.ones((3, 3, 3)), output=pieces)
     sizes = np.bincount(pieces.ravel())

@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from ctsim.arrayfile import MOST, read_array
 from ctsim.errors import InputError
@@ -106,8 +107,6 @@ def _resampled(hu: NDArray[np.float32], params: CtVolume, n: Shape, d_voxel: Tri
 
     HU are interpolated at as many places in a voxel as it takes that none of the file's is passed over.
     """
-    from scipy import ndimage
-
     times = np.ceil(np.divide(d_voxel, params.spacing) - 1e-9).astype(int)
     if math.prod(int(a * b) for a, b in zip(n, times, strict=True)) > MOST:
         raise InputError(

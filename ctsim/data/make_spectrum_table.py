@@ -9,6 +9,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import spekpy  # pyright: ignore[reportMissingImports]
 
 from ctsim.anode import K_EDGE, L_EDGE, self_absorption
 
@@ -21,8 +22,6 @@ EDGES = np.array([L_EDGE] * 4 + [K_EDGE] * 5)
 
 
 def _spectrum(kvp: float, angle: float, dk: float, brem: bool) -> tuple[np.ndarray, np.ndarray]:
-    import spekpy  # pyright: ignore[reportMissingImports]
-
     tube = spekpy.Spek(
         kvp=kvp, th=angle, physics="casim", mu_data_source="nist", dk=dk, mas=1, z=100, brem=brem, char=not brem
     )
