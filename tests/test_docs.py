@@ -57,7 +57,7 @@ def commands(text: str) -> list[str]:
 
 def arguments_of(name: str, words: list[str]) -> tuple[type, list[str]] | None:
     """Return the form and the words of a command of ours, None for another, and where it is but named."""
-    from ctsim.benchmarks.tools.reference.commands import forms
+    from ctsim.benchmarks.tools.reference import forms
 
     name = name.rpartition("/")[2]
     if name not in ("make-dataset", "run-benchmark"):

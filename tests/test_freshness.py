@@ -5,18 +5,17 @@ from pathlib import Path
 
 import pytest
 
-from ctsim.benchmarks.tools import freshness, measured, provenance
+from ctsim.benchmarks.tools import freshness, measured
 from ctsim.errors import InputError
 
 DOCS = Path(__file__).parents[1] / "docs"
-PAGE = provenance.Page(title="T", command="make it", sources=("core/", "suites/a.toml"), file="t.md")
+PAGE = measured.Page(title="T", command="make it", sources=("core/", "suites/a.toml"), file="t.md")
 
 
 @pytest.fixture
 def repository(tmp_path, monkeypatch):
     """A repository with one measured page "mine" that depends on core/ and suites/a.toml."""
-    monkeypatch.setattr(provenance, "PAGES", {"mine": PAGE})
-    monkeypatch.setattr(freshness, "PAGES", {"mine": PAGE})
+    monkeypatch.setattr(measured, "PAGES", {"mine": PAGE})
     for name in ("GIT_AUTHOR", "GIT_COMMITTER"):
         monkeypatch.setenv(f"{name}_NAME", "A")
         monkeypatch.setenv(f"{name}_EMAIL", "a@example.org")
@@ -38,8 +37,7 @@ def commit(root):
 
 
 def found(root):
-    (age,) = [freshness.age_of(n, t, root / "pages") for n, t in provenance.measured(root / "pages").items()]
-    return age
+    return freshness.age_of(root / "pages" / "mine.md")
 
 
 def test_a_page_is_fresh_while_its_sources_compute_the_same(repository):
@@ -71,7 +69,7 @@ def test_a_change_of_a_source_shows(repository, path, old, new, state):
 
 def test_the_oldest_commit_counts_and_a_strange_one_is_said(repository):
     page = repository / "pages" / "mine.md"
-    first = provenance.commits_of(page.read_text())[0]
+    first = measured.commits_of(page.read_text())[0]
     (repository / "core" / "a.py").write_text("n = 1\n")
     page.write_text(f"commit {commit(repository)}, {first}\n")
     assert found(repository).commit == first
@@ -89,16 +87,16 @@ def test_the_report_lists_every_page_and_ends_well(repository, capsys, monkeypat
 def test_a_page_without_a_declaration_is_refused(repository):
     (repository / "pages" / "new.md").write_text("commit 0123456789ab\n")
     with pytest.raises(InputError, match="no measured page 'new'"):
-        provenance.measured(repository / "pages")
+        freshness.main([str(repository / "pages")])
 
 
 def test_every_measured_page_is_declared_and_names_a_commit():
-    texts = provenance.measured(DOCS / "measured")
-    assert set(texts) == set(provenance.PAGES)
+    texts = {path.stem: path.read_text(encoding="utf-8") for path in (DOCS / "measured").glob("*.md")}
+    assert set(texts) == set(measured.PAGES)
     for name, text in texts.items():
-        assert provenance.commits_of(text), name
-        assert text.startswith(f"# {provenance.PAGES[name].title}"), name
-    for page in provenance.PAGES.values():
+        assert measured.commits_of(text), name
+        assert text.startswith(f"# {measured.PAGES[name].title}"), name
+    for page in measured.PAGES.values():
         for source in page.sources:
             assert (DOCS.parent / source).exists(), source
         assert not page.explained or (DOCS / "explanation" / page.explained).is_file(), page.explained
@@ -108,11 +106,11 @@ def test_commits_are_found_as_studies_write_them():
     said = (
         "x, commit b669e20a1df2 (`nmar` and `bhc-poly` 7cbee5388662), AMD; at commit 4051706b4a9f, 7cbee5388662 on AMD"
     )
-    assert provenance.commits_of(said) == ["b669e20a1df2", "4051706b4a9f", "7cbee5388662"]
+    assert measured.commits_of(said) == ["b669e20a1df2", "4051706b4a9f", "7cbee5388662"]
 
 
 def test_a_study_s_table_becomes_a_page(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(provenance, "PAGES", {"mine": PAGE})
+    monkeypatch.setattr(measured, "PAGES", {"mine": PAGE})
     (tmp_path / "t.md").write_text("# Title of its own\n\n2026, commit 0123456789ab, AMD\n\n| a |\n|---|\n| 1 |\n")
     assert measured.main(["mine", str(tmp_path), str(tmp_path / "docs")]) == 0
     text = (tmp_path / "docs" / "mine.md").read_text()

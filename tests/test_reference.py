@@ -8,9 +8,10 @@ import msgspec
 import pytest
 import tyro
 
-from ctsim.benchmarks.methods import TABLE, find
-from ctsim.benchmarks.tools.reference import commands, text
-from ctsim.benchmarks.tools.reference.__main__ import COMMAND, main, pages
+from ctsim.benchmarks.methods import TABLE, find, parameters, resolve
+from ctsim.benchmarks.tools import reference
+from ctsim.benchmarks.tools import typetext as text
+from ctsim.benchmarks.tools.reference import COMMAND, main, pages
 
 FOLDER = Path(__file__).parents[1] / "docs" / "reference"
 
@@ -50,7 +51,7 @@ class Form:
 
 
 def test_a_command_is_described_by_its_dataclass():
-    said = commands.section("do-it", Form).splitlines()
+    said = reference.command("do-it", Form).splitlines()
     assert said[0] == "## do-it" and "do-it WHERE [flags]" in said and "And say why." in said
     assert [line for line in said if line.startswith("| `")] == [
         "| `WHERE` |  |  | Where it is done. |",
@@ -63,10 +64,10 @@ def test_a_command_is_described_by_its_dataclass():
 
 
 def test_every_flag_of_a_command_is_one_that_tyro_takes(capsys):
-    for name, form in commands.forms().items():
+    for name, form in reference.forms().items():
         with pytest.raises(SystemExit):
             tyro.cli(form, args=["--help"])
-        shown, section = capsys.readouterr().out, commands.section(name, form)
+        shown, section = capsys.readouterr().out, reference.command(name, form)
         for item in dataclasses.fields(form):
             flag = f"--{item.name.replace('_', '-')}"
             assert (flag in shown) == (f"`{flag}`" in section), (name, flag)
@@ -79,7 +80,9 @@ def test_every_method_has_its_parameters_with_their_defaults():
         assert section, name
         for key, value in find(name).params.items():
             default = "none" if value is None else text.code(value)
-            assert any(row.startswith(f"| `{key}` |") and default in row for row in section.splitlines()), (name, key)
+            (row,) = (row for row in section.splitlines() if row.startswith(f"| `{key}` |"))
+            parameter = parameters(name, resolve(find(name).target))[key]
+            assert all(said in row for said in (default, parameter.expected, parameter.meaning)), (name, key)
 
 
 def test_types_are_named_in_words():

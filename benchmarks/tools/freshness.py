@@ -2,13 +2,14 @@
 
     python -m ctsim.benchmarks.tools.freshness [docs/measured]
 
-Every measured page names the commit at which it was measured; the oldest one counts. `provenance.PAGES` declares the
+Every measured page names the commit at which it was measured; the oldest one counts. `measured.PAGES` declares the
 sources that its numbers depend on. The report lists how many of those have changed between that commit and HEAD,
 and which of them hold another default: a field of a settings type, a constant, a key of a suite. Moved files, comments,
 docstrings and imports do not count. It is a report, not a check: the exit code is 0.
 """
 
 import ast
+import contextlib
 import dataclasses
 import subprocess
 import sys
@@ -16,7 +17,7 @@ import tomllib
 from pathlib import Path
 
 from ctsim.benchmarks.cli import guarded
-from ctsim.benchmarks.tools.provenance import PAGES, commits_of, measured
+from ctsim.benchmarks.tools.measured import commits_of, page_named
 from ctsim.errors import InputError
 
 FOLDER = Path("docs/measured")
@@ -29,15 +30,14 @@ class Age:
 
     page: str
     commit: str
-    date: str
-    changed: tuple[str, ...]
-    settings: tuple[str, ...]
-    known: bool = True
+    date: str = ""
+    changed: tuple[str, ...] = ()
+    settings: tuple[str, ...] = ()
 
     @property
     def state(self) -> str:
         """The verdict in two words."""
-        if not self.known:
+        if not self.date:
             return "commit unknown"
         return "other defaults" if self.settings else "other code" if self.changed else "fresh"
 
@@ -49,46 +49,43 @@ def main(arguments: list[str]) -> int:
     folder = Path(arguments[0]) if arguments else FOLDER
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder, expected one of measured pages")
-    sys.stdout.write(report([age_of(name, text, folder) for name, text in measured(folder).items()]))
+    sys.stdout.write(report([age_of(path) for path in sorted(folder.glob("*.md"))]))
     return 0
 
 
-def age_of(name: str, text: str, folder: Path) -> Age:
-    """Compare the sources of a page at its oldest commit with those at HEAD."""
-    root = Path(git(folder, "rev-parse", "--show-toplevel").strip())
-    named = [c for c in commits_of(text) if _exists(root, c)]
+def age_of(page: Path) -> Age:
+    """Compare the sources of a page at its oldest commit with those at HEAD.
+
+    Raises InputError where a page has no declaration, so that none is forgotten.
+    """
+    sources, commits = page_named(page.stem).sources, commits_of(page.read_text(encoding="utf-8"))
+    root = Path(git(page.parent, "rev-parse", "--show-toplevel").strip())
+    named = [c for c in commits if _tried(root, "cat-file", "-t", c) == "commit\n"]
     if not named:
-        return Age(
-            page=name, commit=", ".join(commits_of(text)) or "none", date="", changed=(), settings=(), known=False
-        )
+        return Age(page=page.stem, commit=", ".join(commits) or "none")
     oldest = max(named, key=lambda c: int(git(root, "rev-list", "--count", f"{c}..HEAD")))
-    changed = _changed(root, oldest, PAGES[name].sources)
+    changed = _changed(root, oldest, sources)
     return Age(
-        page=name,
+        page=page.stem,
         commit=oldest,
         date=git(root, "show", "-s", "--format=%cs", oldest).strip(),
         changed=tuple(changed),
-        settings=tuple(new for new, old in changed.items() if _other_default(root, oldest, old, new)),
+        settings=tuple(name for name, other in changed.items() if other),
     )
 
 
-def _changed(root: Path, commit: str, sources: tuple[str, ...]) -> dict[str, str]:
-    """Return the sources that compute something else, as today's name → the name then."""
+def _changed(root: Path, commit: str, sources: tuple[str, ...]) -> dict[str, bool]:
+    """Return the sources that compute something else, and whether they hold another value of a setting."""
     found = {}
     for line in git(root, "diff", "--name-status", "-M", commit, "HEAD").splitlines():
         status, *names = line.split("\t")
         if status == "R100" or not any(n == s or (s.endswith("/") and n.startswith(s)) for n in names for s in sources):
             continue
-        before, after = _text(root, commit, names[0]), _text(root, "HEAD", names[-1])
-        if _code(names[0], before) != _code(names[-1], after):
-            found[names[-1]] = names[0]
+        before = names[0], _tried(root, "show", f"{commit}:{names[0]}")
+        after = names[-1], _tried(root, "show", f"HEAD:{names[-1]}")
+        if _code(*before) != _code(*after):
+            found[names[-1]] = _defaults(*before) != _defaults(*after)
     return found
-
-
-def _text(root: Path, commit: str, path: str) -> str:
-    """Return a file as it was; nothing where it was not there."""
-    done = subprocess.run(["git", "-C", root, "show", f"{commit}:{path}"], capture_output=True, check=False)
-    return "" if done.returncode else done.stdout.decode("utf-8", errors="replace")
 
 
 def _code(path: str, text: str) -> str:
@@ -108,11 +105,6 @@ def _says(node: ast.AST) -> bool:
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
-def _other_default(root: Path, commit: str, old: str, new: str) -> bool:
-    """Tell whether a changed file holds another value of a setting."""
-    return _defaults(old, _text(root, commit, old)) != _defaults(new, _text(root, "HEAD", new))
-
-
 def _defaults(path: str, text: str) -> set[str]:
     """Return "name = value" of a TOML file's keys, or of a module's constants and fields with defaults."""
     if path.endswith(".toml"):
@@ -129,19 +121,20 @@ def _defaults(path: str, text: str) -> set[str]:
     return found
 
 
-def _exists(root: Path, commit: str) -> bool:
-    done = subprocess.run(
-        ["git", "-C", root, "cat-file", "-e", f"{commit}^{{commit}}"], capture_output=True, check=False
-    )
-    return done.returncode == 0
-
-
 def git(where: Path, *arguments: str) -> str:
     """Return what git prints. Raises InputError with its words where it fails."""
-    done = subprocess.run(["git", "-C", str(where), *arguments], capture_output=True, text=True, check=False)
+    command = ["git", "-C", str(where), *arguments]
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", check=False)
     if done.returncode:
         raise InputError(f"git {arguments[0]}: {' '.join(done.stderr.split())}")
     return done.stdout
+
+
+def _tried(where: Path, *arguments: str) -> str:
+    """Return what git prints; nothing where it fails, as for a file that was not there."""
+    with contextlib.suppress(InputError):
+        return git(where, *arguments)
+    return ""
 
 
 def report(ages: list[Age]) -> str:
@@ -159,4 +152,4 @@ def report(ages: list[Age]) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded("freshness", __name__, sys.argv[1:]))
+    sys.exit(guarded("freshness", "ctsim.benchmarks.tools.freshness", sys.argv[1:]))

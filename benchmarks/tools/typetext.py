@@ -1,4 +1,4 @@
-"""What a type says of itself, as Markdown: descriptions of fields, names of types, tables."""
+"""What a type says of itself, as Markdown: descriptions of fields, names of types, tables. For `tools.reference`."""
 
 import ast
 import inspect
