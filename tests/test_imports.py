@@ -2,8 +2,10 @@
 
 import importlib.metadata
 import pkgutil
+import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -46,6 +48,23 @@ def test_an_installed_ctsim_claims_one_name_on_the_import_path():
     folders = {".".join(p.parent.relative_to(ROOT).parts) for part in ("ctsim", *PARTS) for p in inits(ROOT / part)}
     assert {*found} == {name if name.startswith("ctsim") else f"ctsim.{name}" for name in folders}
     assert (importlib.metadata.distribution("ctsim").read_text("top_level.txt") or "").split() == ["ctsim"]
+
+
+def test_a_wheel_holds_all_of_ctsim_but_the_tools(tmp_path):
+    left_out = shutil.ignore_patterns(".*", "__pycache__", "build", "*.egg-info", "docs", "tests")
+    shutil.copytree(ROOT, tmp_path / "source", symlinks=True, ignore=left_out)
+    code = f"from setuptools import build_meta; build_meta.build_wheel({str(tmp_path)!r})"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path / "source", capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    held = {name for name in zipfile.ZipFile(wheel).namelist() if name.endswith((".py", ".toml", ".html", ".npz"))}
+    parts = [path for part in PARTS for path in (ROOT / part).rglob("*")]
+    ours = [path for path in [*parts, *(ROOT / "ctsim").rglob("*")] if path.suffix in (".py", ".toml", ".html", ".npz")]
+    names = {str(path.relative_to(ROOT)) for path in ours}
+    tools = {name for name in names if name.startswith("benchmarks/tools/")}
+    assert tools and held == {name if name.startswith("ctsim/") else f"ctsim/{name}" for name in names - tools}
 
 
 def inits(folder: Path) -> list[Path]:
