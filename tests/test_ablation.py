@@ -1,7 +1,4 @@
-import contextlib
 import functools
-import pickle
-import shutil
 import sys
 
 import pytest
@@ -10,11 +7,11 @@ from msgspec.structs import replace
 from run_records import changed
 
 from ctsim.benchmarks import cli, methods
-from ctsim.benchmarks.engine import study as engine
 from ctsim.benchmarks.studies import ablation
 from ctsim.benchmarks.studies.methods import records
 from ctsim.benchmarks.studies.paper import tables as paper_tables
 from ctsim.benchmarks.suites import load as load_suite
+from ctsim.errors import InputError
 from ctsim.store import list_scans, open_scan
 
 STUB = """
@@ -128,23 +125,17 @@ def test_rows_become_records_and_what_failed_is_tried_again(command, tmp_path):
     assert (tmp_path / "results" / "table.md").exists()
 
 
-def test_runs_are_the_workers_where_some_are_asked_for(command, tmp_path, monkeypatch):
-    done = []
+def test_limit_and_workers_are_those_of_run_benchmark(command, monkeypatch):
+    asked = []
 
-    class Here:
-        def answers(self, function, jobs):
-            for k, job in enumerate(jobs):
-                done.append(job[1][0].hints["overrides"])
-                yield k, function(pickle.loads(pickle.dumps(job)))
+    def stopped(study, tasks, known, given):
+        asked.append((len(tasks), given.seconds, given.workers, given.anchor))
+        raise InputError("stopped here")
 
-    monkeypatch.setattr(engine, "open_jobs", lambda n, _: contextlib.nullcontext(Here() if n == 2 else None))
-    assert command("--table", "7")[0] == 0 and not done
-    for line in (tmp_path / "results").iterdir():
-        line.unlink() if line.is_file() else shutil.rmtree(line)
-    assert command("--table", "7", "--workers", "2")[0] == 0
-    assert sorted(map(str, done)) == sorted(str(v.params) for v in ablation.variants((7,)))
-    found = records.read(tmp_path / "results")
-    assert len(found) == len(done) and {r.status for r in found} == {"ok"}
+    monkeypatch.setattr(ablation, "measure_all", stopped)
+    code, shown = command("--table", "9", "--seconds", "7", "--workers", "2")
+    assert code == 2 and "stopped here" in shown.err
+    assert asked == [(len(ablation.variants((9,))), 7.0, 2, False)]
 
 
 def test_a_dry_run_prints_rows_and_cost_and_writes_nothing(command, tmp_path):
@@ -167,12 +158,6 @@ def test_the_cost_of_a_step_is_what_records_say():
     found[0] = changed(found[0], cost=replace(found[0].cost, warm_up=30.0))
     # (50 + 30) and 70 s for 2000 steps, the median between them
     assert ablation._rates(found) == ablation.SECONDS | {"splat-paper": pytest.approx(75 / 2000)}
-
-
-def test_a_time_limit_ends_a_run_with_a_record(command, tmp_path):
-    code, shown = command("--table", "9", "--seconds", "0.01")
-    found = records.read(tmp_path / "results")
-    assert code == 1 and {r.status for r in found} == {"timeout"} and "| timeout |" in shown.out
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ lattice of the preset "fast" in a water cylinder on `core`'s scanner.
 
 import statistics
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from ctsim.benchmarks.cli import guarded
-from ctsim.benchmarks.engine.host import commit, host
+from ctsim.benchmarks.engine.host import commit, in_turns, machine
+from ctsim.benchmarks.engine.table import simple
 from ctsim.errors import InputError
 from ctsim.phantoms.scanners import preset
 from ctsim.reconstruct.splat.columns import LatticeProjector
@@ -29,7 +29,7 @@ ROUNDS = 7
 CORE = preset("skyscan1273", 240, (224, 224), (128, 128, 128), 60.0).geometry
 VIEW = preset("skyscan1273", 1, (512, 512), (256, 256, 256), 60.0).geometry
 N_SPLATS, SIGMA = 50_000, 2.5  # of a published view; σ in pixels
-HEAD = "| case | what | ms | ns a splat and view | relative RMS off the exact form |\n|---|---|--:|--:|--:|\n"
+NUMBERS = ("ms", "ns a splat and view", "relative RMS off the exact form")
 
 
 def main(arguments: list[str]) -> int:
@@ -38,15 +38,14 @@ def main(arguments: list[str]) -> int:
         raise InputError("expected OUT, the folder for splat_kernels.md")
     out = Path(arguments[0])
     out.mkdir(parents=True, exist_ok=True)
-    here = host()
-    text = f"{commit()}, {here.cpu}, {here.threads} threads; medians of {ROUNDS} interleaved rounds.\n\n{HEAD}"
-    text += "".join(f"| {row} |\n" for row in (*published(), *lattice()))
+    table = simple(("case", "what", *NUMBERS), [*published(), *lattice()], numbers=NUMBERS)
+    text = f"{commit()}, {machine()}; medians of {ROUNDS} interleaved rounds.\n\n{table.markdown()}"
     (out / "splat_kernels.md").write_text(text, encoding="utf-8")
     sys.stdout.write(text)
     return 0
 
 
-def published() -> list[str]:
+def published() -> list[list[str]]:
     """Measure one view of the published methods."""
     rng = np.random.default_rng(0)
     within = rng.normal(size=(N_SPLATS, 3))
@@ -76,7 +75,7 @@ def published() -> list[str]:
     return [_row(case, name, s, N_SPLATS, errors.get(name)) for name, (s, _) in found.items()]
 
 
-def lattice() -> list[str]:
+def lattice() -> list[list[str]]:
     """Measure a lattice, by columns and splat by splat."""
     geometry = finer(CORE, 1.5)
     z, y, x = geometry.voxel_centres()
@@ -106,14 +105,9 @@ def lattice() -> list[str]:
 
 def _rounds(contenders: dict[str, Callable[[], Any]]) -> dict[str, tuple[float, Any]]:
     """Run each once to compile, then in turns; return median seconds and the last result."""
-    results = {name: run() for name, run in contenders.items()}
-    seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    for _ in range(ROUNDS):
-        for name, run in contenders.items():
-            began = time.perf_counter()
-            results[name] = run()
-            seconds[name].append(time.perf_counter() - began)
-    return {name: (statistics.median(seconds[name]), results[name]) for name in contenders}
+    results: dict[str, Any] = {}
+    runs = {name: lambda name=name, run=run: results.update({name: run()}) for name, run in contenders.items()}
+    return {name: (statistics.median(seconds), results[name]) for name, (_, seconds) in in_turns(runs, ROUNDS).items()}
 
 
 def _error(found: np.ndarray, reference: np.ndarray) -> float:
@@ -121,9 +115,9 @@ def _error(found: np.ndarray, reference: np.ndarray) -> float:
     return float(np.sqrt((difference**2).mean() / (reference.astype(np.float64) ** 2).mean()))
 
 
-def _row(case: str, name: str, seconds: float, count: int, error: float | None) -> str:
+def _row(case: str, name: str, seconds: float, count: int, error: float | None) -> list[str]:
     off = "–" if error is None else f"{error:.1e}"
-    return f"{case} | {name} | {_digits(1e3 * seconds)} | {_digits(1e9 * seconds / count)} | {off}"
+    return [case, name, _digits(1e3 * seconds), _digits(1e9 * seconds / count), off]
 
 
 def _digits(value: float) -> str:
