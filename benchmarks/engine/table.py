@@ -4,12 +4,12 @@ import csv
 import html
 import io
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from ctsim.benchmarks.engine.texts import escape, harmless, one_line
+from ctsim.benchmarks.engine import latex
+from ctsim.benchmarks.engine.texts import escape, harmless, one_line, ranked
 
 Better = Literal["", "max", "min", "one"]
 
@@ -123,29 +123,17 @@ class Table:
     def latex(self, label: str = "", *, footnotes: bool = False) -> str:
         """Return a table environment by booktabs, its notes as comments below it, or as `footnotes` within it."""
         marks = {"best": r"\textbf{{{}}}", "second": r"\underline{{{}}}"}
-        head = []
-        if any(c.group for c in self.columns):
-            head += latex_groups([c.group for c in self.columns])
+        groups = [(c.group, 1) for c in self.columns]
+        head = latex.spanning(0, groups) if any(c.group for c in self.columns) else []
         if any(c.part for c in self.columns):
-            head += latex_groups([c.title if c.part else "" for c in self.columns], [c.group for c in self.columns])
-        head.append(latex_row(latex_prose(c.part or c.title) for c in self.columns))
-        body = [latex_row(row) for row in self._marked(lambda text: escape(text, "tex"), marks)]
-        lines = [
-            r"\begin{table}",
-            r"\centering",
-            rf"\caption{{{latex_prose(self.caption or self.title)}}}",
-            *([rf"\label{{{label}}}"] if label else []),
-            rf"\begin{{tabular}}{{{''.join('r' if c.number else 'l' for c in self.columns)}}}",
-            r"\toprule",
-            *head,
-            r"\midrule",
-            *body,
-            r"\bottomrule",
-            r"\end{tabular}",
-            *(rf"\par\footnotesize {latex_prose(note)}" for note in self.notes if footnotes),
-            r"\end{table}",
-        ]
-        return "\n".join(lines) + "\n" + ("" if footnotes else "".join(map(latex_comment, self.notes)))
+            whole = itertools.groupby(self.columns, lambda c: (c.group, c.title if c.part else ""))
+            head += latex.spanning(0, [(title, len(list(of))) for (_, title), of in whole], merge=False)
+        head.append(latex.row([latex.prose(c.part or c.title) for c in self.columns]))
+        body = [latex.row(row) for row in self._marked(lambda text: escape(text, "tex"), marks)]
+        columns = "".join("r" if c.number else "l" for c in self.columns)
+        notes = [latex.prose(note) for note in self.notes if footnotes]
+        text = latex.table(latex.prose(self.caption or self.title), columns, head, body, label=label, notes=notes)
+        return text if footnotes else text + "".join(map(latex.comment, self.notes))
 
     def _marked(self, write: Callable[[str], str], marks: dict[str, str]) -> list[list[str]]:
         """Return the texts of all cells, written for a format, with the marks of the best and the second."""
@@ -163,17 +151,6 @@ def simple(columns: Sequence[str], rows: Sequence[Sequence[Any]], *, numbers: Se
     """Return a table of texts: `columns` are titles, `numbers` those of columns aligned to the right."""
     heads = [Column(title, number=title in numbers) for title in columns]
     return Table(columns=heads, rows=[[Cell(str(cell)) for cell in row] for row in rows], **more)
-
-
-def ranked(numbers: Sequence[float | None], better: str) -> dict[int, str]:
-    """Return {index: "best" or "second"}; equal numbers share a place, and a lone number has none, nor has NaN."""
-    numbers = [None if n is None or math.isnan(n) else n for n in numbers]
-    keys: dict[str, Callable[[float], float]] = {"max": lambda v: -v, "min": lambda v: v, "one": lambda v: abs(v - 1)}
-    if better not in keys or sum(n is not None for n in numbers) < 2:
-        return {}
-    found = {i: keys[better](n) for i, n in enumerate(numbers) if n is not None}
-    places = dict(zip(sorted(set(found.values())), ("best", "second"), strict=False))
-    return {i: places[n] for i, n in found.items() if n in places}
 
 
 def _title(column: Column) -> str:
@@ -206,33 +183,3 @@ def _csv(text: str) -> str:
 
 def _markdown_row(cells: Any) -> str:
     return "| " + " | ".join(cells) + " |\n"
-
-
-def latex_comment(text: str) -> str:
-    """Return a text as a comment, which ends where its one line does."""
-    return f"% {' '.join(one_line(text).split())}\n"
-
-
-def latex_prose(text: str) -> str:
-    """Escape prose: a pair of hyphens is a flag and no dash, and what stands in backquotes is typewriter."""
-    parts = ["-{}-".join(escape(piece, "tex") for piece in part.split("--")) for part in text.split("`")]
-    return "".join(rf"\texttt{{{part}}}" if n % 2 else part for n, part in enumerate(parts))
-
-
-def latex_row(cells: Any) -> str:
-    """Return a line of cells that are LaTeX already."""
-    return " & ".join(cells) + r" \\"
-
-
-def latex_groups(groups: Sequence[str], within: Sequence[str] = ()) -> list[str]:
-    """Return a head line of group titles, each over its neighbouring columns, and the rules below them.
-
-    Equal titles stay two where they stand `within` different groups.
-    """
-    cells, rules, first = [], "", 1
-    for (title, _), of in itertools.groupby(zip(groups, within or groups, strict=True)):
-        n = len(list(of))
-        cells += [rf"\multicolumn{{{n}}}{{c}}{{{latex_prose(title)}}}"] if title else [""] * n
-        rules += rf"\cmidrule(lr){{{first}-{first + n - 1}}}" if title else ""
-        first += n
-    return [latex_row(cells), rules]

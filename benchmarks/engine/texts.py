@@ -1,5 +1,7 @@
-"""Small helpers of the tables: escaping for Markdown, LaTeX, CSV and pictures."""
+"""Small helpers of the tables: escaping for Markdown, LaTeX, CSV and pictures, and who is best and second."""
 
+import math
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 _TEX = {
@@ -56,3 +58,17 @@ def harmless(text: str) -> str:
     """Return a text as a cell of CSV that no spreadsheet takes for a formula, on one line."""
     text = one_line(text)
     return f"'{text}" if text.lstrip().startswith(_FORMULA) else text
+
+
+def ranked(numbers: Sequence[float | None], better: str) -> dict[int, str]:
+    """Return {index: "best" or "second"}; equal numbers share a place, and a lone number has none, nor has NaN.
+
+    `better` is "max", "min", "one" (nearest to 1), or "" for no ranking.
+    """
+    numbers = [None if n is None or math.isnan(n) else n for n in numbers]
+    keys: dict[str, Callable[[float], float]] = {"max": lambda v: -v, "min": lambda v: v, "one": lambda v: abs(v - 1)}
+    if better not in keys or sum(n is not None for n in numbers) < 2:
+        return {}
+    found = {i: keys[better](n) for i, n in enumerate(numbers) if n is not None}
+    places = dict(zip(sorted(set(found.values())), ("best", "second"), strict=False))
+    return {i: places[n] for i, n in found.items() if n in places}

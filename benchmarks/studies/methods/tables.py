@@ -10,9 +10,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
+from ctsim.benchmarks.engine import latex
 from ctsim.benchmarks.engine.collector import uncollected
 from ctsim.benchmarks.engine.record import OK
-from ctsim.benchmarks.engine.table import Cell, Column, Table, latex_comment
+from ctsim.benchmarks.engine.table import Cell, Column, Table
 from ctsim.benchmarks.engine.texts import escape
 from ctsim.benchmarks.scores.columns import COLUMNS, Metric
 from ctsim.benchmarks.scores.compare import NMAR, harm, row_of
@@ -189,8 +190,8 @@ def _page(found: Sequence[Table], form: Format, failed: Sequence[str], said: Seq
     if form == "md" and failed:
         parts.append("## Failures and skips\n\n" + "\n".join(f"- {escape(line, form)}" for line in failed) + "\n")
     elif failed:
-        parts.append("".join(map(latex_comment, failed)))
-    parts += [f"{escape(text, form)}.\n" if form == "md" else latex_comment(f"{text}.") for text in said]
+        parts.append("".join(map(latex.comment, failed)))
+    parts += [f"{escape(text, form)}.\n" if form == "md" else latex.comment(f"{text}.") for text in said]
     return "\n".join(parts)
 
 
