@@ -285,7 +285,7 @@ def test_a_table_with_a_hole_is_refused():
     broken = msgspec.to_builtins(TABLES[1])
     broken["rows"][0]["figures"] = ["26.51"]
     with pytest.raises(msgspec.ValidationError, match="table 1, row GMM"):
-        msgspec.convert(broken, paper_layout.Layout)
+        msgspec.convert(broken, paper_layout.PaperTable)
     broken = msgspec.to_builtins(TABLES[1]) | {"scene": ""}
     with pytest.raises(msgspec.ValidationError, match="expected suite, scene and method"):
-        msgspec.convert(broken, paper_layout.Layout)
+        msgspec.convert(broken, paper_layout.PaperTable)

@@ -62,7 +62,7 @@ class Convention:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Score:
+class Scored:
     """PSNR (dB), SSIM, and the data range, in the units that volumes have after alignment.
 
     None where a number does not exist: identical volumes have no PSNR, an empty region has neither.
@@ -115,7 +115,7 @@ WHOLE: tuple[Convention, ...] = (
 )
 
 
-def score(found: Inspected, truth: Truth, how: Convention) -> Score:
+def score(found: Inspected, truth: Truth, how: Convention) -> Scored:
     """Score a volume; its own at 50 keV, where there is one, against the reference of 50 keV.
 
     Outside the region the volume counts as the reference in SSIM's window.
@@ -127,9 +127,9 @@ def score(found: Inspected, truth: Truth, how: Convention) -> Score:
     if how.alignment == "minmax":
         reference = unit(reference)
     if not region.any():
-        return Score(psnr=None, ssim=None, data_range=data_range)
+        return Scored(psnr=None, ssim=None, data_range=data_range)
     psnr = metrics.psnr3d(values, reference, data_range=data_range, region=region)
-    return Score(psnr=psnr, ssim=similarity(values, reference, region, data_range, how.window), data_range=data_range)
+    return Scored(psnr=psnr, ssim=similarity(values, reference, region, data_range, how.window), data_range=data_range)
 
 
 def region_of(truth: Truth, name: str) -> NDArray[np.bool_]:

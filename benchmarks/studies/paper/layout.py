@@ -42,7 +42,7 @@ class Heading(What, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return COLUMNS["cost" if self.metric == "wall" else "paper"][self.metric]
 
 
-class Row(What, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class PaperRow(What, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A row: what stands in its first columns, and the paper's figures as printed, "" or nothing where it has none."""
 
     stubs: tuple[str, ...]
@@ -76,7 +76,7 @@ class Planned:
         return " --set ".join([f"--method {self.method}", *settings])
 
 
-class Layout(What, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class PaperTable(What, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One of the paper's tables; `rank` says which cells compete, see the file.
 
     Raises InputError where a row has more or fewer cells than the table, or a cell has no suite, scene or method.
@@ -87,7 +87,7 @@ class Layout(What, frozen=True, kw_only=True, forbid_unknown_fields=True):
     title: str
     stubs: tuple[str, ...]
     columns: tuple[Heading, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[PaperRow, ...]
     rank: Literal["down", "across", ""] = ""
     note: str = ""
 
@@ -131,7 +131,7 @@ class Paper(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """The paper and its tables."""
 
     source: str
-    table: tuple[Layout, ...]
+    table: tuple[PaperTable, ...]
 
 
 def load() -> Paper:

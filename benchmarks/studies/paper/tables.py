@@ -24,7 +24,7 @@ from ctsim.benchmarks.methods import TABLE
 from ctsim.benchmarks.scores.protocol import VERSION
 from ctsim.benchmarks.studies.methods import records, tables
 from ctsim.benchmarks.studies.methods.records import METAL, Run, RunRecord, case_of
-from ctsim.benchmarks.studies.paper.layout import NONE, Layout, Planned, duration, load, printed
+from ctsim.benchmarks.studies.paper.layout import NONE, PaperTable, Planned, duration, load, printed
 from ctsim.errors import InputError
 
 Form = Literal["md", "tex"]
@@ -104,7 +104,7 @@ def filled(found: Sequence[RunRecord], protocol: Protocol, numbers: tuple[int, .
     return [fill(layout, measured, protocol) for layout in paper if not numbers or layout.number in numbers]
 
 
-def fill(layout: Layout, measured: "Measured", protocol: Protocol) -> Sheet:
+def fill(layout: PaperTable, measured: "Measured", protocol: Protocol) -> Sheet:
     """Fill a table from records. Cells compete within their side and metric, those of different scenes never."""
     columns, plan = [Column(stub) for stub in layout.stubs], layout.plan()
     sides = [("paper", "here") if layout.published(k) else ("here",) for k in range(len(layout.columns))]
@@ -139,7 +139,7 @@ def fill(layout: Layout, measured: "Measured", protocol: Protocol) -> Sheet:
     )
 
 
-def _cell(layout: Layout, k: int, planned: Planned, measured: "Measured", protocol: str) -> Cell:
+def _cell(layout: PaperTable, k: int, planned: Planned, measured: "Measured", protocol: str) -> Cell:
     """Return our cell of column `k`: mean ± standard deviation over seeds; of a failed run its status."""
     metric = layout.columns[k].metric
     bad = [r.status for r in measured.runs.get((planned.place, planned.label), []) if r.status != OK]
@@ -247,7 +247,7 @@ def _some(texts: Iterable[str], most: int = 3) -> str:
     return ", ".join(known[:most]) + (f" and {len(known) - most} more" if len(known) > most else "")
 
 
-def caption(layout: Layout, used: list[RunRecord], protocol: str) -> str:
+def caption(layout: PaperTable, used: list[RunRecord], protocol: str) -> str:
     """State protocol, region, reference, range, seeds, inputs and metal insertion of our columns, and what compares."""
     timed = all(column.metric == "wall" for column in layout.columns)
     parts = [f"The paper's Table {layout.number} and what was measured here."]
@@ -300,7 +300,7 @@ def _remarks(used: list[RunRecord], measured: Measured) -> list[str]:
     return failed + [f"{scene}: {measured.replaced[scene]} {left}" for scene in old]
 
 
-def commands(layout: Layout, missing: list[Planned]) -> list[str]:
+def commands(layout: PaperTable, missing: list[Planned]) -> list[str]:
     """Name the commands that make the cells without a record."""
     strange = dict.fromkeys(p.method for p in missing if p.method not in TABLE)
     notes = [f"–: there is no method {', '.join(strange)} in `benchmarks/methods.py`"] if strange else []
