@@ -38,16 +38,13 @@ log = logging.getLogger(__name__)
 LIMIT = 20_000_000  # bytes of a page that is easily sent and opened
 IMAGES = 0.85  # share of it for slices
 
-STUDIES: tuple[tuple[str, type[Study[Any, Any]], dict[str, Any]], ...] = (
-    ("pareto", Pareto, {}),
-    ("peers", Peers, {}),
-    ("peers, small grids", Peers, {"small": True}),
-    ("skipping", Skipping, {}),
-    ("skipping, small grids", Skipping, {"size": "small"}),
-    ("stress", Stress, {}),
-    ("stress, small grids", Stress, {"short": True}),
+STUDIES: tuple[tuple[type[Study[Any, Any]], dict[str, dict[str, Any]]], ...] = (
+    (Pareto, {"pareto": {}}),
+    (Peers, {"peers": {}, "peers, small grids": {"small": True}}),
+    (Skipping, {"skipping": {}, "skipping, small grids": {"size": "small"}}),
+    (Stress, {"stress": {}, "stress, small grids": {"short": True}}),
 )
-"""Studies whose records may lie in a results folder, too: title, study, and the flags that choose what is shown."""
+"""Studies whose records may lie in a results folder, too, with titles and the flags that choose what each shows."""
 
 
 def main(arguments: list[str]) -> int:
@@ -141,14 +138,19 @@ def more(results: Path, found: Sequence[RunRecord]) -> dict[str, str]:
     """Return what else lies in the results folder, as HTML by title: tables of other studies, other pages as text."""
     parts: dict[str, str] = {}
     shown = {"table.md"}
-    for title, kind, flags in STUDIES:
+    for kind, parted in STUDIES:
         study = kind()
-        given = study.flags(results=results, **flags)
-        kept = study.shown([r for r in study.store(given).read() if study.shows(r.task, given)])
-        if kept:
-            tables = [*study.tables(kept, given), *study.details(kept, given)]
-            parts[title] = f"<p>{html_prose(provenance(kept))}</p>\n{_joined(tables)}"
-            shown.add(f"{study.file}.md")
+        try:
+            known = study.store(study.flags(results=results)).read()
+        except InputError as error:  # such as records of another version
+            log.warning("%s; the page shows %s.md, if it is there, as text", error, study.file)
+            continue
+        for title, flags in parted.items():
+            given = study.flags(results=results, **flags)
+            if kept := study.shown([r for r in known if study.shows(r.task, given)]):
+                tables = [*study.tables(kept, given), *study.details(kept, given)]
+                parts[title] = f"<p>{html_prose(provenance(kept))}</p>\n{_joined(tables)}"
+                shown.add(f"{study.file}.md")
     if (results / ablation.NAME).exists():
         parts["ablation"] = _joined(filled(found, "paper", ablation.ablations()))
     if (results / claims.NAME).exists():

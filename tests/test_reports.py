@@ -211,6 +211,17 @@ def test_other_tables_in_the_folder_are_shown_too(results, tmp_path):
     assert "<pre>## A | &lt;b&gt;</pre>" in text and "<pre>old" not in text
 
 
+def test_records_that_cannot_be_read_leave_their_page_as_text(results, tmp_path, caplog):
+    folder = tmp_path / "r"
+    shutil.copytree(results, folder)
+    (folder / "peers.jsonl").write_text('{"of": "another version"}\n', encoding="utf-8")
+    (folder / "peers.md").write_text("| rtk |", encoding="utf-8")
+    text = report.html_page(folder, None, "run-benchmark report")
+    assert "<summary>peers</summary>" in text and "<pre>| rtk |</pre>" in text
+    (message,) = caplog.messages
+    assert "peers.jsonl, line 1" in message and "peers.md" in message
+
+
 def test_what_did_not_end_well_is_a_table(results, tmp_path):
     folder = tmp_path / "r"
     append(folder, make_record("net", scene="lung", status="error", reason="out of <luck>"))
