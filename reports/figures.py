@@ -15,7 +15,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from matplotlib.transforms import Bbox
 
 from ctsim.benchmarks.engine.texts import pictured
-from ctsim.benchmarks.scores.columns import COLUMNS
+from ctsim.benchmarks.scores.score import COLUMNS
 from ctsim.benchmarks.studies.methods.records import RunRecord
 from ctsim.benchmarks.studies.methods.tables import summary
 

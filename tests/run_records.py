@@ -9,7 +9,7 @@ from ctsim.benchmarks.engine.host import Host
 from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.study import record_of
 from ctsim.benchmarks.methods import Method
-from ctsim.benchmarks.scores.protocol import VERSION
+from ctsim.benchmarks.scores.score import VERSION
 from ctsim.benchmarks.studies.methods import plan
 from ctsim.benchmarks.studies.methods.records import Result, Run, RunRecord, case_of, task_of
 from ctsim.benchmarks.studies.methods.run import Runner

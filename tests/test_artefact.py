@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 from ctsim.benchmarks.scores import artefact, metrics
 from ctsim.benchmarks.scores.artefact import Layout, artefact_score, cupping_index, homogeneous, metal_lines, near_metal
 from ctsim.benchmarks.scores.protocol import Truth
+from ctsim.benchmarks.scores.score import COLUMNS
 from ctsim.errors import InputError
 from ctsim.store import list_scans, open_scan
 
@@ -233,7 +234,7 @@ def test_the_std_of_a_checkerboard():
 def test_the_twins_own_texture_does_not_count():
     twin = WATER * (1 + 0.3 * np.random.default_rng(1).standard_normal(SHAPE))
     values = scored(np.zeros(SHAPE), twin=twin)
-    assert [values[m] for m in artefact.METRICS] == [0.0] * 6
+    assert [values[m] for m in COLUMNS["artefact"]] == [0.0] * 6
 
 
 def test_thirds_are_by_distance_to_the_rois_outside():
@@ -271,7 +272,7 @@ def test_without_a_twin_or_water_there_are_no_numbers():
         artefact_score(volume, None, layout, truth, "gone"),
         artefact_score(volume, volume, scene(water=None)[1], truth),
     ):
-        assert score.values == dict.fromkeys(artefact.METRICS)
+        assert score.values == dict.fromkeys(COLUMNS["artefact"])
     assert artefact_score(volume, None, layout, truth, "gone").note == "gone"
     with pytest.raises(InputError, match="twin"):
         artefact_score(volume, volume[1:], layout, truth)

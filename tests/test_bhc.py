@@ -11,7 +11,7 @@ import torch
 from ctsim.baselines import bhc, known_spectrum
 from ctsim.baselines.known_spectrum import Beam, precorrect
 from ctsim.baselines.metal import Metal, Trace
-from ctsim.benchmarks.studies.methods import intermediates
+from ctsim.benchmarks.studies.methods.volumes import attached
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
@@ -199,7 +199,7 @@ def test_starved_readings_stay_finite(starving, name):
 
 def test_what_pictures_show_is_what_was_backprojected(rods):
     scan, _ = rods
-    found = intermediates.taken(bhc.bhc_poly(scan).details, scan.geometry)
+    found = attached(bhc.bhc_poly(scan).details, scan.geometry)
     measured = line_integrals(scan, int(found["view"]))[0].numpy()
     trace, less = found["trace"], found["projection"]
     assert trace.any() and (less[~trace] == measured[~trace]).all() and (less[trace] <= measured[trace]).all()

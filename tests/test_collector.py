@@ -4,7 +4,7 @@ import pytest
 from run_records import append, make_record
 
 from ctsim.benchmarks.engine import record
-from ctsim.benchmarks.engine.collector import uncollected
+from ctsim.benchmarks.engine.record import uncollected
 from ctsim.benchmarks.studies.methods import records, tables
 
 

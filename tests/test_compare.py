@@ -1,6 +1,6 @@
 import pytest
 
-from ctsim.benchmarks.scores.compare import Row, anchored, derived, harm, row_of
+from ctsim.benchmarks.scores.score import Row, anchored, derived, harm, row_of
 
 
 def row(method, metric, value, *, variant="metal", protocol="tissue", **more):

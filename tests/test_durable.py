@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ctsim import durable, process
-from ctsim.benchmarks.studies.methods import intermediates, volumes
+from ctsim.benchmarks.studies.methods import volumes
 from ctsim.benchmarks.studies.methods.volumes import read_volume, write_volume
 from ctsim.durable import replacing, write_synced
 from ctsim.reconstruct.splat.checkpoint import Checkpoint
@@ -67,12 +67,12 @@ def test_two_commands_replace_one_file_of_arrays_and_the_last_has_its_way(tmp_pa
     def meanwhile(file, **arrays) -> None:
         if second.pop():
             second.append(False)
-            intermediates.write(path, {"prior": volume(2.0)}, "second")
+            volumes.write_intermediates(path, {"prior": volume(2.0)}, "second")
         savez(file, **arrays)
 
     monkeypatch.setattr(np, "savez", meanwhile)
-    intermediates.write(path, {"prior": volume(1.0)}, "first")
-    np.testing.assert_array_equal(intermediates.read(path, "first")["prior"], volume(1.0))
+    volumes.write_intermediates(path, {"prior": volume(1.0)}, "first")
+    np.testing.assert_array_equal(volumes.read_intermediates(path, "first")["prior"], volume(1.0))
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
 
 

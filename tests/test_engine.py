@@ -546,17 +546,19 @@ def test_workers_keep_limits(tiny, tmp_path, capsys):
     assert sorted(found(tmp_path)) == [("good", "ok", ""), ("slow", "timeout", "did not end within 3 s")]
 
 
-def test_a_worker_that_lives_on_keeps_no_process_and_no_folder_of_another_command(tmp_path):
+def test_a_worker_that_lives_on_keeps_no_process_and_no_folder_of_another_command(tmp_path, monkeypatch):
     """Dask's do."""
-    pids, folders = [], []
+    started = []
+    process = study.Process
+    monkeypatch.setattr(study, "Process", lambda variables: started.append(process(variables)) or started[-1])
+    pids = []
     for n in range(3):
         given = tiny_study.Flags(results=tmp_path, repeats=n + 1, seconds=60.0)
         for case in ("good", "better"):
-            (one,) = study._measure_group((TINY(), (tiny_study.Task(study="tiny", case=case),), given))
+            (one,) = study._measure_group(TINY(), given, (tiny_study.Task(study="tiny", case=case),))
             assert one.finished and one.repeats == n + 1
-        here = study._here(TINY, given)
-        pids.append(here._process.run(os.getpid))
-        folders.append(here._folder.name)
+        pids.append(started[n].run(os.getpid))
+    folders = [one._environment["TMPDIR"] for one in started]
     assert [lives(pid) for pid in pids] == [os.path.exists(path) for path in folders] == [False, False, True]
 
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from ctsim.benchmarks import methods
-from ctsim.benchmarks.studies.methods import attempt, intermediates
+from ctsim.benchmarks.studies.methods import attempt
+from ctsim.benchmarks.studies.methods.volumes import attached
 from ctsim.reconstruct.log import line_integrals
 from ctsim.store import list_scans, open_scan
 
@@ -29,4 +30,4 @@ def test_without_metal_nothing_is_attached(smallest):
     method = methods.find("nmar")
     outcome = attempt.attempt(method, attempt.scan_for(method, stored, "metal_free"), 0.0)
     assert outcome.status == "ok" and outcome.intermediates == {}
-    assert intermediates.taken({}, stored.geometry) == {}
+    assert attached({}, stored.geometry) == {}

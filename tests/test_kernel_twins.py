@@ -15,7 +15,7 @@ from ctsim.baselines.kernels import (
     sart_reference,
 )
 from ctsim.benchmarks.scores.kernels import ssim_cpu, ssim_reference
-from ctsim.benchmarks.scores.ssim import border, window
+from ctsim.benchmarks.scores.metrics import border, window
 from ctsim.geometry import Geometry
 from ctsim.kernels import (
     bricks_cpu,

@@ -8,8 +8,8 @@ from scipy import ndimage
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from ctsim.benchmarks.scores import metrics
+from ctsim.benchmarks.scores.metrics import window
 from ctsim.benchmarks.scores.protocol import AS_RETURNED, AT_50KEV, Truth, evaluate, tissue_range
-from ctsim.benchmarks.scores.ssim import window
 from ctsim.errors import InputError
 
 

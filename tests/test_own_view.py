@@ -17,7 +17,7 @@ from run_records import run_methods
 from test_run import GEOMETRY, double
 
 from ctsim.benchmarks import methods
-from ctsim.benchmarks.studies.methods.own import restored
+from ctsim.benchmarks.studies.methods.attempt import restored
 from ctsim.benchmarks.studies.methods.volumes import read_volume
 from ctsim.store import list_scans, open_scan
 from ctsim.types import Volume
@@ -131,7 +131,7 @@ def test_nan_in_the_counts_is_no_change():
     counts = torch.full(GEOMETRY.shape, float("nan"))
     counts[0] = 3.0
     scan = Scan(geometry=GEOMETRY, counts=counts, flat=torch.full(GEOMETRY.n_detector, 9.0))
-    from ctsim.benchmarks.studies.methods.own import changed
+    from ctsim.benchmarks.studies.methods.attempt import changed
 
     assert changed(scan, Scan(geometry=GEOMETRY, counts=counts.clone(), flat=scan.flat.clone())) == []
 

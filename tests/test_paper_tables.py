@@ -7,7 +7,7 @@ import pytest
 from run_records import append, make_record
 
 from ctsim.benchmarks import cli
-from ctsim.benchmarks.scores.protocol import Score
+from ctsim.benchmarks.scores.score import Score
 from ctsim.benchmarks.studies.methods.plan import repetition
 from ctsim.benchmarks.studies.methods.records import Cost
 from ctsim.benchmarks.studies.paper import layout as paper_layout

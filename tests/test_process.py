@@ -21,7 +21,8 @@ import torch
 from engine_jobs import lives, until
 
 from ctsim.benchmarks.engine import dask, host, process
-from ctsim.benchmarks.engine.dask import Cluster, open_jobs
+from ctsim.benchmarks.engine.dask import Cluster
+from ctsim.benchmarks.engine.host import open_jobs
 from ctsim.benchmarks.engine.process import Lost, Pool, Process, Stopped, answered, check_limit
 from ctsim.errors import InputError
 
@@ -516,6 +517,7 @@ def test_a_scheduler_that_does_not_answer_is_one_sentence(cluster, monkeypatch):
 
 def test_a_cluster_without_the_package_is_one_sentence(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
+    monkeypatch.delitem(sys.modules, "ctsim.benchmarks.engine.dask")
     with pytest.raises(InputError, match=r"pip install 'ctsim\[cluster\]'"):
         open_jobs(1, "tcp://127.0.0.1:9")
 

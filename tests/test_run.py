@@ -13,13 +13,21 @@ import torch
 from run_records import run_jobs, run_methods
 
 from ctsim.benchmarks import cli, methods
-from ctsim.benchmarks.scores import artefact
 from ctsim.benchmarks.scores.protocol import truth_of
-from ctsim.benchmarks.studies.methods import attempt, intermediates, plan, records
+from ctsim.benchmarks.scores.score import NOT_ASKED
+from ctsim.benchmarks.studies.methods import attempt, plan, records
 from ctsim.benchmarks.studies.methods import study as cli_run
 from ctsim.benchmarks.studies.methods.panels import Row, cut, draw, write_panels
 from ctsim.benchmarks.studies.methods.tables import caption
-from ctsim.benchmarks.studies.methods.volumes import at_50kev_of, identity_of, read_volume, write_volume
+from ctsim.benchmarks.studies.methods.volumes import (
+    at_50kev_of,
+    attached,
+    identity_of,
+    intermediates_of,
+    read_intermediates,
+    read_volume,
+    write_volume,
+)
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.scaninfo import ScanInfo
@@ -151,7 +159,7 @@ def test_a_run_is_scored_timed_kept_and_recorded(tmp_path):
     assert record.data_code == "v1"
     assert set(record.scores) == {"tissue", "aligned", "aligned_50kev", "paper", "metal", "projection", "artefact"}
     assert "without scene.toml" in record.scores["projection"].note
-    assert record.scores["artefact"].note == artefact.NOT_ASKED
+    assert record.scores["artefact"].note == NOT_ASKED
     assert set(record.scores["artefact"].values.values()) == {None}
     assert record.cost.view_updates == 12 and record.cost.peak_bytes > 0 and not record.cost.isolated
     assert record.host.ram > 0 and record.time.endswith("+00:00")
@@ -261,7 +269,7 @@ def talks(scan, *, device):
 
 
 def kept(results, record):
-    return intermediates.read(intermediates.path_of(results / record.volume), record.identity)
+    return read_intermediates(intermediates_of(results / record.volume), record.identity)
 
 
 def images(figure):
@@ -321,7 +329,7 @@ def test_what_a_method_worked_with_is_kept_beside_its_volume(tmp_path, isolate):
     found = kept(tmp_path, record)
     assert found["view"] == 1 and found["trace"].sum() == 12 and found["trace"].dtype == bool
     assert (found["projection"] == np.float32(0.7)).all() and (found["prior"] == 1).all()
-    assert intermediates.read(tmp_path / "volumes" / "box__test_run_shows.npz", "another run") == {}
+    assert read_intermediates(tmp_path / "volumes" / "box__test_run_shows.npz", "another run") == {}
     assert kept(tmp_path, once("good", tmp_path)) == {}
     (tmp_path / "volumes" / "box__test_run_shows.npz").write_bytes(b"PK damaged")
     with pytest.raises(InputError, match="cannot be read"):
@@ -353,7 +361,7 @@ def test_panels_hold_what_each_method_gave():
     # errors are signed on one scale around 0; the window is 2.5 times the body's 0.02, whatever a method gave
     clims = np.array([a.images[0].get_clim() for a in plain])
     assert clims == pytest.approx(np.array([[0, 0.05]] * 4 + [[-0.02, 0.02]] * 2), abs=1e-8)
-    found = intermediates.taken(shows(stored.scan, device="cpu").details, GEOMETRY)
+    found = attached(shows(stored.scan, device="cpu").details, GEOMETRY)
     all_axes = images(draw(stored, truth, [*rows, Row(caption="nmar", volume=reference, shown=found)]))
     measured, bridged = (a for a in all_axes if a.images[0].get_array().shape == GEOMETRY.n_detector)
     assert np.allclose(measured.images[0].get_array(), np.log(2.0), atol=1e-6)  # 1000 counts of 2000
@@ -371,7 +379,7 @@ def test_intermediates_that_cannot_be_drawn_are_an_error(tmp_path, entries, word
     assert outcome.status == "error" and words in outcome.reason
     for wrong in ({"view": 6}, {"view": -1}, {"prior": np.zeros((2, 2, 2))}, {"view": 0, "trace": np.zeros((5, 5))}):
         with pytest.raises(InputError):
-            intermediates.taken({"intermediates": wrong}, GEOMETRY)
+            attached({"intermediates": wrong}, GEOMETRY)
 
 
 def command(monkeypatch, capsys, *arguments):

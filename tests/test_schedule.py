@@ -70,12 +70,6 @@ def test_cheap_methods_come_first():
     assert order(("b:b", "a:a"), [took("a:a", 1.0, "timeout")]) == ["b:b", "a:a"]  # a failure says nothing of the cost
 
 
-def test_the_cost_of_a_run_is_that_of_its_scan_else_the_methods_median():
-    found = [took("fdk", 1.0, scene="box", seed=3), took("fdk", 5.0, scene="x"), took("fdk", 9.0, scene="y")]
-    twin, scan = listed("fdk")[:2]
-    assert (Costs(found).task(scan), Costs(found).task(twin), Costs([]).task(scan)) == (1.0, 5.0, None)
-
-
 def test_a_dry_run_writes_nothing(smallest, tmp_path, capsys):
 
     assert study.main([str(smallest), str(tmp_path / "results"), "--dry-run"]) == 0

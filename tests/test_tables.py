@@ -13,7 +13,7 @@ from run_records import changed, make_record
 
 from ctsim.benchmarks.engine import latex
 from ctsim.benchmarks.engine.texts import escape
-from ctsim.benchmarks.scores.protocol import Score
+from ctsim.benchmarks.scores.score import Score
 from ctsim.benchmarks.studies.methods import records, tables
 from ctsim.benchmarks.studies.methods.records import Cost
 from ctsim.errors import InputError

@@ -12,7 +12,7 @@ from test_run import GEOMETRY, Double
 
 from ctsim.benchmarks import methods
 from ctsim.benchmarks.engine.record import encoded
-from ctsim.benchmarks.scores import artefact
+from ctsim.benchmarks.scores.score import COLUMNS, NO_TWIN, NOT_ASKED
 from ctsim.benchmarks.studies.methods import attempt, plan, records
 from ctsim.benchmarks.studies.methods.volumes import identity_of, map_volume, read_volume, write_volume
 from ctsim.errors import InputError
@@ -85,7 +85,7 @@ def test_the_twin_that_was_just_run_is_not_taken_for_anothers(tmp_path):
     found = [methods.find("test_twins:counted", {"scale": s}) for s in (1e-5, 3e-5)]
     a_twin, _, _, b_scan = plan.jobs([pair(tmp_path)], found, anchor=True)
     _, record = run_jobs([a_twin, b_scan], tmp_path, keep_volumes=False)
-    assert record.scores["artefact"].note == artefact.NOT_ASKED
+    assert record.scores["artefact"].note == NOT_ASKED
     assert set(record.scores["artefact"].values.values()) == {None}
 
 
@@ -130,7 +130,7 @@ def test_without_kept_volumes_the_twin_is_run_beside_its_scan(tmp_path):
 
 def test_a_scan_scored_without_its_twin_is_done_again_when_the_twin_is_wanted(tmp_path):
     _, (record,) = do(tmp_path, anchor=False)
-    assert record.scores["artefact"].note == artefact.NOT_ASKED
+    assert record.scores["artefact"].note == NOT_ASKED
     assert do(tmp_path, anchor=False)[0] == []
     did, (_, again) = do(tmp_path)
     assert len(did) == 2 and again.scores["artefact"].values["rmse_far"] is not None
@@ -159,8 +159,8 @@ def test_a_scan_without_a_twin_has_no_artefact_numbers(tmp_path):
     alone = dataclasses.replace(pair(tmp_path), metal_free=None)
     listed = plan.jobs([alone], [methods.find("test_twins:counted")], anchor=True)
     (record,) = run_jobs(listed, tmp_path)
-    assert record.scores["artefact"].note == artefact.NO_TWIN
-    assert set(record.scores["artefact"].values) == set(artefact.METRICS)
+    assert record.scores["artefact"].note == NO_TWIN
+    assert set(record.scores["artefact"].values) == set(COLUMNS["artefact"])
     assert set(record.scores["artefact"].values.values()) == {None}
     assert plan.pending([job.task for job in listed], records.read(tmp_path), tmp_path) == []
 

@@ -20,7 +20,8 @@ from test_cli import stopped
 from ctsim.benchmarks import cli
 from ctsim.benchmarks.engine import dask as dask_jobs
 from ctsim.benchmarks.engine import process
-from ctsim.benchmarks.engine.dask import Cluster, open_jobs
+from ctsim.benchmarks.engine.dask import Cluster
+from ctsim.benchmarks.engine.host import open_jobs
 from ctsim.benchmarks.engine.process import Lost, Pool
 from ctsim.errors import InputError
 
@@ -428,6 +429,7 @@ def test_a_scheduler_that_does_not_answer_is_one_sentence_but_a_jobs_own_error_i
 
 def test_a_cluster_without_the_package_is_one_sentence(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
+    monkeypatch.delitem(sys.modules, "ctsim.benchmarks.engine.dask")
     with pytest.raises(InputError, match=r"pip install 'ctsim\[cluster\]'"):
         open_jobs(1, "tcp://127.0.0.1:9")
 

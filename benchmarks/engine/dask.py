@@ -1,8 +1,6 @@
-"""Jobs on the workers of a Dask scheduler, and the choice between this process, a pool and a scheduler."""
+"""Jobs on the workers of a Dask scheduler, which comes with the extra `cluster`."""
 
-import contextlib
 import gc
-import importlib
 import logging
 import threading
 import time
@@ -11,30 +9,17 @@ from collections.abc import Sequence
 from concurrent.futures import CancelledError
 from typing import Any, Self
 
-from ctsim.benchmarks.engine.process import TICK, Answers, Function, Jobs, Lost, Pool, answered
+import distributed
+import numba
+import torch
+from distributed.comm import CommClosedError
+from distributed.scheduler import KilledWorker
+
+from ctsim.benchmarks.engine.process import TICK, Answers, Function, Lost, answered
 from ctsim.errors import InputError
 
 CONNECT = 10.0  # seconds that a scheduler has to answer
 CERTIFICATES = ("distributed.comm.tls.ca-file", "distributed.comm.tls.client.cert")
-
-
-def check_workers(workers: int, scheduler: str | None) -> None:
-    """Raise InputError for less than one worker, and for --workers with --scheduler."""
-    if workers < 1:
-        raise InputError(f"--workers {workers}: expected 1 or more")
-    if scheduler is not None and workers != 1:
-        raise InputError("--workers and --scheduler exclude each other: the scheduler's own workers do the work")
-
-
-def open_jobs(workers: int, scheduler: str | None) -> contextlib.AbstractContextManager[Jobs | None]:
-    """Return what --workers and --scheduler ask for; None where this process is to do all.
-
-    Raises InputError as `check_workers` does, and for a scheduler that cannot be used.
-    """
-    check_workers(workers, scheduler)
-    if scheduler is not None:
-        return Cluster(scheduler)
-    return contextlib.nullcontext() if workers == 1 else Pool(workers)
 
 
 class Cluster:
@@ -45,15 +30,11 @@ class Cluster:
     """
 
     def __init__(self, address: str) -> None:
-        try:
-            self._dask: Any = importlib.import_module("distributed")
-        except ImportError:
-            raise InputError("--scheduler needs the package distributed: pip install 'ctsim[cluster]'") from None
         for name in ("distributed", "distributed.client"):
             logging.getLogger(name).setLevel(logging.CRITICAL)  # our errors say what matters
         self._address, reason = address, ""
         try:
-            self._client = self._dask.Client(address, timeout=CONNECT)
+            self._client = distributed.Client(address, timeout=CONNECT)
         except (OSError, ValueError, RuntimeError, TypeError) as error:
             said = " ".join(str(error).split()) or type(error).__name__
             reason = f"no Dask scheduler answers there, expected tcp://host:port or tls://host:port ({said})"
@@ -74,7 +55,7 @@ class Cluster:
         """See `Jobs`. Raises InputError when the scheduler is gone."""
         try:
             yield from self._answers(function, jobs)
-        except (CancelledError, self._dask.comm.CommClosedError) as error:
+        except (CancelledError, CommClosedError) as error:
             raise self._gone() from error
 
     def _gone(self) -> InputError:
@@ -105,13 +86,13 @@ class Cluster:
             time.sleep(TICK)
             return set()
         try:
-            return self._dask.wait(futures, timeout=TICK, return_when="FIRST_COMPLETED").done
+            return distributed.wait(futures, timeout=TICK, return_when="FIRST_COMPLETED").done
         except TimeoutError:
             return set()
 
     def _answer(self, future: Any) -> Any:
         error = future.exception()
-        if isinstance(error, self._dask.scheduler.KilledWorker):
+        if isinstance(error, KilledWorker):
             return Lost("its process died each time that Dask started it")
         if error is not None:
             raise error
@@ -130,13 +111,8 @@ def _alone(function: Function, job: Any) -> tuple[bool, Any]:
     An exception is returned: where Dask cannot pickle one, nobody hears of it and the client waits for ever.
     """
     with _ALONE:
-        import numba
-        import torch
-        from distributed import get_worker
-        from numba.core import config
-
-        threads: int = get_worker().state.nthreads
-        most = int(config.NUMBA_NUM_THREADS)  # pyright: ignore[reportAttributeAccessIssue]
+        threads: int = distributed.get_worker().state.nthreads
+        most = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]
         numba.set_num_threads(min(threads, most))
         torch.set_num_threads(threads)
         return answered(function, job)

@@ -1,4 +1,4 @@
-"""Where a measurement was taken: machine, threads, versions, commit; and what it took."""
+"""Where measurements are taken: processes, machine, threads, versions, commit; and what they took."""
 
 import contextlib
 import functools
@@ -15,7 +15,8 @@ from pathlib import Path
 
 import msgspec
 
-from ctsim.benchmarks.engine.process import THREADS, at_most
+from ctsim.benchmarks.engine.process import THREADS, Jobs, Pool, at_most
+from ctsim.errors import InputError
 
 VERSIONS_OF = ("ctsim", "numpy", "numba", "torch", "scipy", "scikit-image", "xraylib")
 
@@ -164,3 +165,26 @@ def in_turns(runs: Mapping[str, Callable[[], object]], repeats: int) -> dict[str
             run()
             seconds[name].append(time.perf_counter() - start)
     return {name: (s[0], tuple(s[1:])) for name, s in seconds.items()}
+
+
+def check_workers(workers: int, scheduler: str | None) -> None:
+    """Raise InputError for less than one worker, and for --workers with --scheduler."""
+    if workers < 1:
+        raise InputError(f"--workers {workers}: expected 1 or more")
+    if scheduler is not None and workers != 1:
+        raise InputError("--workers and --scheduler exclude each other: the scheduler's own workers do the work")
+
+
+def open_jobs(workers: int, scheduler: str | None) -> contextlib.AbstractContextManager[Jobs | None]:
+    """Return what --workers and --scheduler ask for; None where this process is to do all.
+
+    Raises InputError as `check_workers` does, and for a scheduler that cannot be used.
+    """
+    check_workers(workers, scheduler)
+    if scheduler is not None:
+        try:
+            from ctsim.benchmarks.engine.dask import Cluster  # needs what only an extra installs
+        except ImportError:
+            raise InputError("--scheduler needs the package distributed: pip install 'ctsim[cluster]'") from None
+        return Cluster(scheduler)
+    return contextlib.nullcontext() if workers == 1 else Pool(workers)

@@ -1,6 +1,7 @@
 """The life of every measuring command: list tasks, skip what is recorded, measure, record, write tables."""
 
 import contextlib
+import functools
 import pkgutil
 import sys
 import tempfile
@@ -11,14 +12,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Any, ClassVar, Generic, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
 import tyro
 
 from ctsim.benchmarks.engine import host
-from ctsim.benchmarks.engine.dask import check_workers, open_jobs
+from ctsim.benchmarks.engine.host import check_workers, open_jobs
 from ctsim.benchmarks.engine.process import Jobs, Lost, Process, Stopped, check_limit
-from ctsim.benchmarks.engine.record import OK, Found, Record, Store, Task, by_row, done, latest, provenance
+from ctsim.benchmarks.engine.record import Found, Record, Store, Task, by_row, done, latest, provenance
 from ctsim.benchmarks.engine.table import Table
 from ctsim.benchmarks.engine.terminal import Bar
 from ctsim.durable import write_synced
@@ -98,8 +99,7 @@ class Study(Generic[R, G]):
 
     def store(self, given: G) -> Store[R]:
         """Return the records in the results folder."""
-        what = f"a record of run-benchmark {self.name}".rstrip()
-        return Store(self.folder(given), self.file, self.record, what)
+        return Store(self.folder(given), self.file, self.record, f"a record of run-benchmark {self.name}".rstrip())
 
     def prepare(self, given: G) -> None:
         """Make what tasks depend on, such as data; called before `tasks`, and not with --dry-run."""
@@ -170,10 +170,6 @@ class Study(Generic[R, G]):
         """Return a task as its record keeps it."""
         return task
 
-    def failed(self, task: Any, status: str, reason: str) -> Found:
-        """Return what stands for a task that did not end."""
-        return self.kind(ok=False, status=status, reason=reason)
-
     def tables(self, records: Sequence[R], given: G) -> list[Table]:
         """Return the tables of records: one of each row, with `rounds` those of all rounds, in order."""
         raise NotImplementedError
@@ -207,7 +203,7 @@ class Study(Generic[R, G]):
     def code(self, tasks: Sequence[Any], records: Sequence[R], given: G) -> int:
         """Return the exit code: 0 if every task that was asked for ended as expected."""
         rows = {task.row for task in tasks}
-        return int(any(not f.ok for r in latest(records) if not rows or r.task.row in rows for f in r.found))
+        return int(any(not r.ok for r in latest(records) if not rows or r.task.row in rows))
 
 
 def main(study: Study[Any, Any], arguments: list[str]) -> int:
@@ -223,9 +219,8 @@ def main(study: Study[Any, Any], arguments: list[str]) -> int:
         sys.stderr.write(f"{other}: {count} records taken over\n")
     records = store.read()
     if given.dry_run:
-        sys.stdout.write(
-            listing(study, study.pending(tasks, records, given), records, given, _all(study, tasks, given))
-        )
+        left = study.pending(tasks, records, given)
+        sys.stdout.write(listing(study, left, records, given, _all(study, tasks, given)))
         return 0
     failed = measure_all(study, tasks, records, given) if tasks else []
     shown = _shown(study, store, given)
@@ -269,20 +264,19 @@ def measure_all(study: Study[R, G], tasks: Sequence[Task], records: Sequence[R],
     left, store, n_all = study.pending(tasks, records, given), study.store(given), _all(study, tasks, given)
     if len(left) < n_all:
         sys.stderr.write(f"{n_all - len(left)} of {n_all} {study.unit}s are recorded already (--force)\n")
-    failed, written, took = [], 0.0, 0.0
+    failed, due = [], 0.0
     with open_jobs(given.workers, given.scheduler) as jobs:
         store.folder.mkdir(parents=True, exist_ok=True)  # before anything is measured that could not be recorded
         with Bar(len(left), study.unit) as bar, study.watched(bar.note):
             try:
                 for record in _records(study, study.groups(left, records), given, jobs):
                     store.append([record])
-                    if not all(one.ok for one in record.found):
-                        failed.append(record)
-                    bar.advance(text=f"{study.title(record.task)}: {_status(record)}")
-                    if study.follows and time.monotonic() > written + took / SHARE:
-                        began = time.monotonic()
+                    failed += [] if record.ok else [record]
+                    how = "not as expected" if record.finished and not record.ok else record.status
+                    bar.advance(text=f"{study.title(record.task)}: {how}")
+                    if study.follows and (began := time.monotonic()) > due:
                         _follow(study, store, given)
-                        written, took = time.monotonic(), time.monotonic() - began
+                        due = (now := time.monotonic()) + (now - began) / SHARE
             except BaseException as error:
                 if study.follows:
                     with contextlib.suppress(OSError, InputError):
@@ -301,11 +295,6 @@ def _follow(study: Study[R, G], store: Store[R], given: G, *, draw: bool = False
             study.draw(shown, given)
 
 
-def _status(record: Record[Any]) -> str:
-    good = OK if all(one.ok for one in record.found) else "not as expected"
-    return next((one.status for one in record.found if one.status != OK), good)
-
-
 def _records(study: Study[R, G], groups: Sequence[tuple[Task, ...]], given: G, jobs: Jobs | None) -> Iterator[R]:
     """Measure groups of tasks here, or by `jobs` on several processes or a cluster; yield their records as they end.
 
@@ -313,20 +302,21 @@ def _records(study: Study[R, G], groups: Sequence[tuple[Task, ...]], given: G, j
     """
     failed: set[str] = set()
     if jobs is None:
-        with _Here(study, given) as here:
+        with _measuring(study, given) as measure:
             for task in (task for group in groups for task in group if task.identity not in failed):
-                yield (record := here.record(task))
+                yield (record := measure(task))
                 failed |= set() if record.finished else {task.identity}
         return
     for of_round in _rounds(groups):
         parts = [tuple(task for task in group if task.identity not in failed) for group in of_round]
         parts = [part for part in parts if part]
-        for answer in jobs.answers(_measure_group, [(study, part, given) for part in parts]):
+        for answer in jobs.answers(functools.partial(_measure_group, study, given), parts):
             if answer is None:
                 continue
             number, found = answer
             if isinstance(found, Lost):
-                found = [record_of(study, t, [study.failed(t, "error", found.reason)]) for t in parts[number]]
+                lost = study.kind(ok=False, status="error", reason=found.reason)
+                found = [record_of(study, task, [lost]) for task in parts[number]]
             failed |= {record.task.identity for record in found if not record.finished}
             yield from found
 
@@ -342,34 +332,28 @@ def _rounds(groups: Sequence[tuple[Task, ...]]) -> list[list[tuple[Task, ...]]]:
     return [rounds[n] for n in sorted(rounds)]
 
 
-class _Here(Generic[R, G]):
-    """Measures tasks one after the other: in this process, or in another one where the study or a limit asks for it."""
+@contextlib.contextmanager
+def _measuring(study: Study[R, G], given: G) -> Iterator[Callable[[Task], R]]:
+    """Yield what measures a task and returns its record: here, or where study or limit ask for it in another process.
 
-    def __init__(self, study: Study[R, G], given: G) -> None:
-        self._study, self._given = study, given
-        host.commit()  # remembered: of the code that is loaded, not of what is committed meanwhile
-        # what a process leaves behind that is killed goes with the folder
-        self._folder = tempfile.TemporaryDirectory(prefix="ctsim-", ignore_cleanup_errors=True)
-        self._process = Process({"TMPDIR": self._folder.name, **study.environment(given)})
+    That one remembers what is compiled. What it leaves behind where it is killed goes with its folder.
+    """
+    host.commit()  # remembered: of the code that is loaded, not of what is committed meanwhile
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._process.close()
-        self._folder.cleanup()
-
-    def record(self, task: Task) -> R:
-        study, given = self._study, self._given
+    def record(task: Task) -> R:
         limit = study.limit(task, given)
         try:
             if limit is None and not study.apart:
-                found = study.measure(task, given)
-            else:
-                found = self._process.run(study.measure, task, given, seconds=limit)
+                return record_of(study, task, study.measure(task, given))
+            return record_of(study, task, process.run(study.measure, task, given, seconds=limit))
         except Stopped as end:
-            found = [study.failed(task, end.status, str(end))]
-        return record_of(study, task, found)
+            return record_of(study, task, [study.kind(ok=False, status=end.status, reason=str(end))])
+
+    with (
+        tempfile.TemporaryDirectory(prefix="ctsim-", ignore_cleanup_errors=True) as folder,
+        Process({"TMPDIR": folder, **study.environment(given)}) as process,
+    ):
+        yield record
 
 
 def record_of(study: Study[R, Any], task: Task, found: Sequence[Any]) -> R:
@@ -378,27 +362,21 @@ def record_of(study: Study[R, Any], task: Task, found: Sequence[Any]) -> R:
     return study.record(task=study.recorded(task), found=tuple(found), host=host.host(), commit=host.commit(), time=now)
 
 
-def _measure_group(job: tuple[Study[R, G], tuple[Task, ...], G]) -> list[R]:
-    """Be a worker: measure a group of tasks."""
-    study, group, given = job
-    here = _here(type(study), given)
-    return [here.record(task) for task in group]
+_measures: dict[Any, Callable[[Task], Any]] = {}
+_opened = contextlib.ExitStack()
 
 
-_heres: dict[Any, _Here[Any, Any]] = {}
-
-
-def _here(study: type[Study[Any, Any]], given: Any) -> _Here[Any, Any]:
-    """Return what measures in this process, whose own process remembers what is compiled.
+def _measure_group(study: Study[R, G], given: G, group: tuple[Task, ...]) -> list[R]:
+    """Be a worker: measure a group of tasks.
 
     A worker of Dask lives on: what measured for another command is closed.
     """
-    if (study, given) not in _heres:
-        for here in _heres.values():
-            here.__exit__()
-        _heres.clear()
-        _heres[study, given] = _Here(study(), given)
-    return _heres[study, given]
+    who = type(study), given
+    if who not in _measures:
+        _opened.close()
+        _measures.clear()
+        _measures[who] = _opened.enter_context(_measuring(study, given))
+    return [_measures[who](task) for task in group]
 
 
 def listing(study: Study[R, G], left: Sequence[Task], records: Sequence[R], given: G, n_all: int) -> str:
@@ -409,15 +387,13 @@ def listing(study: Study[R, G], left: Sequence[Task], records: Sequence[R], give
         once = known[task.row] if task.row in known else study.expected(task, given)
         lines.setdefault(study.line(task), []).append(once)
     wide, long = (max((len(line[k]) for line in lines), default=0) for k in (0, 1))
-    out = []
+    out, total = [], 0.0
     for (name, more), seconds in lines.items():
         times = [s for s in seconds if s is not None]
-        total = human_time(sum(times)) if times else "unknown"
-        out.append(f"{name:{wide}}  {more:{long}}  {f'{len(seconds)} x ' if len(seconds) > 1 else ''}{total}")
-    every = [s for seconds in lines.values() for s in seconds]
-    unknown = [name for (name, _), seconds in lines.items() if None in seconds]
-    out.append(
-        f"total: {len(left)} of {n_all} {study.unit}s, {human_time(sum(s for s in every if s is not None))}, "
-        f"{study.estimate}" + (f"; never measured: {', '.join(dict.fromkeys(unknown))}" if unknown else "")
-    )
+        total += sum(times)
+        count = f"{len(seconds)} x " if len(seconds) > 1 else ""
+        out.append(f"{name:{wide}}  {more:{long}}  {count}{human_time(sum(times)) if times else 'unknown'}")
+    unknown = dict.fromkeys(name for (name, _), seconds in lines.items() if None in seconds)
+    never = f"; never measured: {', '.join(unknown)}" if unknown else ""
+    out.append(f"total: {len(left)} of {n_all} {study.unit}s, {human_time(total)}, {study.estimate}{never}")
     return "\n".join(out) + "\n"

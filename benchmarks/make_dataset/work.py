@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from ctsim.benchmarks.engine.compiling import announced
-from ctsim.benchmarks.engine.dask import open_jobs
+from ctsim.benchmarks.engine.host import open_jobs
 from ctsim.benchmarks.engine.process import TICK, Jobs, Lost
 from ctsim.benchmarks.engine.terminal import Bar
 from ctsim.benchmarks.make_dataset import Options

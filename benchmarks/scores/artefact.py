@@ -12,10 +12,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from ctsim.benchmarks.scores.metrics import Mask
-from ctsim.benchmarks.scores.protocol import Score, Stored, Truth
+from ctsim.benchmarks.scores.metrics import Mask, box_around
+from ctsim.benchmarks.scores.protocol import Truth
+from ctsim.benchmarks.scores.score import COLUMNS, NO_TWIN, Score
 from ctsim.errors import InputError
+from ctsim.materials import attenuation
+from ctsim.store import StoredScan
 
 NEAR = 5.0
 """Tissue up to this distance from the metal (mm, between voxel centres) is near."""
@@ -24,15 +28,11 @@ ROI_MARGIN = 2
 MIN_VOXELS = 64
 MAX_PIECES = 32
 BINS = 3
-METRICS = ("roi_std", "cupping", "streak", "rmse", "rmse_near", "rmse_far")
 REGION = (
     "homogeneous ROIs, lines between metal pieces, and the tissue within 5 mm of the metal and beyond, "
     "all outside the metal dilated by 2 voxels"
 )
 REFERENCE = "the metal-free scan reconstructed by the same method"
-NO_TWIN = "the scan has no metal-free twin"
-NOT_ASKED = "the metal-free twin was not to be reconstructed"
-TWIN_ENDED = "the run on the metal-free twin ended as"
 _EVERY_WAY = np.ones((3, 3, 3), bool)
 
 
@@ -67,14 +67,12 @@ class Layout:
     note: str
 
 
-def water_attenuation(stored: Stored) -> float | None:
+def water_attenuation(stored: StoredScan) -> float | None:
     """Return μ of water in 1/mm under the scan's effective spectrum; None where its spectrum is not stored.
 
     ω(E) ∝ signal(E)·exp(−μ_water(E)·L0), the weights of the effective-spectrum reference. Raises
     InputError where spectrum.csv is damaged.
     """
-    from ctsim.materials import attenuation
-
     path = stored.folder / "spectrum.csv"
     if not path.is_file():
         return None
@@ -91,7 +89,7 @@ def water_attenuation(stored: Stored) -> float | None:
     return float(np.average(mu, weights=weights))
 
 
-def layout_of(stored: Stored, truth: Truth) -> Layout:
+def layout_of(stored: StoredScan, truth: Truth) -> Layout:
     """Choose the ROIs and lines of a scan from its labels and its metal; nothing depends on a method."""
     rois, small = homogeneous(np.asarray(stored.labels), truth, stored.info.materials)
     lines, n_pairs, cut = metal_lines(truth)
@@ -124,8 +122,6 @@ def homogeneous(labels: NDArray[Any], truth: Truth, names: tuple[str, ...]) -> t
     A voxel is homogeneous where all labels within 2 voxels, diagonals included, are its own, and it is
     outside the dilated metal. What lies at the volume's edge does not count.
     """
-    from scipy import ndimage
-
     size = 2 * ROI_MARGIN + 1
     low = ndimage.minimum_filter(labels, size, mode="constant", cval=0)
     alike = np.where((low == ndimage.maximum_filter(labels, size)) & truth.tissue, low, 0)
@@ -143,8 +139,6 @@ def homogeneous(labels: NDArray[Any], truth: Truth, names: tuple[str, ...]) -> t
 
 def _pieces(mask: Mask) -> NDArray[np.int32]:
     """Give every piece of a mask a number from 1 on; what shares a face, edge or corner is one piece."""
-    from scipy import ndimage
-
     pieces = np.zeros(mask.shape, np.int32)
     ndimage.label(mask, structure=_EVERY_WAY, output=pieces)
     return pieces
@@ -152,9 +146,7 @@ def _pieces(mask: Mask) -> NDArray[np.int32]:
 
 def _roi(mask: Mask, material: str, d_voxel: tuple[float, float, float]) -> Roi:
     """Split a region into thirds by depth, the distance (mm) to the nearest voxel outside it."""
-    from scipy import ndimage
-
-    box = ndimage.find_objects(mask.astype(np.uint8))[0]
+    box = box_around(mask)
     inside = np.pad(mask[box], 1)  # the box is tight: its rim is outside the region
     depth = np.asarray(ndimage.distance_transform_edt(inside, sampling=d_voxel))[1:-1, 1:-1, 1:-1][mask[box]]
     voxels = np.flatnonzero(mask)
@@ -176,8 +168,6 @@ def metal_lines(truth: Truth) -> tuple[tuple[NDArray[np.float64], ...], int, str
 
     Points stand half the smallest voxel apart; those whose nearest voxel is not judged tissue are left out.
     """
-    from scipy import ndimage
-
     pieces = _pieces(truth.metal)
     sizes = np.bincount(pieces.ravel())[1:]
     n = sizes.size
@@ -197,13 +187,9 @@ def metal_lines(truth: Truth) -> tuple[tuple[NDArray[np.float64], ...], int, str
 
 def near_metal(truth: Truth) -> Mask:
     """Return the tissue whose voxel centres are within 5 mm of the centre of a metal voxel."""
-    from scipy import ndimage
-
     near = np.zeros_like(truth.metal)
     if truth.metal.any():
-        tight = ndimage.find_objects(truth.metal.astype(np.uint8))[0]
-        reach = [math.ceil(NEAR / d) + 1 for d in truth.d_voxel]
-        box = tuple(slice(max(0, s.start - r), s.stop + r) for s, r in zip(tight, reach, strict=True))
+        box = box_around(truth.metal, [math.ceil(NEAR / d) + 1 for d in truth.d_voxel])
         distance = np.asarray(ndimage.distance_transform_edt(~truth.metal[box], sampling=truth.d_voxel))
         near[box] = distance <= NEAR * (1 + 1e-9)  # a sum of voxel sizes may round either way
     return near & truth.tissue
@@ -216,7 +202,7 @@ def artefact_score(
 
     HU = 1000·μ/μ_water, of differences; `cupping` is in percentage points.
     """
-    found: dict[str, float | None] = dict.fromkeys(METRICS)
+    found: dict[str, float | None] = dict.fromkeys(COLUMNS["artefact"])
     if twin is not None and twin.shape != values.shape:
         raise InputError(f"the volume has shape {values.shape}, the twin's {twin.shape}")
     if twin is not None and layout.water:
@@ -271,18 +257,7 @@ def cupping_index(values: NDArray[Any], roi: Roi) -> float | None:
 
 def line_mean(difference: NDArray[np.float64], points: NDArray[np.float64]) -> float:
     """Return the mean along a line of points (z, y, x in voxels), interpolated linearly; signed."""
-    from scipy import ndimage
-
     return float(np.mean(ndimage.map_coordinates(difference, points.T, order=1, mode="nearest")))
-
-
-def lacks_twin(scores: dict[str, Score]) -> bool:
-    """Say whether a volume was scored without its twin although there may be one, so that it is to be done again.
-
-    A method that gave a reason to skip the twin would skip it again.
-    """
-    note = scores["artefact"].note if "artefact" in scores else ""
-    return note == NOT_ASKED or (note.startswith(TWIN_ENDED) and not note.startswith(f"{TWIN_ENDED} skipped"))
 
 
 def rms(numbers: list[float]) -> float | None:

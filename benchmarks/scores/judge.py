@@ -6,9 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.benchmarks.scores.artefact import NO_TWIN, Layout, artefact_score, layout_of
+from ctsim.benchmarks.scores.artefact import Layout, artefact_score, layout_of
+from ctsim.benchmarks.scores.metrics import METAL
 from ctsim.benchmarks.scores.projection import HeldOut, held_out, projection_score, with_floor
-from ctsim.benchmarks.scores.protocol import Score, Stored, Truth, evaluate, no_metal_score, truth_of
+from ctsim.benchmarks.scores.protocol import Stored, Truth, evaluate, truth_of
+from ctsim.benchmarks.scores.score import NO_TWIN, Score
 from ctsim.notes import NOT_ON_GRID
 
 
@@ -50,7 +52,7 @@ class Judge:
         if variant == "metal":
             scores["projection"] = projection_score(values, self.views, at_50kev)
         if variant == "metal" and self.absent:
-            scores["metal"] = no_metal_score(self.absent)
+            scores["metal"] = Score.none("metal", METAL, self.absent)
             scores["artefact"] = artefact_score(values, None, self.layout, self.truth, self.absent)
         elif variant == "metal" and self.truth.metal.any():
             scores["artefact"] = artefact_score(values, twin.values, self.layout, self.truth, twin.reason)

@@ -2,18 +2,33 @@
 
 Volumes are [z, y, x] in 1/mm. The data range is always an argument, never taken from a dtype. A
 metric that does not exist (identical volumes, an empty region) is None, never infinity or NaN.
+
+SSIM: Wang et al., IEEE TIP 13 (2004) 600, doi:10.1109/TIP.2003.819861, of every slice along each of the three axes:
+Gaussian weights with σ = 1.5 on an 11 × 11 window, population covariance, K1 = 0.01, K2 = 0.03. This equals
+scikit-image's `structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False)` slice by slice
+and is several times faster, because the five filtered images of a slice stay in the cache.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import KDTree
+from skimage.metrics import structural_similarity
 
+from ctsim.benchmarks.scores.kernels.ssim_cpu import slice_sums
 from ctsim.errors import InputError
 
 Array = NDArray[Any]
 Mask = NDArray[np.bool_]
+
+RADIUS = 5
+SIGMA = 1.5
+K1, K2 = 0.01, 0.03
+METAL = ("core_ratio", "dice", "boundary_rms")
 
 
 def _check(values: Array, reference: Array, region: Mask | None, data_range: float) -> None:
@@ -29,16 +44,18 @@ def _check(values: Array, reference: Array, region: Mask | None, data_range: flo
 
 def dilate(mask: Mask, steps: int) -> Mask:
     """Grow `mask` by `steps` voxels along every axis and diagonal (a cube of 2·steps + 1)."""
-    from scipy import ndimage
-
     return ndimage.maximum_filter(mask.astype(np.uint8), 2 * steps + 1, mode="constant", cval=0) > 0
 
 
 def erode(mask: Mask, steps: int = 1) -> Mask:
     """Shrink `mask` by `steps` voxels; the volume's edge does not count as outside."""
-    from scipy import ndimage
-
     return ndimage.minimum_filter(mask.astype(np.uint8), 2 * steps + 1, mode="nearest") > 0
+
+
+def box_around(mask: Mask, reach: int | Sequence[int] = 0) -> tuple[slice, ...]:
+    """Return the smallest box that holds `mask`, extended by `reach` voxels (one number, or one an axis)."""
+    tight = ndimage.find_objects(mask.astype(np.uint8))[0]
+    return tuple(slice(max(0, s.start - r), s.stop + r) for s, r in zip(tight, np.broadcast_to(reach, 3), strict=True))
 
 
 def mse3d(values: Array, reference: Array, region: Mask | None = None) -> float:
@@ -60,14 +77,48 @@ def psnr3d(values: Array, reference: Array, *, data_range: float, region: Mask |
     return psnr(mse3d(values, reference, region), data_range)
 
 
+def window() -> NDArray[np.float64]:
+    """Return the 11 Gaussian weights of the window; they sum to 1."""
+    offsets = np.arange(-RADIUS, RADIUS + 1)
+    weights = np.exp(-0.5 * (offsets / SIGMA) ** 2)
+    return weights / weights.sum()
+
+
+def border(n: int, mode: str) -> NDArray[np.int64]:
+    """Return the source index of each padded position of an axis of length `n`.
+
+    `mode` "mirror" repeats the edge sample (scipy's "reflect"); "zero" marks the outside with -1.
+    """
+    if mode == "zero":
+        return np.pad(np.arange(n), RADIUS, constant_values=-1)
+    return np.pad(np.arange(n), RADIUS, mode="symmetric")
+
+
+def ssim_along_axes(
+    values: Array, reference: Array, region: Mask, data_range: float, mode: str = "mirror"
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return, for slices normal to z, y and x, the sum of the SSIM map over `region` in each slice.
+
+    Slices outside the box around the region are left out with `mode` "mirror"; "zero" keeps all.
+    """
+    box = box_around(region, RADIUS) if mode == "mirror" else (slice(None),) * 3
+    arrays = [np.ascontiguousarray(a[box]) for a in (values, reference, region)]
+    constants = (K1 * data_range) ** 2, (K2 * data_range) ** 2
+    sums = []
+    for axis in range(3):
+        x, y, inside = (np.moveaxis(a, axis, 0) for a in arrays)
+        _, height, width = x.shape
+        borders = border(height, mode), border(width, mode)
+        sums.append(slice_sums(x, y, inside, window(), borders, constants))
+    return sums[0], sums[1], sums[2]
+
+
 def ssim3d(values: Array, reference: Array, *, data_range: float, region: Mask | None = None) -> float:
     """Return the SSIM map averaged over `region` and over slices along z, y and x.
 
     Outside the region the reconstruction is replaced by the reference before filtering, so that what
     is not judged cannot leak in through the window. Same numbers as scikit-image's slice-wise map.
     """
-    from ctsim.benchmarks.scores.ssim import ssim_along_axes
-
     _check(values, reference, region, data_range)
     if region is None:
         region = np.ones(values.shape, bool)
@@ -82,8 +133,6 @@ def ssim3d_r2(values: Array, reference: Array) -> float | None:
 
     Peak 1, zeros beyond the border of a slice, slices whose reference is nowhere positive left out.
     """
-    from ctsim.benchmarks.scores.ssim import ssim_along_axes
-
     _check(values, reference, None, 1.0)
     sums = ssim_along_axes(values, reference, np.ones(values.shape, bool), 1.0, mode="zero")
     means = []
@@ -99,8 +148,6 @@ def ssim3d_naf(values: Array, reference: Array) -> float | None:
 
     None for a volume with fewer than 7 voxels along an axis.
     """
-    from skimage.metrics import structural_similarity
-
     _check(values, reference, None, 2.0)
     if min(values.shape) < 7:
         return None
@@ -116,8 +163,6 @@ def least_squares_gain(values: Array, reference: Array, region: Mask) -> float |
 
 def surface(mask: Mask) -> Mask:
     """Return the voxels of `mask` that have one of six neighbours outside it."""
-    from scipy import ndimage
-
     return mask & ~np.asarray(ndimage.binary_erosion(mask, border_value=1), np.bool_)
 
 
@@ -126,8 +171,6 @@ def boundary_rms(found: Mask, truth: Mask, d_voxel: tuple[float, float, float]) 
 
     Distances run between surface voxel centres; None where either mask has no surface.
     """
-    from scipy.spatial import KDTree
-
     a, b = (np.argwhere(surface(m)) * np.asarray(d_voxel) for m in (found, truth))
     if len(a) == 0 or len(b) == 0:
         return None
@@ -139,9 +182,6 @@ def dice(found: Mask, truth: Mask) -> float | None:
     """Return 2·|A ∩ B| / (|A| + |B|); None if both are empty."""
     total = int(found.sum()) + int(truth.sum())
     return None if total == 0 else 2 * int((found & truth).sum()) / total
-
-
-METAL = ("core_ratio", "dice", "boundary_rms")
 
 
 def metal_metrics(

@@ -10,10 +10,20 @@ from typing import Any
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from ctsim.benchmarks.scores.protocol import AS_RETURNED, Score, Stored, Truth
+from ctsim import settings
+from ctsim.benchmarks.scores.protocol import Truth
+from ctsim.benchmarks.scores.score import AS_RETURNED, Score
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.materials import attenuation
+from ctsim.phantoms.scene import build, load_suite, stream_id
+from ctsim.plan import make_plan
+from ctsim.quadrature import effective_weights
+from ctsim.reconstruct.projector import forward_columns
+from ctsim.simulate import REFERENCE_KEV, simulate_views
+from ctsim.store import StoredScan
 
 N_VIEWS = 12
 MARGIN = 2
@@ -60,10 +70,8 @@ def half_way(geometry: Geometry) -> Geometry | str:
     return msgspec.structs.replace(geometry, n_views=len(picked), angles_deg=picked)
 
 
-def held_out(stored: Stored) -> HeldOut | str:
+def held_out(stored: StoredScan) -> HeldOut | str:
     """Simulate the held-out views of a scan, or say why there are none."""
-    from ctsim.phantoms.scene import load_suite
-
     views = half_way(stored.geometry)
     if isinstance(views, str):
         return views
@@ -84,19 +92,10 @@ def held_out(stored: Stored) -> HeldOut | str:
         return "there was not enough memory to simulate held-out views"
 
 
-def _simulated(scene: Any, geometry: Geometry, stored: Stored) -> HeldOut:
-    from scipy import ndimage
-
-    from ctsim.materials import attenuation
-    from ctsim.phantoms.scene import build, stream_id
-    from ctsim.plan import make_plan
-    from ctsim.quadrature import effective_weights
-    from ctsim.settings import Truth
-    from ctsim.simulate import REFERENCE_KEV, simulate_views
-
+def _simulated(scene: Any, geometry: Geometry, stored: StoredScan) -> HeldOut:
     phantom = build(scene)
     scanner = msgspec.structs.replace(scene.resolve(), geometry=geometry)
-    asked = Truth(twin=False, noise_free=True, paths=True, trace=True, mono_kev=(REFERENCE_KEV,))
+    asked = settings.Truth(twin=False, noise_free=True, paths=True, trace=True, mono_kev=(REFERENCE_KEV,))
     plan = make_plan(phantom, scanner, scene.simulation, asked, stream_id(scene))
     energies, weights = effective_weights(plan.spectrum, scanner.detector, stored.l0)
     mu = np.array([float(attenuation(m, energies) @ weights) for m in plan.materials[1:]])
@@ -144,8 +143,6 @@ def rmse_by_target(
 
 
 def _projected(values: NDArray[Any], held: HeldOut) -> NDArray[np.float32]:
-    from ctsim.reconstruct.projector import forward_columns
-
     return forward_columns(np.ascontiguousarray(values.transpose(1, 2, 0), np.float32), held.geometry)
 
 
@@ -160,15 +157,7 @@ def projection_score(values: NDArray[Any], held: HeldOut | str, at_50kev: NDArra
     """
     if isinstance(held, str):
         names = [f"{target}/{region}" for target in TARGETS for region in REGIONS]
-        return Score(
-            region=REGION,
-            reference="none",
-            alignment="none",
-            data_range=None,
-            n_voxels=0,
-            values=dict.fromkeys(names),
-            note=held,
-        )
+        return Score.none(REGION, names, held)
     return Score(
         region=REGION,
         reference=held.reference,

@@ -5,123 +5,23 @@ the numbers in the record and in the caption of every table.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any, Literal
 
-import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ctsim.benchmarks.scores import metrics
 from ctsim.benchmarks.scores.metrics import Mask
+from ctsim.benchmarks.scores.score import AS_RETURNED, AT_50KEV, Score
 from ctsim.errors import InputError
-
-if TYPE_CHECKING:
-    from ctsim.geometry import Geometry
-    from ctsim.scaninfo import ScanInfo
-    from ctsim.types import Scan
-
-VERSION = 3
-"""Part of every run's identity: a change of the protocol's meaning counts it up.
-
-1: tissue, aligned, paper, metal, cost. 2: every method runs on the metal-free twin too, for `artefact`.
-3: `projection`, and `rmse` of `artefact`. The version was not raised for `at_energy`: only new code has it, and code is
-part of the identity.
-"""
+from ctsim.store import StoredScan as Stored
 
 METAL_MARGIN = 2
 BODY_MARGIN = 4
 RANGE_PERCENTILE = 99.9
 ReferenceKind = Literal["effective", "50kev"]
-AS_RETURNED, AT_50KEV = "as returned", "read at 50 keV"
 TISSUE = "inside the body dilated by 4 voxels, outside the metal dilated by 2"
-
-
-class Stored(Protocol):
-    """What the benchmark needs of a scan on disk; `ctsim.store.StoredScan` has it."""
-
-    @property
-    def folder(self) -> Path:
-        """The scan's folder."""
-        ...
-
-    @property
-    def name(self) -> str:
-        """The scene's name."""
-        ...
-
-    @property
-    def scene_id(self) -> str:
-        """The hash of the recipe."""
-        ...
-
-    @property
-    def content_hash(self) -> str:
-        """The hash of the files."""
-        ...
-
-    @property
-    def code(self) -> str:
-        """The hash of the code that made the files."""
-        ...
-
-    @property
-    def scan(self) -> "Scan":
-        """What a method gets."""
-        ...
-
-    @property
-    def geometry(self) -> "Geometry":
-        """The scan's geometry."""
-        ...
-
-    @property
-    def info(self) -> "ScanInfo":
-        """What scan.json says."""
-        ...
-
-    @property
-    def labels(self) -> NDArray[np.uint8]:
-        """Material labels, 0 is air: [z, y, x]."""
-        ...
-
-    @property
-    def metal(self) -> NDArray[np.uint8]:
-        """1 in the metal, [z, y, x]."""
-        ...
-
-    @property
-    def l0(self) -> float:
-        """The water path in mm that the effective-spectrum reference was hardened by."""
-        ...
-
-    @property
-    def metal_free(self) -> "Stored | None":
-        """The same scan without its metal."""
-        ...
-
-    def reference(self, which: str) -> NDArray[np.float32]:
-        """Return the reference volume "effective" or "50kev", [z, y, x] in 1/mm."""
-        ...
-
-
-class Score(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The scores under one protocol, with all that is needed to read them.
-
-    `data_range` is 1/mm; `values` maps a metric to its number, or to None where it does not exist; `volume` says which
-    of a method's volumes was scored.
-    """
-
-    region: str
-    reference: str
-    alignment: str
-    data_range: float | None
-    n_voxels: int
-    values: dict[str, float | None]
-    identical: bool = False
-    note: str = ""
-    volume: str = AS_RETURNED
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -245,19 +145,6 @@ def metal_score(values: NDArray[Any], truth: Truth) -> Score:
         n_voxels=int(truth.metal.sum()),
         values=metrics.metal_metrics(values, reference, truth.metal, truth.judged, truth.d_voxel),
         note="" if cored else "the metal is too thin to be eroded: its core is all of it",
-    )
-
-
-def no_metal_score(reason: str) -> Score:
-    """Return the score under `metal` of a scan whose scene holds metal that it lacks: no numbers, and why."""
-    return Score(
-        region="metal",
-        reference="none",
-        alignment="none",
-        data_range=None,
-        n_voxels=0,
-        values=dict.fromkeys(metrics.METAL),
-        note=reason,
     )
 
 

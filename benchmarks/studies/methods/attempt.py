@@ -1,28 +1,36 @@
-"""One run of a method in this process: warmed up, measured, and whatever happens turned into an outcome."""
+"""One run of a method in this process: warmed up, measured, and whatever happens turned into an outcome.
 
+Runs that share a process are kept apart: each has its own view of the data and leaves nothing behind (`restored`).
+"""
+
+import contextlib
 import dataclasses
+import gc
 import logging
+import os
+import random
+import signal
+import sys
 import time
+import warnings
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
+import numba
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ctsim.benchmarks.engine.host import measured
 from ctsim.benchmarks.methods import Method
-from ctsim.benchmarks.scores.protocol import Stored
-from ctsim.benchmarks.studies.methods import details, intermediates
-from ctsim.benchmarks.studies.methods.intermediates import Intermediates
-from ctsim.benchmarks.studies.methods.own import changed, restored
-from ctsim.benchmarks.studies.methods.records import Cost
+from ctsim.benchmarks.studies.methods.records import METAL, Cost
+from ctsim.benchmarks.studies.methods.volumes import Intermediates, attached, recordable
 from ctsim.errors import InputError
-
-if TYPE_CHECKING:
-    import torch
-
-    from ctsim.types import Scan, Volume
+from ctsim.simulate import REFERENCE_KEV
+from ctsim.store import StoredScan
+from ctsim.types import Scan, Status, Volume
 
 log = logging.getLogger(__name__)
 
@@ -35,8 +43,7 @@ class Outcome:
     """How a run ended: its status and reason, the volume [z, y, x] float32 in 1/mm if any, and its cost.
 
     `at_50kev` is the volume at 50 keV of a method that knows energies.
-    `intermediates` are what the method worked with, for pictures (`.intermediates`); `details` what it
-    says of its result, for the record (`.details`).
+    `intermediates` are what the method worked with, for pictures; `details` what it says of its result, for the record.
     """
 
     status: str
@@ -47,24 +54,26 @@ class Outcome:
     intermediates: Intermediates = field(default_factory=dict)
     details: dict[str, Any] = field(default_factory=dict)
 
+    def fail(self, status: str, reason: str) -> None:
+        """Replace the volumes by a status and its reason."""
+        self.status, self.reason, self.values, self.at_50kev = status, reason, None, None
 
-def scan_for(method: Method, stored: Stored, variant: str) -> "Scan":
+
+def scan_for(method: Method, stored: StoredScan, variant: str) -> Scan:
     """Return the scan itself or its twin without metal; with the true mask where the method's is "oracle".
 
     Its arrays are nobody else's. Raises InputError where there is no twin. The twin's true mask is empty.
     """
-    found = stored if variant == "metal" else stored.metal_free
+    found = stored if variant == METAL else stored.metal_free
     if found is None:
         raise InputError(f"scan {stored.name!r} has no metal-free twin")
     if method.mask != "oracle":
         return found.scan
-    import torch
-
     metal = np.asarray(stored.metal) > 0
-    return dataclasses.replace(found.scan, metal=torch.from_numpy(metal & (variant == "metal")))
+    return dataclasses.replace(found.scan, metal=torch.from_numpy(metal & (variant == METAL)))
 
 
-def run_here(stored: Stored, variant: str, method: Method, warm_up_seconds: float) -> Outcome:
+def run_here(stored: StoredScan, variant: str, method: Method, warm_up_seconds: float) -> Outcome:
     """Run a method in this process on a view of the scan that is its own; that it changed its input is its error."""
     try:
         scan = scan_for(method, stored, variant)
@@ -74,13 +83,12 @@ def run_here(stored: Stored, variant: str, method: Method, warm_up_seconds: floa
         return Outcome(status="error", reason=describe(error))
     if parts:
         what = f"the method changed its input ({parts}): expected it to work on a copy"
-        outcome.reason = what if outcome.status in (*SCORED, "nonfinite") else f"{outcome.reason}; {what}"
-        outcome.status, outcome.values, outcome.at_50kev = "error", None, None
+        outcome.fail("error", what if outcome.status in (*SCORED, "nonfinite") else f"{outcome.reason}; {what}")
         outcome.intermediates, outcome.details = {}, {}
     return outcome
 
 
-def skip(method: Method, stored: Stored, variant: str) -> Outcome | None:
+def skip(method: Method, stored: StoredScan, variant: str) -> Outcome | None:
     """Ask a method why it would rather not run; None where it runs."""
     try:
         scan = scan_for(method, stored, variant)
@@ -104,7 +112,7 @@ def describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
-def attempt(method: Method, scan: "Scan", warm_up_seconds: float) -> Outcome:
+def attempt(method: Method, scan: Scan, warm_up_seconds: float) -> Outcome:
     """Run a method in this process and turn whatever happens into an outcome; only Ctrl-C is passed on."""
     outcome, usage, view_updates = Outcome(status="error"), None, 0
     try:
@@ -115,8 +123,8 @@ def attempt(method: Method, scan: "Scan", warm_up_seconds: float) -> Outcome:
             view_updates = int(volume.details.get("view_updates", scan.geometry.n_views))
             outcome.status, outcome.reason = str(volume.status), volume.reason
             outcome.values = _array(volume.values)
-            outcome.intermediates = intermediates.taken(volume.details, scan.geometry)
-            outcome.details = details.kept(volume.details)
+            outcome.intermediates = attached(volume.details, scan.geometry)
+            outcome.details = recordable(volume.details)
             if outcome.status in SCORED:
                 _read_at_50kev(outcome, volume)
     except KeyboardInterrupt:
@@ -138,10 +146,6 @@ def attempt(method: Method, scan: "Scan", warm_up_seconds: float) -> Outcome:
 
 def _check(volume: Any) -> None:
     """Raise InputError unless a method returned a volume of real numbers that ended in a way that there is."""
-    import torch
-
-    from ctsim.types import Status, Volume
-
     if not isinstance(volume, Volume):
         raise _NoVolume(f"the method returned a {_kind(volume)}, expected a ctsim.types.Volume")
     if not isinstance(volume.values, torch.Tensor):
@@ -161,18 +165,15 @@ def _kind(value: object) -> str:
     return type(value).__name__ if module == "builtins" else f"{module}.{type(value).__name__}"
 
 
-def _read_at_50kev(outcome: Outcome, volume: "Volume") -> None:
+def _read_at_50kev(outcome: Outcome, volume: Volume) -> None:
     """Add the volume at 50 keV where the method knows energies; what goes wrong there is the run's failure."""
-    from ctsim.simulate import REFERENCE_KEV
-
     try:
         outcome.at_50kev = None if volume.at_energy is None else _array(volume.at_energy(REFERENCE_KEV))
     except KeyboardInterrupt:
         raise
     except BaseException as error:
         failed = _failure(error)
-        outcome.values = None
-        outcome.status, outcome.reason = failed.status, f"the volume at 50 keV: {failed.reason}"
+        outcome.fail(failed.status, f"the volume at 50 keV: {failed.reason}")
 
 
 def _failure(error: BaseException) -> Outcome:
@@ -189,20 +190,19 @@ def checked(outcome: Outcome, shape: tuple[int, int, int]) -> Outcome:
         if values is None or outcome.status not in SCORED:
             continue
         if values.shape != shape:
-            outcome.status, outcome.values, outcome.at_50kev = "error", None, None
-            outcome.reason = f"the {what} has shape {values.shape}, the geometry says {shape}"
+            outcome.fail("error", f"the {what} has shape {values.shape}, the geometry says {shape}")
         elif not (finite := np.isfinite(values)).all():
             outcome.status = "nonfinite"
             outcome.reason = f"{int((~finite).sum())} of {values.size} voxels of the {what} are not finite"
     return outcome
 
 
-def _array(volume: "torch.Tensor") -> NDArray[np.float32]:
+def _array(volume: torch.Tensor) -> NDArray[np.float32]:
     """Return a copy: a method may use its memory again while the twin's volume waits for the scan's."""
     return np.array(volume.detach().cpu().numpy(), np.float32)
 
 
-def warm_up(method: Method, scan: "Scan") -> float:
+def warm_up(method: Method, scan: Scan) -> float:
     """Run the method on a tiny scan of the same kind, so that compiling is not timed; return its seconds.
 
     A method that can be told how many seconds it may take gets one, again until it needs no more: what it did not get
@@ -227,7 +227,7 @@ def warm_up(method: Method, scan: "Scan") -> float:
     return usage.wall
 
 
-def tiny(scan: "Scan") -> "Scan":
+def tiny(scan: Scan) -> Scan:
     """Return a scan of the first 8 views of `scan` and 8 whole slices of its volume.
 
     The counts are a view into the scan's own and the slices keep their size, so that kernels are
@@ -247,3 +247,80 @@ def tiny(scan: "Scan") -> "Scan":
         most = int(np.argmax(np.convolve(per_slice, np.ones(height, per_slice.dtype), "valid")))
         more["metal"] = scan.metal[most : most + height]
     return dataclasses.replace(scan, **more, geometry=msgspec.structs.replace(g, **changes), counts=scan.counts[:n])
+
+
+Setting = tuple[Callable[[], Any], Callable[[Any], object]]
+
+
+@contextlib.contextmanager
+def restored() -> Iterator[None]:
+    """Put back, when the block ends, what a process has one of: the work folder, threads, defaults, random states.
+
+    The environment and the filters of warnings are among it. What a block imports or starts stays.
+    """
+    settings = _settings()
+    before, environment = [get() for get, _ in settings], dict(os.environ)
+    with warnings.catch_warnings(), np.errstate():
+        try:
+            yield
+        finally:
+            for (get, put), value in zip(settings, before, strict=True):
+                with contextlib.suppress(OSError):  # a folder that is gone
+                    if get() != value:
+                        put(value)
+            for name in os.environ.keys() - environment.keys():
+                del os.environ[name]
+            os.environ.update({k: v for k, v in environment.items() if os.environ.get(k) != v})
+
+
+def _settings() -> tuple[Setting, ...]:
+    numpy_state, torch_state = np.random.get_state, torch.get_rng_state
+    return (
+        (_folder, os.chdir),
+        (numba.get_num_threads, numba.set_num_threads),
+        (torch.get_num_threads, torch.set_num_threads),
+        (torch.get_default_device, lambda to: torch.set_default_device(None if to.type == "cpu" else to)),
+        (torch.get_default_dtype, torch.set_default_dtype),
+        (torch.is_grad_enabled, torch.set_grad_enabled),
+        (torch.are_deterministic_algorithms_enabled, torch.use_deterministic_algorithms),
+        (random.getstate, random.setstate),
+        (lambda: _plain(numpy_state()), np.random.set_state),
+        (lambda: torch_state().tolist(), lambda state: torch.set_rng_state(torch.tensor(state, dtype=torch.uint8))),
+        (sys.getrecursionlimit, sys.setrecursionlimit),
+        (lambda: signal.getsignal(signal.SIGINT), lambda handler: signal.signal(signal.SIGINT, handler)),
+        (gc.isenabled, lambda enabled: gc.enable() if enabled else gc.disable()),
+        (lambda: sys.stdout, lambda stream: setattr(sys, "stdout", stream)),
+        (lambda: sys.stderr, lambda stream: setattr(sys, "stderr", stream)),
+    )
+
+
+def _folder() -> str:
+    try:
+        return os.getcwd()
+    except FileNotFoundError:
+        return ""
+
+
+def _plain(state: Any) -> tuple[Any, ...]:
+    name, keys, *rest = state
+    return name, keys.tolist(), *rest
+
+
+def changed(scan: Scan, fresh: Scan) -> list[str]:
+    """Return the names of the parts of a scan that are not those of `fresh`, bit by bit."""
+    names = [field.name for field in dataclasses.fields(scan)]
+    return [name for name in names if not _same(getattr(scan, name), getattr(fresh, name))]
+
+
+def _same(one: Any, other: Any) -> bool:
+    if not (isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor)):
+        return type(one) is type(other) and one == other
+    if one.dtype != other.dtype or one.shape != other.shape:
+        return False
+    # a view at a time: the comparison takes an array of truths; as bytes: NaN is equal to itself
+    pairs = zip(one.detach().numpy(), other.detach().numpy(), strict=True)
+    return all(np.array_equal(_bytes(a), _bytes(b)) for a, b in pairs)
+
+
+def _bytes(array: Any) -> Any:
+    return np.ascontiguousarray(array).reshape(-1).view(np.uint8)

@@ -12,9 +12,9 @@ from rich.text import Text
 from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.terminal import WIDEST, rendered
 from ctsim.benchmarks.engine.texts import one_line, ranked
-from ctsim.benchmarks.scores.columns import COLUMNS
+from ctsim.benchmarks.scores.score import COLUMNS
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest
-from ctsim.benchmarks.studies.methods.summary import Numbers, numbers
+from ctsim.benchmarks.studies.methods.tables import Numbers, numbers
 
 PROTOCOL = "tissue"
 SHOWN = ((PROTOCOL, "psnr3d", 5), (PROTOCOL, "ssim3d", 5), ("cost", "wall", 6))

@@ -1,7 +1,7 @@
 """One picture a scene: every method's volume in one window, its signed error on one scale, and what it worked with.
 
 Rows are the reference and the methods. Columns are a slice normal to z and one normal to y, their errors against the
-effective-spectrum reference, and, where a method attached them (`.intermediates`), the projection that
+effective-spectrum reference, and, where a method attached them (`.volumes`), the projection that
 it backprojected with the metal's trace, and its prior.
 """
 
@@ -19,16 +19,24 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
+from PIL import Image
 
 from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.texts import pictured
 from ctsim.benchmarks.scores.artefact import water_attenuation
-from ctsim.benchmarks.scores.protocol import Stored, Truth, truth_of
-from ctsim.benchmarks.studies.methods import intermediates
-from ctsim.benchmarks.studies.methods.intermediates import Intermediates
+from ctsim.benchmarks.scores.protocol import Truth, truth_of
 from ctsim.benchmarks.studies.methods.records import RunRecord, latest
-from ctsim.benchmarks.studies.methods.volumes import identity_of, map_volume
+from ctsim.benchmarks.studies.methods.volumes import (
+    Intermediates,
+    identity_of,
+    intermediates_of,
+    map_volume,
+    read_intermediates,
+)
 from ctsim.durable import replacing, sync
+from ctsim.reconstruct.log import line_integrals
+from ctsim.reconstruct.projector import forward_columns
+from ctsim.store import StoredScan
 
 PLANES = ((0, "z"), (1, "y"))
 TOP, ERROR = 2.5, 1.0
@@ -66,7 +74,7 @@ def cut(metal: NDArray[np.bool_], body: NDArray[np.bool_]) -> tuple[int, int, in
     return z, y, x
 
 
-def write_panels(records: Sequence[RunRecord], scans: list[Stored], results: Path) -> list[Path]:
+def write_panels(records: Sequence[RunRecord], scans: list[StoredScan], results: Path) -> list[Path]:
     """Draw panels/SCENE.png for every scan that has kept volumes; return what was written.
 
     A picture holds a digest of the runs and files that it shows (`_digest`); where they are the same it stays.
@@ -91,17 +99,17 @@ def write_panels(records: Sequence[RunRecord], scans: list[Stored], results: Pat
 
 
 def _row(record: RunRecord, path: Path) -> Row:
-    shown = intermediates.read(intermediates.path_of(path), record.identity)
+    shown = read_intermediates(intermediates_of(path), record.identity)
     return Row(caption=_caption(record), volume=map_volume(path), shown=shown)
 
 
-def _digest(stored: Stored, kept: list[tuple[RunRecord, Path]]) -> str:
+def _digest(stored: StoredScan, kept: list[tuple[RunRecord, Path]]) -> str:
     """Hash what a picture depends on: the scan, the runs with their scores, their files, and how it is drawn.
 
     A file counts by its size and time: a run that is done again has the same identity.
     """
     rows = [
-        (record.identity, _caption(record), [_stamp(file) for file in (path, intermediates.path_of(path))])
+        (record.identity, _caption(record), [_stamp(file) for file in (path, intermediates_of(path))])
         for record, path in kept
     ]
     what = (stored.name, stored.content_hash, rows, matplotlib.__version__, Path(__file__).read_text(encoding="utf-8"))
@@ -118,8 +126,6 @@ def _stamp(path: Path) -> tuple[int, int] | None:
 
 def _held(picture: Path) -> str | None:
     """Return the digest that a picture holds; None where there is none, or no picture."""
-    from PIL import Image
-
     try:
         with Image.open(picture) as image:
             return image.info.get(KEY)
@@ -146,7 +152,7 @@ def look_of(truth: Truth, measured: NDArray[Any] | None, shadow: NDArray[np.bool
     return Look(top=TOP * middle, error=ERROR * middle, projection=max(highest, 1e-3), water=water)
 
 
-def draw(stored: Stored, truth: Truth, rows: list[Row]) -> Figure:
+def draw(stored: StoredScan, truth: Truth, rows: list[Row]) -> Figure:
     """Draw the reference and each row: volumes in one window, errors on one scale, colourbars below."""
     worked = any(r.shown for r in rows)
     view = next((int(r.shown["view"]) for r in rows if "view" in r.shown), None)
@@ -176,18 +182,15 @@ def draw(stored: Stored, truth: Truth, rows: list[Row]) -> Figure:
     return figure
 
 
-def _measured(stored: Stored, view: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _measured(stored: StoredScan, view: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return −ln(counts/open) of a view, and where the true metal's shadow lies (Joseph's rule), both [v, u]."""
-    from ctsim.reconstruct.log import line_integrals
-    from ctsim.reconstruct.projector import forward_columns
-
     metal = np.ascontiguousarray((np.asarray(stored.metal) > 0).transpose(1, 2, 0), np.float32)
     return line_integrals(stored.scan, view)[0].numpy(), forward_columns(metal, stored.geometry, [view])[0] > 0
 
 
 def _slices(axes: NDArray[Any], volume: NDArray[Any], truth: Truth, at: tuple[int, int, int], look: Look) -> None:
     for k, (axis, _) in enumerate(PLANES):
-        _slice(axes[k], np.take(volume, at[axis], axis), truth, axis, at[axis], (0.0, look.top, "gray"))
+        _slice(axes[k], np.take(volume, at[axis], axis), truth, axis, at, cmap="gray", vmin=0.0, vmax=look.top)
 
 
 def _errors(axes: NDArray[Any], volume: NDArray[Any], truth: Truth, at: tuple[int, int, int], look: Look) -> None:
@@ -197,18 +200,15 @@ def _errors(axes: NDArray[Any], volume: NDArray[Any], truth: Truth, at: tuple[in
             np.take(v, at[axis], axis) for v in (volume, truth.references["effective"], truth.metal)
         )
         error = np.ma.masked_where(metal, image - reference)
-        _slice(axes[k], error, truth, axis, at[axis], (-look.error, look.error, "RdBu_r"))
+        _slice(axes[k], error, truth, axis, at, cmap="RdBu_r", vmin=-look.error, vmax=look.error)
 
 
-def _slice(
-    axes: Axes, image: NDArray[Any], truth: Truth, axis: int, index: int, look: tuple[float, float, str]
-) -> None:
+def _slice(axes: Axes, image: NDArray[Any], truth: Truth, axis: int, at: tuple[int, int, int], **window: Any) -> None:
     """Show one slice at true proportions, the metal's outline over it; row 0 is at the bottom."""
-    low, high, colours = look
     d_v, d_u = (d for a, d in enumerate(truth.d_voxel) if a != axis)
-    axes.imshow(image, cmap=colours, vmin=low, vmax=high, origin="lower", aspect=d_v / d_u, interpolation="nearest")
+    axes.imshow(image, origin="lower", aspect=d_v / d_u, interpolation="nearest", **window)
     axes.set_facecolor(UNJUDGED)
-    _outline(axes, np.take(truth.metal, index, axis))
+    _outline(axes, np.take(truth.metal, at[axis], axis))
     axes.set(xticks=[], yticks=[])
 
 
@@ -230,7 +230,7 @@ def _worked(axes: NDArray[Any], shown: Intermediates, truth: Truth, at: tuple[in
     else:
         axes[0].axis("off")
     if "prior" in shown:
-        _slice(axes[1], np.take(shown["prior"], at[0], 0), truth, 0, at[0], (0.0, look.top, "gray"))
+        _slice(axes[1], np.take(shown["prior"], at[0], 0), truth, 0, at, cmap="gray", vmin=0.0, vmax=look.top)
     else:
         axes[1].axis("off")
 
@@ -275,7 +275,7 @@ def _bars(figure: Figure, plan: Any, grid: NDArray[Any], look: Look) -> None:
         bar.set_label("−ln(I/I₀)", fontsize=8)
 
 
-def _title(stored: Stored, truth: Truth, look: Look, worked: bool) -> str:
+def _title(stored: StoredScan, truth: Truth, look: Look, worked: bool) -> str:
     water = "" if look.water is None else f" · water {look.water:.4f} 1/mm"
     trace = "; in projections its trace" if worked else ""
     return (

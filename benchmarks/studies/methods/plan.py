@@ -11,12 +11,12 @@ from pathlib import Path
 from ctsim.benchmarks import methods
 from ctsim.benchmarks.engine.record import done
 from ctsim.benchmarks.methods import Method
-from ctsim.benchmarks.scores.artefact import lacks_twin
-from ctsim.benchmarks.scores.protocol import Stored
+from ctsim.benchmarks.scores.score import lacks_twin
 from ctsim.benchmarks.studies.methods.records import METAL, TWIN, Run, RunRecord, RunTask, rank, task_of
-from ctsim.benchmarks.studies.methods.volumes import identity_of
+from ctsim.benchmarks.studies.methods.volumes import is_kept
 from ctsim.errors import InputError
 from ctsim.phantoms.suites import read_toml
+from ctsim.store import StoredScan
 
 OPEN = "ctsim.store:open_scan"
 """The function that opens a scan's folder."""
@@ -30,7 +30,7 @@ class Job:
     asked for.
     """
 
-    stored: Stored
+    stored: StoredScan
     variant: str
     method: Method
     scene: str
@@ -64,7 +64,7 @@ class Job:
         )
 
 
-def repetition(stored: Stored) -> tuple[str, int]:
+def repetition(stored: StoredScan) -> tuple[str, int]:
     """Return the scene's name and its seed; make-dataset names the repetitions of a scene NAME-sSEED."""
     path = stored.folder / "scene.toml"
     recipe = read_toml(path, "that make-dataset wrote") if path.exists() else {}
@@ -74,7 +74,7 @@ def repetition(stored: Stored) -> tuple[str, int]:
     return stored.name.removesuffix(f"-s{seed}"), seed
 
 
-def jobs(scans: Sequence[Stored], chosen: Sequence[Method], *, anchor: bool) -> list[Job]:
+def jobs(scans: Sequence[StoredScan], chosen: Sequence[Method], *, anchor: bool) -> list[Job]:
     """List every run: all methods on all scans; with `anchor` each on the metal-free twin first where there is one."""
     found = []
     for i, stored in enumerate(scans):
@@ -84,7 +84,7 @@ def jobs(scans: Sequence[Stored], chosen: Sequence[Method], *, anchor: bool) -> 
 
 
 def jobs_on(
-    stored: Stored, variants: Sequence[str], placed: Sequence[tuple[Method, tuple[int, int]]], open: str = OPEN
+    stored: StoredScan, variants: Sequence[str], placed: Sequence[tuple[Method, tuple[int, int]]], open: str = OPEN
 ) -> list[Job]:
     """List the runs of methods, each with its place, on a scan and on its twin, as `variants` say."""
     scene, seed = repetition(stored)
@@ -93,18 +93,6 @@ def jobs_on(
         for method, place in placed
         for variant in variants
     ]
-
-
-def volume_name(task: RunTask) -> str:
-    """Return the path of a kept volume in the results folder: scene and method with what the file system allows."""
-    label = "".join(c if c.isalnum() or c in "-.=" else "_" for c in task.subject)
-    twin = "" if task.part == METAL else "__metal_free"
-    return f"volumes/{task.hints['name']}{twin}__{label}.tif"
-
-
-def is_kept(task: RunTask, results: Path) -> bool:
-    """Whether the volume on the disk is this very run's, not one of other parameters, code or data."""
-    return identity_of(results / volume_name(task)) == task.identity
 
 
 def job_of(task: RunTask) -> Job:
@@ -146,20 +134,14 @@ class Costs:
     """Seconds that runs took, from records of runs that ended well; without warm-up and scoring."""
 
     def __init__(self, records: Sequence[RunRecord]) -> None:
-        self._rows: dict[tuple[str, str, str], float] = {}
-        self._methods: dict[str, list[float]] = {}
+        self._seconds: dict[str, list[float]] = {}
         for record in records:
-            if record.finished and (cost := record.cost) is not None:
-                self._rows[record.task.row] = cost.wall
-                self._methods.setdefault(record.label, []).append(cost.wall)
+            if record.finished and record.cost is not None:
+                self._seconds.setdefault(record.label, []).append(record.cost.wall)
 
     def method(self, label: str) -> float | None:
         """Return the median of a method's seconds, None where it has never run."""
-        return statistics.median(self._methods[label]) if label in self._methods else None
-
-    def task(self, task: RunTask) -> float | None:
-        """Return what the same scan took the last time, else the method's median, else None."""
-        return self._rows.get(task.row, self.method(task.subject))
+        return statistics.median(self._seconds[label]) if label in self._seconds else None
 
 
 def ordered(left: Sequence[RunTask], costs: Costs) -> list[tuple[RunTask, ...]]:

@@ -13,7 +13,7 @@ import msgspec
 from ctsim.benchmarks.engine.record import Found, Record, Store, Task
 from ctsim.benchmarks.engine.record import latest as latest_rows
 from ctsim.benchmarks.methods import TABLE
-from ctsim.benchmarks.scores.protocol import VERSION, Score
+from ctsim.benchmarks.scores.score import VERSION, Score
 from ctsim.folder import mixture
 
 STUDY, FILE, WHAT = "methods", "records", "a record of run-benchmark"
@@ -91,11 +91,6 @@ class RunRecord(Record[Result], frozen=True, kw_only=True, forbid_unknown_fields
     def identity(self) -> str:
         """The identity of the task."""
         return self.task.identity
-
-    @property
-    def status(self) -> str:
-        """How it ended: "ok", "skipped", "diverged", "nonfinite", "timeout", "out_of_memory" or "error"."""
-        return self.found[0].status
 
     @property
     def reason(self) -> str:

@@ -1,8 +1,8 @@
 """Run methods over stored scans and score what they return.
 
 A method that fails is a result with a status and a reason; the next command tries it again. What it writes into its
-scan or sets in its process no other run sees (`.own`). With --isolate a run has a process of its own: its peak memory
-is its own, a crash or a time limit ends only it.
+scan or sets in its process no other run sees. With --isolate a run has a process of its own: its peak memory is its
+own, a crash or a time limit ends only it.
 """
 
 import dataclasses
@@ -13,14 +13,20 @@ import msgspec
 
 from ctsim.benchmarks.engine.process import Process, Stopped
 from ctsim.benchmarks.engine.record import OK
-from ctsim.benchmarks.scores import artefact
 from ctsim.benchmarks.scores.judge import Judge, Twin
-from ctsim.benchmarks.studies.methods import intermediates
+from ctsim.benchmarks.scores.score import NO_TWIN, NOT_ASKED, TWIN_ENDED
 from ctsim.benchmarks.studies.methods.attempt import SCORED, Outcome, describe, run_here, scan_for, skip, warm_up
-from ctsim.benchmarks.studies.methods.plan import Job, is_kept, job_of, volume_name
+from ctsim.benchmarks.studies.methods.plan import Job, job_of
 from ctsim.benchmarks.studies.methods.records import METAL, TWIN, Result, RunTask
 from ctsim.benchmarks.studies.methods.study import Flags
-from ctsim.benchmarks.studies.methods.volumes import keep, read_volume
+from ctsim.benchmarks.studies.methods.volumes import (
+    intermediates_of,
+    is_kept,
+    keep,
+    read_volume,
+    volume_name,
+    write_intermediates,
+)
 
 LATE = 120.0  # seconds that a method which was told its limit has beyond it
 
@@ -85,18 +91,18 @@ class Runner:
     def _pair(self, job: Job) -> Twin:
         """Return what the same method with the same parameters made of the metal-free scan, or why nothing."""
         if job.stored.metal_free is None:
-            return Twin(reason=artefact.NO_TWIN)
+            return Twin(reason=NO_TWIN)
         if not self._given.anchor:
-            return Twin(reason=artefact.NOT_ASKED)
+            return Twin(reason=NOT_ASKED)
         twin = dataclasses.replace(job, variant=TWIN)
         if self._twin is not None and self._twin[0].task.identity == twin.task.identity:
             outcome = self._twin[1]
             if outcome.values is not None and outcome.status == OK:
                 return Twin(values=outcome.values)
-            return Twin(reason=f"{artefact.TWIN_ENDED} {outcome.status}: {outcome.reason}")
+            return Twin(reason=f"{TWIN_ENDED} {outcome.status}: {outcome.reason}")
         if is_kept(twin.task, self._results):
             return Twin(values=read_volume(self._results / volume_name(twin.task)))
-        return Twin(reason=artefact.NOT_ASKED)
+        return Twin(reason=NOT_ASKED)
 
     def _scored(self, job: Job, outcome: Outcome, judge: Judge, pair: Twin) -> Result:
         """Score an outcome and write its volume."""
@@ -111,7 +117,7 @@ class Runner:
             path = self._results / files["volume"]
             keep(path, outcome.values, outcome.at_50kev, task.identity)
             if outcome.intermediates:
-                intermediates.write(intermediates.path_of(path), outcome.intermediates, task.identity)
+                write_intermediates(intermediates_of(path), outcome.intermediates, task.identity)
         return Result(
             ok=outcome.status in (OK, "skipped"),
             status=outcome.status,

@@ -15,7 +15,6 @@ import tyro
 from ctsim.benchmarks import methods
 from ctsim.benchmarks.engine import study
 from ctsim.benchmarks.engine.record import Task
-from ctsim.benchmarks.scores.protocol import Stored
 from ctsim.benchmarks.studies.methods import overview, plan, tables
 from ctsim.benchmarks.studies.methods.records import FILE, METAL, Result, RunRecord, RunTask
 from ctsim.errors import InputError
@@ -24,7 +23,7 @@ from ctsim.human import human_choice
 from ctsim.manifest import read_index
 from ctsim.reconstruct.watch import Progress, listen
 from ctsim.sources import source_hash
-from ctsim.store import list_scans, open_scan
+from ctsim.store import StoredScan, list_scans, open_scan
 
 log = logging.getLogger(__name__)
 DEFAULT = ("fdk", "limar", "nmar", "splat")
@@ -163,9 +162,9 @@ def _methods(given: Flags) -> list[methods.Method]:
     return methods.chosen(names, given.set, given.seconds)
 
 
-def _scans(given: Flags) -> list[Stored]:
+def _scans(given: Flags) -> list[StoredScan]:
     """Open the dataset's scans, in its order; check those of --scene, and warn of several simulators."""
-    scans: list[Stored] = [open_scan(folder) for folder in list_scans(given.data)]
+    scans: list[StoredScan] = [open_scan(folder) for folder in list_scans(given.data)]
     if not scans:
         raise InputError(f"{given.data}: the dataset has no scenes")
     names = {s.name: None for s in scans}
@@ -176,7 +175,7 @@ def _scans(given: Flags) -> list[Stored]:
     return scans
 
 
-def _warn(scans: Sequence[Stored]) -> None:
+def _warn(scans: Sequence[StoredScan]) -> None:
     """Say what scans note of themselves, each note once with the scans that share it."""
     found: dict[str, list[str]] = {}
     for stored in scans:

@@ -1,31 +1,128 @@
 """Tables from records: Markdown, CSV and LaTeX, one table a protocol, ranked within an input class.
 
 Nothing is computed anew. A cell is the mean ± standard deviation over noise seeds; a run that failed
-shows its status in place of numbers, and its reason below the tables.
+shows its status in place of numbers, and its reason below the tables. The numbers are made once for all tables of a
+command. A large table has a million of them: they are plain tuples, which the collector of garbage need not follow.
 """
 
+import csv
+import functools
+import io
+import math
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from ctsim.benchmarks.engine import latex
-from ctsim.benchmarks.engine.collector import uncollected
-from ctsim.benchmarks.engine.record import OK
+from ctsim.benchmarks.engine.latex import comment
+from ctsim.benchmarks.engine.record import OK, uncollected
 from ctsim.benchmarks.engine.table import Cell, Column, Table
-from ctsim.benchmarks.engine.texts import escape
-from ctsim.benchmarks.scores.columns import COLUMNS, Metric
-from ctsim.benchmarks.scores.compare import NMAR, harm, row_of
-from ctsim.benchmarks.scores.protocol import AS_RETURNED
+from ctsim.benchmarks.engine.texts import escape, harmless
+from ctsim.benchmarks.scores.score import AS_RETURNED, COLUMNS, COMPARED, NMAR, Metric, Row, derived, harm, row_of
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest, outdated, remarks
-from ctsim.benchmarks.studies.methods.summary import Number, Numbers, csv_text, numbers, summary
 from ctsim.durable import write_synced
 from ctsim.errors import InputError
 
-__all__ = ["caption", "merged", "render", "summary", "tables", "write"]
+if TYPE_CHECKING:
+    import pandas as pd
 
 Format = Literal["md", "tex"]
+
+STUBS = (Column("inputs"), Column("method"))
+
+Key = tuple[str, str, str, str, str, str]
+"""Scene, variant, method, inputs, protocol and metric; a run without any number has protocol and metric ""."""
+
+Number = tuple[float | None, float | None, int, str, str, bool]
+"""Mean, std (ddof 1, of two seeds and more) and n over the seeds that have the metric; status; which of the method's
+volumes was scored; whether no seed has it because the volumes are the reference itself."""
+
+NAMES = (
+    *("scene", "variant", "method", "inputs", "protocol", "metric"),
+    *("mean", "std", "n", "status", "volume", "identical"),
+)
+
+Numbers = dict[Key, Number]
+
+
+def numbers(shown: Sequence[RunRecord]) -> Numbers:
+    """Return the numbers of records that `records.latest` kept, in their order, those derived from them last."""
+    seeds: dict[Key, list[Number]] = defaultdict(list)
+    compared: list[Row] = []
+
+    def add(key: Key, value: float | None, status: str, volume: str = "", identical: bool = False) -> None:
+        seeds[key].append((value, None, 0 if value is None else 1, status, volume, identical))
+
+    for record in shown:
+        run, status = record.run, record.status
+        who = run.scene, run.variant, record.label, record.inputs
+        for protocol, score in record.scores.items():
+            wanted, said = COMPARED.get(protocol, ()), (status, score.volume, score.identical)
+            for metric, value in score.values.items():
+                add((*who, protocol, metric), value, *said)
+                if metric in wanted:
+                    compared.append(Row(who[0], run.seed, *who[1:], protocol, metric, value, *said))
+        for metric in COLUMNS["cost"] if record.cost is not None else ():
+            add((*who, "cost", metric), float(getattr(record.cost, metric)), status)
+        if record.cost is None and not any(score.values for score in record.scores.values()):
+            add((*who, "", ""), None, status)
+    for row in derived(compared):
+        key = (row.scene, row.variant, row.method, row.inputs, row.protocol, row.metric)
+        add(key, row.value, row.status, row.volume, row.identical)
+    return {key: group[0] if len(group) == 1 else _over(group) for key, group in seeds.items()}
+
+
+def _over(seeds: list[Number]) -> Number:
+    """Return the number over seeds of those of each."""
+    values = [value for value, *_ in seeds if value is not None]
+    _, _, _, status, volume, identical = zip(*seeds, strict=True)
+    return (
+        _mean(values) if values else None,
+        _std(values) if len(values) > 1 else None,
+        len(values),
+        ", ".join(dict.fromkeys(status)),
+        ", ".join(dict.fromkeys(volume)),
+        all(identical),
+    )
+
+
+def _mean(values: list[float]) -> float:
+    """Return the mean; the others are summed before the first is added, as in pandas, down to the last bit."""
+    total = 0.0
+    for value in values[1:]:
+        total += value
+    mean = (values[0] + total) / len(values)
+    return mean if math.isfinite(mean) else math.fsum(v / len(values) for v in values)
+
+
+def _std(values: list[float]) -> float:
+    """Return the standard deviation by Welford's recurrence; infinite where the squares are."""
+    mean, squares = 0.0, 0.0
+    for n, value in enumerate(values, 1):
+        before = mean
+        mean += (value - before) / n
+        squares += (value - mean) * (value - before)
+    return math.sqrt(squares / (len(values) - 1)) if 0 <= squares < math.inf else math.inf
+
+
+def csv_text(found: Numbers) -> str:
+    """Return the numbers as CSV in which no text is a formula to a spreadsheet."""
+    out, cell = io.StringIO(), functools.cache(harmless)
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(NAMES)
+    for key, (mean, std, n, status, volume, identical) in found.items():
+        writer.writerow([*map(cell, key), mean, std, n, cell(status), cell(volume), identical])
+    return out.getvalue()
+
+
+def summary(records: Sequence[RunRecord]) -> "pd.DataFrame":
+    """Return the numbers of the latest records as table.csv holds them, a row each."""
+    import pandas as pd  # half a second that writing tables does without
+
+    found = numbers(latest(records))
+    frame = pd.DataFrame([(*key, *number) for key, number in found.items()], columns=pd.Index(NAMES))
+    return frame.assign(mean=pd.to_numeric(frame["mean"]), std=pd.to_numeric(frame["std"]))
 
 
 def _cell(number: Number | None, metric: str, column: Metric) -> Cell:
@@ -64,9 +161,6 @@ def _tables(shown: Sequence[RunRecord], found: Numbers, protocols: Iterable[str]
     return made
 
 
-STUBS = (Column("inputs"), Column("method"))
-
-
 def _grid(
     chosen: dict[tuple[str, str, str], Number], protocol: str, own: Sequence[RunRecord]
 ) -> tuple[list[Column], list[list[Cell]]]:
@@ -88,7 +182,7 @@ def _grid(
                 cells.append(cell)
         more: list[Cell] = []
         if len(scenes) > 1:
-            more += [_mean(cells, k, len(metrics), how) for k, how in enumerate(metrics.values())]
+            more += [_over_scenes(cells, k, len(metrics), how) for k, how in enumerate(metrics.values())]
         if protocol == "anchored":
             shares = (harm([c.number for c in cells[k :: len(metrics)]]) for k in range(len(metrics)))
             more += [Cell(text, share) for share, text in shares]
@@ -98,7 +192,7 @@ def _grid(
     return [*STUBS, *heads], rows
 
 
-def _mean(cells: list[Cell], k: int, step: int, column: Metric) -> Cell:
+def _over_scenes(cells: list[Cell], k: int, step: int, column: Metric) -> Cell:
     """Average a metric over scenes; a method that lacks one has no mean, since it would not compare."""
     known = [cell.number for cell in cells[k::step]]
     if any(n is None or n == float("inf") for n in known):
@@ -128,7 +222,7 @@ def caption(records: Sequence[RunRecord], protocol: str) -> str:
     if protocol == "cost":
         return "Protocol cost: seconds and peak resident memory of a run; compilation and first call stand apart."
     if protocol == "against":
-        nmar = row_of(NMAR, (r.label for r in records if r.status == OK and r.run.variant == "metal"))
+        nmar = row_of(NMAR, (r.label for r in records if r.status == OK and r.run.variant == METAL))
         return (
             "Protocol tissue, compared: gain in PSNR3D (dB) over no correction (FDK) and over NMAR"
             f"{'' if nmar is None else f' (the row {nmar})'}, scene by scene and seed by seed."
@@ -139,24 +233,23 @@ def caption(records: Sequence[RunRecord], protocol: str) -> str:
             "0 as if the metal had never been there, 1 uncorrected. Harm rate: share of scenes with s > 1, "
             "and how many of how many scenes that have a score."
         )
-    found = [(r.run.scene, r.scores[protocol]) for r in records if protocol in r.scores and r.run.variant == "metal"]
+    found = [(r, r.scores[protocol]) for r in records if protocol in r.scores and r.run.variant == METAL]
     if not found:
         return f"Protocol {protocol}."
     score = found[0][1]
-    references = dict.fromkeys(s.reference for _, s in found)
+    references = merged(dict.fromkeys(s.reference for _, s in found))
     alignment = "one least-squares gain on the body" if protocol.startswith("aligned") else score.alignment
+    text = f"Protocol {protocol}: region {score.region}; reference {references}; alignment {alignment}"
     ranges: dict[str, list[float]] = {}
-    for scene, s in found:
+    others: dict[str, list[str]] = {}
+    for r, s in found:
         if s.data_range is not None:
-            ranges.setdefault(scene, []).append(s.data_range)
-    text = f"Protocol {protocol}: region {score.region}; reference {merged(references)}; alignment {alignment}"
+            ranges.setdefault(r.run.scene, []).append(s.data_range)
+        if s.volume != AS_RETURNED:
+            others.setdefault(s.volume, []).append(r.label)
     if ranges:
         text += "; data range " + ", ".join(f"{_span(v)} ({s})" for s, v in ranges.items()) + " 1/mm"
-    read: dict[str, list[str]] = {}
-    for r in (r for r in records if protocol in r.scores and r.run.variant == "metal"):
-        read.setdefault(r.scores[protocol].volume, []).append(r.label)
-    others = [f"{', '.join(dict.fromkeys(who))} {how}" for how, who in read.items() if how != AS_RETURNED]
-    return text + "".join(f"; {other}" for other in others) + "."
+    return text + "".join(f"; {', '.join(dict.fromkeys(who))} {how}" for how, who in others.items()) + "."
 
 
 def _span(numbers: list[float]) -> str:
@@ -169,7 +262,7 @@ def _notes(records: Sequence[RunRecord], protocol: str) -> list[str]:
     """Return what the scores of a protocol declare: once for a scene and seed where its methods agree."""
     labels: dict[tuple[str, int, str], list[str]] = {}
     for record in records:
-        if record.run.variant == "metal" and protocol in record.scores and record.scores[protocol].note:
+        if record.run.variant == METAL and protocol in record.scores and record.scores[protocol].note:
             key = (record.run.scene, record.run.seed, record.scores[protocol].note)
             labels.setdefault(key, []).append(record.label)
     said = Counter((scene, seed) for scene, seed, _ in labels)
@@ -190,8 +283,8 @@ def _page(found: Sequence[Table], form: Format, failed: Sequence[str], said: Seq
     if form == "md" and failed:
         parts.append("## Failures and skips\n\n" + "\n".join(f"- {escape(line, form)}" for line in failed) + "\n")
     elif failed:
-        parts.append("".join(map(latex.comment, failed)))
-    parts += [f"{escape(text, form)}.\n" if form == "md" else latex.comment(f"{text}.") for text in said]
+        parts.append("".join(map(comment, failed)))
+    parts += [f"{escape(text, form)}.\n" if form == "md" else comment(f"{text}.") for text in said]
     return "\n".join(parts)
 
 

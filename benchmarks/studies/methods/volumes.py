@@ -1,19 +1,50 @@
-"""Kept reconstructions: TIFF stacks that name the run they came from."""
+"""What a run keeps beside its record: its volumes, what it worked with for the pictures, and what it says of them.
+
+Volumes are TIFF stacks that name the run they came from. A method attaches what it worked with (a metal trace, bridged
+projections, a prior) to its volume, `Volume(..., details={"intermediates": {"view": 15, "trace": ...}})`; no score
+reads it. It is kept beside the volume as NAME.npz. The other details stand in the record.
+"""
 
 import json
 import os
 import struct
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
+import tifffile
 from numpy.typing import NDArray
 
+from ctsim.arrayfile import read_arrays
+from ctsim.benchmarks.studies.methods.records import METAL, RunTask
 from ctsim.durable import replacing
 from ctsim.errors import InputError
+from ctsim.geometry import Geometry
 from ctsim.tiffstack import write_all
 
 # what tifffile (TiffFileError is a ValueError) and JSON raise for files that are cut short or changed
 DAMAGED = (ValueError, LookupError, AttributeError, TypeError, RecursionError, struct.error)
+
+KEY = "intermediates"
+_RUN = "run"
+Intermediates = dict[str, NDArray[Any]]
+
+LONGEST = 10_000  # bytes of JSON of an entry that a record keeps
+ELSEWHERE = ("view_updates", KEY)  # details that a run keeps in its cost and beside its volume
+
+
+def volume_name(task: RunTask) -> str:
+    """Return the path of a kept volume in the results folder: scene and method with what the file system allows."""
+    label = "".join(c if c.isalnum() or c in "-.=" else "_" for c in task.subject)
+    twin = "" if task.part == METAL else "__metal_free"
+    return f"volumes/{task.hints['name']}{twin}__{label}.tif"
+
+
+def is_kept(task: RunTask, results: Path) -> bool:
+    """Whether the volume on the disk is this very run's, not one of other parameters, code or data."""
+    return identity_of(results / volume_name(task)) == task.identity
 
 
 def write_volume(path: Path, values: NDArray[np.float32], identity: str = "") -> None:
@@ -21,8 +52,6 @@ def write_volume(path: Path, values: NDArray[np.float32], identity: str = "") ->
 
     `identity` is the run's; a reader can tell by it whether the file is still that run's.
     """
-    import tifffile
-
     path.parent.mkdir(parents=True, exist_ok=True)
     text = {"axes": "ZYX", "unit": "1/mm", "run": identity}
     with replacing(path) as new:
@@ -41,11 +70,10 @@ def write_volume(path: Path, values: NDArray[np.float32], identity: str = "") ->
 def keep(path: Path, values: NDArray[np.float32], at_50kev: NDArray[np.float32] | None, identity: str) -> None:
     """Write a run's volume, and beside it the one at 50 keV; without one, that of an earlier run of this name goes."""
     write_volume(path, values, identity)
-    beside = at_50kev_of(path)
     if at_50kev is None:
-        beside.unlink(missing_ok=True)
+        at_50kev_of(path).unlink(missing_ok=True)
     else:
-        write_volume(beside, at_50kev, identity)
+        write_volume(at_50kev_of(path), at_50kev, identity)
 
 
 def at_50kev_of(path: Path) -> Path:
@@ -55,14 +83,11 @@ def at_50kev_of(path: Path) -> Path:
 
 def own_at_50kev(path: Path, identity: str) -> Path | None:
     """Return where the volume at 50 keV of a kept volume's run lies; None where that very run has none."""
-    beside = at_50kev_of(path)
-    return beside if identity_of(beside) == identity else None
+    return at_50kev_of(path) if identity_of(at_50kev_of(path)) == identity else None
 
 
 def identity_of(path: Path) -> str | None:
     """Return the identity of the run that wrote `path`; None where there is no such volume or it does not say."""
-    import tifffile
-
     try:
         with tifffile.TiffFile(path) as file:
             found = json.loads(file.pages.first.description).get("run")
@@ -76,8 +101,6 @@ def map_volume(path: Path) -> NDArray[np.float32]:
 
     Raises InputError where the file is damaged.
     """
-    import tifffile
-
     try:
         return tifffile.memmap(path, mode="r")
     except DAMAGED as error:
@@ -96,3 +119,103 @@ def read_volume(path: Path) -> NDArray[np.float32]:
     if values.ndim != 3:
         raise InputError(f"{path}: expected a volume [z, y, x], got shape {values.shape}")
     return values
+
+
+def attached(details: Mapping[str, Any], geometry: Geometry) -> Intermediates:
+    """Return the intermediates that a method attached, checked; {} where it attached none.
+
+    `view` is an index, `trace` (not 0 in the metal's shadow) and `projection` (what was backprojected, −ln) are
+    that view's [v, u], `prior` is [z, y, x] in 1/mm. Raises InputError for other names, shapes and views.
+    """
+    shapes = {"view": (), "trace": geometry.n_detector, "projection": geometry.n_detector, "prior": geometry.n_voxel}
+    kinds = {"view": np.int64, "trace": np.bool_}
+    found = {}
+    for name, value in details.get(KEY, {}).items():
+        if name not in shapes:
+            raise InputError(f"details[{KEY!r}] has no entry {name!r}: expected {', '.join(shapes)}")
+        array = np.asarray(value)
+        if array.shape != shapes[name]:
+            raise InputError(f"details[{KEY!r}][{name!r}] has shape {array.shape}, expected {shapes[name]}")
+        found[name] = np.array(array != 0 if name == "trace" else array, kinds.get(name, np.float32))
+    if found.keys() & {"trace", "projection"} and "view" not in found:
+        raise InputError(f"details[{KEY!r}]: a trace or a projection needs its 'view'")
+    if "view" in found and not 0 <= found["view"] < geometry.n_views:
+        raise InputError(f"details[{KEY!r}]['view'] is {found['view']}, expected 0 … {geometry.n_views - 1}")
+    return found
+
+
+def intermediates_of(volume: Path) -> Path:
+    """Return where the intermediates of a kept volume lie."""
+    return volume.with_suffix(".npz")
+
+
+def write_intermediates(path: Path, found: Intermediates, identity: str) -> None:
+    """Write intermediates with the identity of their run, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    arrays: dict[str, Any] = {**found, _RUN: np.array(identity)}
+    with replacing(path) as new, new.open("wb") as file:
+        np.savez(file, **arrays)
+
+
+def read_intermediates(path: Path, identity: str) -> Intermediates:
+    """Read the intermediates of a run; {} where it left none, or the file is another run's.
+
+    Raises InputError where the file is damaged.
+    """
+    try:
+        found = read_arrays(path)
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); delete it or run the method again with --force") from None
+    return found if str(found.pop(_RUN, "")) == identity else {}
+
+
+def recordable(details: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a volume's details that a record keeps: numbers, words, and lists and dicts of them.
+
+    An array, a tensor or any other object is left out, and so is an entry of more than `LONGEST` bytes. A list that
+    holds one is left out whole, for its places mean something; a dict loses that entry, and is left out where it loses
+    all. What is not finite becomes None.
+    """
+    found: dict[str, Any] = {}
+    for name, value in _entries(details).items():
+        try:
+            line = msgspec.json.encode({name: value})  # null where a number is not finite
+            if name not in ELSEWHERE and len(line) <= LONGEST:
+                found |= msgspec.json.decode(line)
+        except (ValueError, msgspec.MsgspecError):  # half a surrogate pair, or an integer of thousands of digits
+            continue
+    return found
+
+
+def _entries(given: Mapping[Any, Any]) -> dict[str, Any]:
+    found = {}
+    for name, value in given.items():
+        try:
+            found[_word(name)] = _plain(value)
+        except TypeError:
+            continue
+    return found
+
+
+def _word(value: object) -> str:
+    """Return a string without what a subclass adds; raises TypeError for anything else."""
+    return str.__str__(value)  # pyright: ignore[reportArgumentType]
+
+
+def _plain(value: object) -> Any:
+    """Return a value in the types of JSON; raises TypeError where it has none."""
+    if value is None or isinstance(value, bool):
+        return value
+    for kinds, plain in (((np.bool_,), bool), ((int, np.integer), int), ((float, np.floating), float)):
+        if isinstance(value, kinds):
+            return plain(value)
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, Mapping):
+        found = _entries(value)
+        if value and not found:
+            raise TypeError("a record keeps none of its entries")
+        return found
+    return _word(value)

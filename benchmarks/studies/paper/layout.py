@@ -13,7 +13,7 @@ import msgspec
 
 from ctsim.benchmarks.engine.table import Cell
 from ctsim.benchmarks.methods import Method
-from ctsim.benchmarks.scores.columns import COLUMNS, Metric
+from ctsim.benchmarks.scores.score import COLUMNS, Metric
 from ctsim.errors import InputError
 
 NONE = Cell("–")

@@ -21,7 +21,7 @@ from ctsim.benchmarks.engine.record import OK, merged
 from ctsim.benchmarks.engine.table import Cell, Column, Table
 from ctsim.benchmarks.engine.texts import ranked
 from ctsim.benchmarks.methods import TABLE
-from ctsim.benchmarks.scores.protocol import VERSION
+from ctsim.benchmarks.scores.score import VERSION
 from ctsim.benchmarks.studies.methods import records, tables
 from ctsim.benchmarks.studies.methods.records import METAL, Run, RunRecord, case_of
 from ctsim.benchmarks.studies.paper.layout import NONE, PaperTable, Planned, duration, load, printed

@@ -1,0 +1,233 @@
+"""What a score is, how tables show it, and what is derived from scores that are recorded.
+
+All of it is light: what computes scores (`.protocol`, `.artefact`, `.projection`) is loaded where volumes are judged.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import msgspec
+
+from ctsim.benchmarks.engine.record import OK
+
+VERSION = 3
+"""Part of every run's identity: a change of the protocol's meaning counts it up.
+
+1: tissue, aligned, paper, metal, cost. 2: every method runs on the metal-free twin too, for `artefact`.
+3: `projection`, and `rmse` of `artefact`. The version was not raised for `at_energy`: only new code has it, and code is
+part of the identity.
+"""
+
+AS_RETURNED, AT_50KEV = "as returned", "read at 50 keV"
+NO_TWIN = "the scan has no metal-free twin"
+NOT_ASKED = "the metal-free twin was not to be reconstructed"
+TWIN_ENDED = "the run on the metal-free twin ended as"
+"""Notes of `artefact` where it has no numbers."""
+
+
+class Score(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The scores under one protocol, with all that is needed to read them.
+
+    `data_range` is 1/mm; `values` maps a metric to its number, or to None where it does not exist; `volume` says which
+    of a method's volumes was scored.
+    """
+
+    region: str
+    reference: str
+    alignment: str
+    data_range: float | None
+    n_voxels: int
+    values: dict[str, float | None]
+    identical: bool = False
+    note: str = ""
+    volume: str = AS_RETURNED
+
+    @classmethod
+    def none(cls, region: str, metrics: Iterable[str], why: str) -> "Score":
+        """Return a score without numbers, and why there are none."""
+        empty = dict.fromkeys(metrics)
+        return cls(
+            region=region, reference="none", alignment="none", data_range=None, n_voxels=0, values=empty, note=why
+        )
+
+
+def lacks_twin(scores: dict[str, Score]) -> bool:
+    """Say whether a volume was scored without its twin although there may be one, so that it is to be done again.
+
+    A method that gave a reason to skip the twin would skip it again.
+    """
+    note = scores["artefact"].note if "artefact" in scores else ""
+    return note == NOT_ASKED or (note.startswith(TWIN_ENDED) and not note.startswith(f"{TWIN_ENDED} skipped"))
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """How a metric is shown: title, decimals, which way is better ("max", "min", "one" = nearest 1), and a factor."""
+
+    title: str
+    digits: int
+    better: Literal["", "max", "min", "one"] = ""
+    scale: float = 1.0
+
+
+_IMAGE = {"psnr3d": Metric("PSNR3D (dB)", 2, "max"), "ssim3d": Metric("SSIM3D", 3, "max")}
+
+COLUMNS: dict[str, dict[str, Metric]] = {
+    "tissue": _IMAGE,
+    "aligned": {**_IMAGE, "gain": Metric("gain", 3)},
+    "aligned_50kev": {**_IMAGE, "gain": Metric("gain", 3)},
+    "paper": {
+        **_IMAGE,
+        "psnr3d_full_gtmax": Metric("psnr3d_full_gtmax", 2, "max"),
+        "psnr3d_r2": Metric("psnr3d_r2", 2, "max"),
+        "ssim3d_r2": Metric("ssim3d_r2", 3, "max"),
+        "ssim3d_naf": Metric("ssim3d_naf", 3, "max"),
+    },
+    "metal": {
+        "core_ratio": Metric("core ratio", 3, "one"),
+        "dice": Metric("Dice", 3, "max"),
+        "boundary_rms": Metric("boundary RMS (mm)", 3, "min"),
+    },
+    "artefact": {
+        "roi_std": Metric("ROI std (HU)", 1, "min"),
+        "cupping": Metric("excess cupping (points)", 2, "min"),
+        "streak": Metric("streak (HU)", 1, "min"),
+        "rmse": Metric("RMSE (HU)", 1, "min"),
+        "rmse_near": Metric("RMSE ≤ 5 mm (HU)", 1, "min"),
+        "rmse_far": Metric("RMSE > 5 mm (HU)", 1, "min"),
+    },
+    "projection": {
+        "noise_free/body": Metric("RMSE P", 4, "min"),
+        "noise_free/outside": Metric("RMSE P, outside trace", 4, "min"),
+        "noise_free/trace": Metric("RMSE P, in trace", 3, "min"),
+        "effective/outside": Metric("RMSE effective, outside trace", 4, "min"),
+        "effective/trace": Metric("RMSE effective, in trace", 3, "min"),
+        "50kev/outside": Metric("RMSE 50 keV, outside trace", 4, "min"),
+        "50kev/trace": Metric("RMSE 50 keV, in trace", 3, "min"),
+    },
+    "against": {
+        "over_fdk": Metric("over FDK (dB)", 2, "max"),
+        "over_nmar": Metric("over NMAR (dB)", 2, "max"),
+    },
+    "anchored": {
+        "tissue/rmse": Metric("s tissue RMSE", 3, "min"),
+        "tissue/ssim3d": Metric("s tissue 1 − SSIM3D", 3, "min"),
+        "aligned/rmse": Metric("s aligned RMSE", 3, "min"),
+        "artefact/streak": Metric("s streak", 3, "min"),
+        "artefact/rmse_near": Metric("s RMSE ≤ 5 mm", 3, "min"),
+    },
+    "cost": {
+        "wall": Metric("wall (s)", 2, "min"),
+        "cpu": Metric("CPU (s)", 2, "min"),
+        "peak_bytes": Metric("peak (MiB)", 0, "min", 1 / 2**20),
+        "view_updates": Metric("view updates", 0),
+        "warm_up": Metric("warm-up (s)", 2),
+    },
+}
+"""The metrics that tables show of each protocol, in order."""
+
+FDK, NMAR = "fdk", "nmar"
+ANCHORED = {
+    "tissue": ("rmse", "ssim3d"),
+    "aligned": ("rmse", "ssim3d"),
+    "aligned_50kev": ("rmse", "ssim3d"),
+    "artefact": ("roi_std", "cupping", "streak", "rmse", "rmse_near", "rmse_far"),
+}
+"""The metrics that have an anchored score; of `artefact` FDK's error without the metal is 0 by definition."""
+COMPARED = {**ANCHORED, "tissue": ("psnr3d", *ANCHORED["tissue"])}
+"""The metrics that anything is derived of."""
+
+Place = tuple[str, int, str, str, str, str]
+"""Scene, seed, variant, method, protocol, metric."""
+
+
+class Row(NamedTuple):
+    """One number of a run, None where it does not exist; `identical` and `volume` are those of its score."""
+
+    scene: str
+    seed: int
+    variant: str
+    method: str
+    inputs: str
+    protocol: str
+    metric: str
+    value: float | None
+    status: str = OK
+    volume: str = ""
+    identical: bool = False
+
+
+def row_of(name: str, labels: Iterable[str]) -> str | None:
+    """Return the label to compare with: `name` itself, else the first with parameters, such as nmar[mask=oracle]."""
+    labels = list(dict.fromkeys(labels))
+    return name if name in labels else next((x for x in labels if x.startswith((f"{name}[", f"{name}-"))), None)
+
+
+def error(metric: str, value: float) -> float:
+    """Return a metric as an error that is 0 at best: 1 − SSIM3D, any other as it is."""
+    return 1 - value if metric.startswith("ssim3d") else value
+
+
+def anchored(e: float, e_reference: float, e_fdk: float) -> float | None:
+    """Return (e − e_ref) / (e_FDK − e_ref); None where FDK is no worse with the metal than without it."""
+    return (e - e_reference) / (e_fdk - e_reference) if e_fdk > e_reference else None
+
+
+def harm(scores: list[float | None]) -> tuple[float | None, str]:
+    """Return the share of scenes whose anchored score is above 1, and its text with the count of scenes.
+
+    Scenes without a score are not counted; the share is None, and not ranked, where one is missing.
+    """
+    known = [s for s in scores if s is not None]
+    if not known:
+        return None, "–"
+    harmed = sum(s > 1 for s in known)
+    share = harmed / len(known)
+    return share if len(known) == len(scores) else None, f"{share:.2f} ({harmed}/{len(known)})"
+
+
+def derived(rows: list[Row]) -> list[Row]:
+    """Derive the rows of `against` (dB of tissue PSNR3D) and `anchored` ("protocol/metric") from scored rows.
+
+    Comparisons are made within one scene and seed, between runs that ended well.
+    """
+    scored = [row for row in rows if row.status == OK and row.value is not None and row.value == row.value]
+    labels = dict.fromkeys(row.method for row in scored if row.variant == "metal")
+    bases = {name: row_of(name, labels) for name in (FDK, NMAR)}
+    values = {_place(row, row.method, row.variant): row.value for row in scored if row.method in (FDK, *bases.values())}
+    found = []
+    for row in scored:
+        if row.variant == "metal":
+            pairs = _gains(row, values, bases) + _anchors(row, values)
+            found += [row._replace(protocol=p, metric=m, value=v, identical=False) for p, m, v in pairs]
+    return found
+
+
+def _place(row: Row, method: str, variant: str) -> Place:
+    return row.scene, row.seed, variant, method, row.protocol, row.metric
+
+
+def _gains(row: Row, values: dict[Place, float | None], bases: dict[str, str | None]) -> list[tuple[str, str, float]]:
+    """Return the gain in tissue PSNR3D over FDK and NMAR, where those rows are there."""
+    if row.metric != "psnr3d" or row.protocol != "tissue" or row.value is None:
+        return []
+    found = []
+    for name, label in bases.items():
+        base = None if label is None else values.get(_place(row, label, "metal"))
+        found += [] if base is None else [("against", f"over_{name}", row.value - base)]
+    return found
+
+
+def _anchors(row: Row, values: dict[Place, float | None]) -> list[tuple[str, str, float]]:
+    """Return a metric's anchored score, where FDK ran on the scan and its twin."""
+    protocol, metric = row.protocol, row.metric
+    if metric not in ANCHORED.get(protocol, ()) or row.value is None:
+        return []
+    worst = values.get(_place(row, FDK, "metal"))
+    # artefacts are differences from the twin, which differs from itself by nothing
+    best = error(metric, 0.0) if protocol == "artefact" else values.get(_place(row, FDK, "metal_free"))
+    if worst is None or best is None:
+        return []
+    s = anchored(error(metric, row.value), error(metric, best), error(metric, worst))
+    return [] if s is None else [("anchored", f"{protocol}/{metric}", s)]
