@@ -206,6 +206,14 @@ def test_a_method_that_can_be_told_its_seconds_ends_by_itself(tmp_path):
     assert methods.within(mine, 0.5) == mine and methods.within(methods.find("fdk"), 0.5) == methods.find("fdk")
 
 
+def test_the_command_leaves_a_method_that_knows_its_seconds_the_time_to_end(smallest, tmp_path, monkeypatch, capsys):
+    words = ("--method", "test_run:punctual", "--method", "test_run:slow", "--no-anchor", "--seconds", "0.5")
+    assert command(monkeypatch, capsys, smallest, tmp_path, *words)[0] == 1
+    found = {r.run.method: r for r in records.read(tmp_path)}
+    assert {name: r.status for name, r in found.items()} == {"test_run:punctual": "ok", "test_run:slow": "timeout"}
+    assert {r.inputs for r in found.values()} == {"counts only"}  # a class of its own would be another table
+
+
 def test_a_warm_up_goes_on_until_nothing_is_left_to_compile(tmp_path):
     CALLS.clear()
     seconds = attempt.warm_up(methods.find("test_run:compiling"), double(tmp_path).scan)

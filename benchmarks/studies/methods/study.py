@@ -100,6 +100,10 @@ class Methods(study.Study[RunRecord, Flags]):
         """Run a task in this process, on the scan that was opened for it or, on a worker, on one opened here."""
         return pkgutil.resolve_name(self.work)(task, given, self._jobs.get(task.identity))
 
+    def limit(self, task: RunTask, given: Flags) -> float | None:
+        """Return no limit: a run has its own process, and a method that is told its seconds has some more to end."""
+        return None
+
     def recorded(self, task: RunTask) -> RunTask:
         """Leave out where this machine has the scan."""
         return msgspec.structs.replace(task, hints={})
