@@ -54,10 +54,9 @@ def test_a_terminated_make_dataset_goes_on_to_the_same_bytes(tmp_path):
     assert len(hashes) == 1
 
 
-@pytest.mark.parametrize("isolate", [(), ("--isolate",)])
-def test_a_terminated_run_benchmark_keeps_its_records_and_goes_on(smallest, tmp_path, isolate, monkeypatch, capsys):
+def test_a_terminated_run_benchmark_keeps_its_records_and_goes_on(smallest, tmp_path, monkeypatch, capsys):
     (tmp_path / "waiting_method.py").write_text(WAITING, encoding="utf-8")
-    arguments = [smallest, tmp_path / "r", "--method", "fdk", "--method", "waiting_method:reconstruct", *isolate]
+    arguments = [smallest, tmp_path / "r", "--method", "fdk", "--method", "waiting_method:reconstruct", "--isolate"]
     code, said = stopped("run_benchmark", arguments, tmp_path, (tmp_path / "waiting").exists)
     assert code == 130 and "interrupted" in said and "Traceback" not in said
     assert [r.label for r in records.read(tmp_path / "r")] == ["fdk", "fdk"]  # the twin and the scan

@@ -72,72 +72,9 @@ def test_only_ok_is_done_and_counts_before_a_failure_of_the_same_run():
     assert records.latest([record("error"), record("timeout")]) == [record("timeout")]
 
 
-def test_a_failed_run_of_before_does_not_hide_what_is_measured_now():
-    """Which code and data count is what was run last, not what last ended well."""
-    old, new = record(code="1"), record("error", code="2")
-    assert records.latest([old, new]) == [new]
-    assert records.latest([new, old, record("error", code="1")]) == [old]
-
-
-def test_within_a_file_the_last_line_counts_whatever_its_clock_said(tmp_path):
-    for given in (record("error", time="2031-01-01"), record("timeout", time="2026-01-01")):
-        append(tmp_path, given)
-    assert [r.status for r in records.latest(records.read(tmp_path))] == ["timeout"]
-    append(tmp_path, record(code="new", time="2026-01-02"))
-    assert [r.task.code for r in records.latest(records.read(tmp_path))] == ["new"]
-
-
-def test_a_clock_ahead_on_one_machine_hides_nothing_of_another(tmp_path):
-    """Here new code ran on the second day; there, old code on the first, one record of it dated 2031."""
-    here, there = tmp_path / "here", tmp_path / "there"
-    for k, time in enumerate(("2026-01-01T01", "2031-01-01", "2026-01-01T03", "2026-01-01T04")):
-        append(there, record("ok", code="old", seed=k, time=time))
-    for k in range(4):
-        append(here, record("ok", code="new", seed=k, time=f"2026-01-02T0{k}"))
-    assert store(here).collect([there]) == {there: 4}
-    shown = records.latest(records.read(here))
-    assert [r.task.code for r in shown] == ["new"] * 4
-    before = (here / "records.jsonl").read_bytes()
-    assert store(here).collect([there]) == {there: 0} and (here / "records.jsonl").read_bytes() == before
-    # files that lie side by side are merged alike
-    (here / "records.jsonl").unlink()
-    (there / "records.jsonl").rename(here / "records-there.jsonl")
-    for k in range(4):
-        append(here, record("ok", code="new", seed=k, time=f"2026-01-02T0{k}"))
-    assert [r.task.code for r in records.latest(records.read(here))] == ["new"] * 4
-
-
-def test_a_failure_dated_in_the_future_is_mended_by_a_collected_success(tmp_path):
-    here, there = tmp_path / "here", tmp_path / "there"
-    append(here, record("error", time="2031-01-01"))
-    append(there, record(time="2026-01-01"))
-    assert store(here).collect([there]) == {there: 1}
-    assert [r.status for r in records.latest(records.read(here))] == ["ok"]
-
-
-def test_nothing_is_collected_where_a_folder_has_no_records(tmp_path):
-    here, there = tmp_path / "here", tmp_path / "there"
-    append(there, record())
-    with pytest.raises(InputError, match=r"--collect .*none: there are no records"):
-        store(here).collect([there, tmp_path / "none"])
-    assert not here.exists()
-
-
-def test_latest_supersedes_other_code_versions():
-    old, new = record(code="1"), record("error", code="2")
-    assert records.latest([old, new, record(seed=1)]) == [new, record(seed=1)]
-
-
 def test_a_scan_made_anew_supersedes_what_was_measured_on_the_old():
     given = [record(), record(label="nmar"), record(scan="new"), record(seed=1)]
     assert records.latest(given) == [record(scan="new"), record(seed=1)]
-
-
-def test_files_of_several_machines_merge(tmp_path):
-    append(tmp_path, record())
-    append(tmp_path, record(seed=1), name="records-other")
-    found = records.read(tmp_path)
-    assert {r.run.seed for r in found} == {0, 1}
 
 
 def test_host_is_described_and_survives_json():

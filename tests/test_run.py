@@ -438,14 +438,6 @@ def test_bad_input_is_one_sentence_and_code_2(tmp_path, monkeypatch, capsys):
         assert code == 2 and said.err.startswith("run-benchmark: ") and said.err.count("\n") == 1, said.err
 
 
-def test_a_disk_that_cannot_be_written_is_one_sentence(tmp_path, monkeypatch, capsys):
-    use_double(monkeypatch)
-    blocker = tmp_path / "file"
-    blocker.write_text("")
-    code, said = command(monkeypatch, capsys, tmp_path, blocker / "r", "--method", "test_run:good")
-    assert code == 2 and said.err.count("\n") == 1 and str(blocker) in said.err
-
-
 def test_help_loads_nothing_heavy():
     script = (
         "import sys\nfrom ctsim.benchmarks.cli import run_benchmark\nsys.argv = ['run-benchmark', '--help']\n"

@@ -9,7 +9,6 @@ import pytest
 from test_run import double
 from test_tables import record
 
-from ctsim.benchmarks.engine.process import Lost, Pool
 from ctsim.benchmarks.methods import TABLE, Method, find
 from ctsim.benchmarks.studies.methods import estimates, plan, records, study, tables
 from ctsim.benchmarks.studies.methods.estimates import FDKS, fdk_seconds, in_fdks
@@ -70,22 +69,6 @@ def test_cheap_methods_come_first():
     assert order(("b:b", "a:a"), [took("a:a", 1.0, "timeout")]) == ["b:b", "a:a"]  # a failure says nothing of the cost
 
 
-def test_a_dry_run_writes_nothing(smallest, tmp_path, capsys):
-
-    assert study.main([str(smallest), str(tmp_path / "results"), "--dry-run"]) == 0
-    assert "2 of 2 runs" in capsys.readouterr().out
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_run_whose_process_dies_is_a_failure_on_record(smallest, tmp_path, monkeypatch):
-    monkeypatch.setattr(Pool, "answers", lambda self, function, jobs: iter([None, (0, Lost("it died"))]))
-    assert study.main([str(smallest), str(tmp_path), "--workers", "2"]) == 1
-    assert [(r.status, r.reason, r.run.variant) for r in records.read(tmp_path)] == [
-        ("error", "it died", "metal_free"),
-        ("error", "it died", "metal"),
-    ]
-
-
 def test_a_worker_with_other_code_is_refused(smallest, tmp_path):
     given = study.Flags(data=smallest, results=tmp_path)
     task = study.Methods().tasks(given)[0]
@@ -113,57 +96,6 @@ def test_tables_do_not_depend_on_which_run_ended_first():
     assert list(dict.fromkeys(r.label for r in shown)) == ["fdk", "nmar", "my:net", "a:lab"]
 
 
-def at(time: str, name: str, **more):
-    return record(name, time=f"2026-01-01T00:00:{time}+00:00", **more)
-
-
-def test_results_of_several_machines_are_collected_once(tmp_path):
-    here, there, third = (tmp_path / name for name in ("here", "there", "deep/third"))
-    for folder, found in (
-        (here, [at("20", "fdk", psnr=30.0), at("21", "nmar", status="error")]),
-        (there, [at("05", "fdk", psnr=30.0, code="old"), at("30", "nmar", volume="volumes/n.tif")]),
-        (third, [at("40", "nmar", status="error"), at("41", "splat")]),
-    ):
-        store(folder).append(found)
-    assert store(here).collect([there, third]) == {there: 2, third: 1}
-    assert store(here).collect([there, third, here]) == {there: 0, third: 0, here: 0}
-    shown = {r.label: r for r in records.latest(records.read(here))}
-    assert shown["fdk"].task.code == ""  # the older code came last, but does not supersede
-    assert shown["nmar"].status == "ok" and (here / (shown["nmar"].volume or "")).resolve() == there / "volumes/n.tif"
-    assert set(shown) == {"fdk", "nmar", "splat"}
-    with pytest.raises(InputError, match="no records"):
-        store(here).collect([tmp_path / "nothing"])
-
-
-def store(folder):
-    return study.Methods().store(study.Flags(data=folder, results=folder))
-
-
-def test_collecting_renders_the_tables(tmp_path, capsys):
-
-    store(tmp_path / "there").append([record("fdk")])
-    collect = [str(tmp_path / "data"), str(tmp_path / "here"), "--collect", str(tmp_path / "there")]
-    with pytest.raises(InputError, match="--collect writes records, --dry-run writes nothing"):
-        study.main([*collect, "--dry-run"])
-    assert not (tmp_path / "here").exists()
-    assert study.main(collect) == 0
-    assert "| counts only | fdk |" in capsys.readouterr().out and (tmp_path / "here/table.csv").exists()
-
-
-def test_tables_follow_the_runs(tmp_path, monkeypatch):
-    seen = []
-    write = tables.write
-
-    def watched(found, results):
-        seen.append(len(found))
-        write(found, results)
-
-    monkeypatch.setattr(tables, "write", watched)
-    monkeypatch.setattr(study, "_scans", lambda given: [double(given.data)])
-    assert study.main([str(tmp_path), str(tmp_path / "r"), "--method", "test_run:good"]) == 0
-    assert seen[0] == 1 and seen[-1] == 2  # after the first run, and at the end
-
-
 def test_a_method_that_never_ran_is_guessed_from_the_time_of_fdk(smallest, tmp_path, capsys):
     told = [
         str(smallest),
@@ -177,7 +109,8 @@ def test_a_method_that_never_ran_is_guessed_from_the_time_of_fdk(smallest, tmp_p
     ]
     assert study.main(told) == 0
     out = capsys.readouterr().out
-    assert "unknown" not in out and "never measured" not in out
+    assert "2 of 2 runs" in out and "unknown" not in out and "never measured" not in out
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
