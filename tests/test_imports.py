@@ -6,8 +6,10 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from graphlib import TopologicalSorter
 from pathlib import Path
 
+import grimp
 import pytest
 from setuptools import find_packages
 
@@ -41,6 +43,13 @@ def modules(*left_out: str) -> list[str]:
 
 def test_the_layers_hold():
     run("from importlinter.cli import lint_imports; assert lint_imports(cache_dir=None) == 0")
+
+
+def test_no_module_of_benchmarks_imports_itself_by_way_of_others():
+    """Imports within functions are counted, too."""
+    graph = grimp.build_graph("ctsim", cache_dir=None)
+    ours = [name for name in graph.modules if name.startswith("ctsim.benchmarks.")]
+    TopologicalSorter({name: graph.find_modules_directly_imported_by(name) for name in ours}).prepare()
 
 
 def test_an_installed_ctsim_claims_one_name_on_the_import_path():

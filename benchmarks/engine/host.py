@@ -33,13 +33,13 @@ class Host(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     versions: dict[str, str]
 
 
-def _cpu_name() -> str:
-    """Return the processor's model name, or the architecture where the system does not tell."""
+def _line_of(file: str, key: str) -> str:
+    """Return what Linux says of a key in one of its files, "" on other systems."""
     with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
+        for line in Path(file).read_text().splitlines():
+            if line.startswith(key):
                 return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+    return ""
 
 
 def threads() -> int:
@@ -47,13 +47,6 @@ def threads() -> int:
     numba = sys.modules.get("numba")
     cores = len(os.sched_getaffinity(0))
     return int(numba.get_num_threads()) if numba else int(os.environ.get("NUMBA_NUM_THREADS", cores))
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "not installed"
 
 
 def use_threads(threads: int) -> None:
@@ -69,7 +62,7 @@ def use_threads(threads: int) -> None:
 def host() -> Host:
     """Describe this machine."""
     return Host(
-        cpu=_cpu_name(),
+        cpu=_line_of("/proc/cpuinfo", "model name") or platform.processor() or platform.machine(),
         cores=len(os.sched_getaffinity(0)),
         threads=threads(),
         ram=os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
@@ -81,7 +74,11 @@ def host() -> Host:
 
 @functools.cache
 def _versions() -> dict[str, str]:
-    return {package: _version(package) for package in VERSIONS_OF}
+    found = dict.fromkeys(VERSIONS_OF, "not installed")
+    for package in VERSIONS_OF:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[package] = metadata.version(package)
+    return found
 
 
 @functools.cache
@@ -114,21 +111,10 @@ class Usage:
     peak_bytes: int = 0
 
 
-def _reset_peak() -> bool:
-    """Ask the kernel to forget this process's memory high-water mark (Linux); say whether it did."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return False
-    return True
-
-
 def peak_memory() -> int:
     """Return the highest resident memory in bytes since the last reset, else since the process began."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
+    if kilobytes := _line_of("/proc/self/status", "VmHWM:"):
+        return int(kilobytes.split()[0]) * 1024
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
 
@@ -140,7 +126,8 @@ def measured() -> Iterator[Usage]:
     The peak is the whole process's, with the interpreter, the libraries and the mapped files.
     """
     usage = Usage()
-    _reset_peak()
+    with contextlib.suppress(OSError):  # Linux forgets the peak so far
+        Path("/proc/self/clear_refs").write_text("5")
     wall, cpu = time.perf_counter(), time.process_time()
     try:
         yield usage

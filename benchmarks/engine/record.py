@@ -126,12 +126,14 @@ def uncollected() -> Iterator[None]:
 
 
 class Store(Generic[R]):
-    """The records of one study in a results folder: `NAME.jsonl`, and files of other machines, `NAME-*.jsonl`."""
+    """The records of one study in a results folder: `NAME.jsonl`, and files of other machines, `NAME-*.jsonl`.
+
+    `what` says in errors what a line should be.
+    """
 
     def __init__(self, folder: Path, name: str, kind: type[R], what: str) -> None:
-        self.folder, self.path, self._name = folder, folder / f"{name}.jsonl", name
+        self.folder, self.path, self._name, self._kind, self._what = folder, folder / f"{name}.jsonl", name, kind, what
         self._decoder = msgspec.json.Decoder(kind)
-        self._what = what
         self._warned: set[Path] = set()
 
     @uncollected()
@@ -140,7 +142,8 @@ class Store(Generic[R]):
 
         Raises InputError where a whole line is not a record.
         """
-        return merged([list(self._of(path)) for path in self._files(self.folder)])
+        files = [*self.folder.glob(f"{self._name}.jsonl"), *self.folder.glob(f"{self._name}-*.jsonl")]
+        return merged([list(self._of(path)) for path in sorted(files)])
 
     def append(self, records: Iterable[R]) -> None:
         """Append records and force them to the disk; alone among processes."""
@@ -155,7 +158,7 @@ class Store(Generic[R]):
         What ended well here, or failed here as there, is left out. Files of a record stay where they are. Raises
         InputError for a folder without records.
         """
-        brought = {other: Store.read(self._at(other)) for other in others}
+        brought = {other: Store(other, self._name, self._kind, self._what).read() for other in others}
         for other, records in brought.items():
             if not records:
                 raise InputError(f"--collect {other}: there are no records, expected a folder with {self.path.name}")
@@ -164,24 +167,16 @@ class Store(Generic[R]):
         with locked(self.path) as handle:  # what another command appends meanwhile would be lost
             self._end_last_line(handle)
             files = [list(self._of(self.path))]
-            known = {r.task.identity: r.finished for r in sorted(self.read(), key=lambda r: r.finished)}
+            ended, known = _identities(self.read())
             for other, records in brought.items():
-                lacked = [r for r in records if not known.get(r.task.identity, False)]
-                lacked = [r for r in lacked if r.finished or r.task.identity not in known]
-                known |= {r.task.identity: r.finished for r in sorted(lacked, key=lambda r: r.finished)}
+                lacked = [r for r in records if r.task.identity not in (ended if r.finished else known)]
+                more_ended, more = _identities(lacked)
+                ended, known = ended | more_ended, known | more
                 files.append([_moved(r, other, self.folder) for r in lacked])
                 counts[other] = len(lacked)
             if any(files[1:]):
                 write_synced(self.path, encoded(merged(files)))
         return counts
-
-    def _at(self, folder: Path) -> "Store[R]":
-        other = Store.__new__(Store)
-        other.__dict__ |= self.__dict__ | {"folder": folder, "path": folder / self.path.name}
-        return other
-
-    def _files(self, folder: Path) -> list[Path]:
-        return sorted([*folder.glob(f"{self._name}.jsonl"), *folder.glob(f"{self._name}-*.jsonl")])
 
     def _of(self, path: Path) -> Iterator[R]:
         data = path.read_bytes() if path.exists() else b""
@@ -212,6 +207,11 @@ class Store(Generic[R]):
 def encoded(records: Iterable[msgspec.Struct]) -> bytes:
     """Return records as lines."""
     return b"".join(msgspec.json.encode(record) + b"\n" for record in records)
+
+
+def _identities(records: Iterable[Record[Any]]) -> tuple[set[str], set[str]]:
+    """Return the identities of records that ended well, and of all."""
+    return {r.task.identity for r in records if r.finished}, {r.task.identity for r in records}
 
 
 def _moved(record: R, source: Path, folder: Path) -> R:
@@ -277,9 +277,8 @@ def by_row(records: Sequence[R]) -> dict[tuple[str, str, str], list[R]]:
     machine = {(r.task.part, r.task.case): r.task.machine for r in ended}
     rows: dict[tuple[str, str, str], list[R]] = {}
     for record in records:
-        task = record.task
-        if task.machine == machine[task.part, task.case]:
-            rows.setdefault((task.part, task.case, task.subject), []).append(record)
+        if record.task.machine == machine[record.task.part, record.task.case]:
+            rows.setdefault(record.task.row, []).append(record)
     return {row: _newest(found) for row, found in rows.items()}
 
 
