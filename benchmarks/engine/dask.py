@@ -12,7 +12,7 @@ from typing import Any, Self
 import distributed
 import numba
 import torch
-from distributed.comm import CommClosedError
+from distributed.comm.core import CommClosedError
 from distributed.scheduler import KilledWorker
 
 from ctsim.benchmarks.engine.process import TICK, Answers, Function, Lost, answered
@@ -34,7 +34,7 @@ class Cluster:
             logging.getLogger(name).setLevel(logging.CRITICAL)  # our errors say what matters
         self._address, reason = address, ""
         try:
-            self._client = distributed.Client(address, timeout=CONNECT)
+            self._client: Any = distributed.Client(address, timeout=CONNECT)
         except (OSError, ValueError, RuntimeError, TypeError) as error:
             said = " ".join(str(error).split()) or type(error).__name__
             reason = f"no Dask scheduler answers there, expected tcp://host:port or tls://host:port ({said})"
@@ -86,7 +86,8 @@ class Cluster:
             time.sleep(TICK)
             return set()
         try:
-            return distributed.wait(futures, timeout=TICK, return_when="FIRST_COMPLETED").done
+            found: Any = distributed.wait(futures, timeout=TICK, return_when="FIRST_COMPLETED")
+            return found.done
         except TimeoutError:
             return set()
 

@@ -74,7 +74,7 @@ def host() -> Host:
 
 @functools.cache
 def _versions() -> dict[str, str]:
-    found = dict.fromkeys(VERSIONS_OF, "not installed")
+    found: dict[str, str] = dict.fromkeys(VERSIONS_OF, "not installed")
     for package in VERSIONS_OF:
         with contextlib.suppress(metadata.PackageNotFoundError):
             found[package] = metadata.version(package)
