@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from ctsim.benchmarks.scores.artefact import Layout, artefact_score, layout_of
 from ctsim.benchmarks.scores.metrics import METAL
 from ctsim.benchmarks.scores.projection import HeldOut, held_out, projection_score, with_floor
-from ctsim.benchmarks.scores.protocol import Stored, Truth, evaluate, truth_of
+from ctsim.benchmarks.scores.protocol import Truth, evaluate, truth_of
 from ctsim.benchmarks.scores.score import NO_TWIN, Score
 from ctsim.notes import NOT_ON_GRID
+from ctsim.store import StoredScan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,7 +36,7 @@ class Judge:
     absent: str = ""
 
     @classmethod
-    def of(cls, stored: Stored) -> "Judge":
+    def of(cls, stored: StoredScan) -> "Judge":
         """Load a scan's references and choose where its artefacts are measured."""
         truth = truth_of(stored)
         views = with_floor(held_out(stored), truth)
@@ -59,7 +60,7 @@ class Judge:
         return scores
 
 
-def _absent(stored: Stored, truth: Truth) -> str:
+def _absent(stored: StoredScan, truth: Truth) -> str:
     """Return a scan's notes on its metal; where an older version made it, what its mask says."""
     if stored.info.notes or truth.metal.any() or not stored.info.metal:
         return "; ".join(stored.info.notes)
