@@ -308,8 +308,8 @@ def _records(study: Study[R, G], groups: Sequence[tuple[Task, ...]], given: G, j
                 failed |= set() if record.finished else {task.identity}
         return
     for of_round in _rounds(groups):
-        parts = [tuple(task for task in group if task.identity not in failed) for group in of_round]
-        parts = [part for part in parts if part]
+        left = (tuple(task for task in group if task.identity not in failed) for group in of_round)
+        parts = [part for part in left if part]
         for answer in jobs.answers(functools.partial(_measure_group, study, given), parts):
             if answer is None:
                 continue
@@ -326,9 +326,8 @@ def _rounds(groups: Sequence[tuple[Task, ...]]) -> list[list[tuple[Task, ...]]]:
     rounds: dict[int, list[tuple[Task, ...]]] = {}
     times = Counter[str]()
     for group in groups:
-        identities = {task.identity for task in group}
-        rounds.setdefault(max(times[i] for i in identities), []).append(group)
-        times.update(identities)
+        rounds.setdefault(max(times[task.identity] for task in group), []).append(group)
+        times.update({task.identity for task in group})
     return [rounds[n] for n in sorted(rounds)]
 
 
