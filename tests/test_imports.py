@@ -46,10 +46,11 @@ def test_the_layers_hold():
 
 
 def test_no_module_of_benchmarks_imports_itself_by_way_of_others():
-    """Imports within functions are counted, too."""
+    """Imports within functions are counted, too; a module's own package is loaded before it in any case."""
     graph = grimp.build_graph("ctsim", cache_dir=None)
     ours = [name for name in graph.modules if name.startswith("ctsim.benchmarks.")]
-    TopologicalSorter({name: graph.find_modules_directly_imported_by(name) for name in ours}).prepare()
+    imported = {name: graph.find_modules_directly_imported_by(name) - {name.rpartition(".")[0]} for name in ours}
+    TopologicalSorter(imported).prepare()
 
 
 def test_an_installed_ctsim_claims_one_name_on_the_import_path():

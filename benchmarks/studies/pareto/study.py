@@ -18,7 +18,7 @@ from ctsim.benchmarks.engine.record import Record, Task
 from ctsim.benchmarks.engine.table import Table
 from ctsim.benchmarks.engine.terminal import Bar
 from ctsim.benchmarks.methods import code_version, find
-from ctsim.benchmarks.scores.score import VERSION
+from ctsim.benchmarks.scores import score
 from ctsim.benchmarks.studies.methods import estimates
 from ctsim.benchmarks.studies.pareto import Flags, figure, suite, tables
 from ctsim.benchmarks.studies.pareto.finding import Part, Run, Timed, points
@@ -65,7 +65,7 @@ class Pareto(study.Study[Record[Run], Flags]):
         size = f"{asked.simulator.side}² pixels, {asked.simulator.views} views"
         simulated = "simulator" in given.parts and (not given.scene or RODS in given.scene)
         found = [(RODS, size, choice) for choice in (suite.choices(asked.simulator) if simulated else ())]
-        scored = f"protocol {VERSION}" + ", aligned" * asked.dataset.aligned
+        scored = f"protocol {score.VERSION}" + ", aligned" * asked.dataset.aligned
         for scene in scenes:
             folder = given.results / "data" / scene.name
             known = f"{read_manifest(folder).content_hash}, {scored}" if folder.exists() else ""
