@@ -15,7 +15,7 @@ from typing import Annotated
 import tyro
 
 from ctsim.benchmarks import make_dataset
-from ctsim.benchmarks.engine.dask import check_workers
+from ctsim.benchmarks.engine.host import check_workers
 from ctsim.benchmarks.engine.process import check_limit
 from ctsim.benchmarks.engine.study import listing, measure_all
 from ctsim.benchmarks.methods import Method, find

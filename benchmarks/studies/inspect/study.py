@@ -20,8 +20,8 @@ from ctsim.benchmarks import methods
 from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.table import Table, simple
 from ctsim.benchmarks.scores import metrics
+from ctsim.benchmarks.scores.metrics import ssim_along_axes
 from ctsim.benchmarks.scores.protocol import TISSUE, Stored, Truth, tissue_range, truth_of
-from ctsim.benchmarks.scores.ssim import ssim_along_axes
 from ctsim.benchmarks.studies.inspect import Flags
 from ctsim.benchmarks.studies.methods import records
 from ctsim.benchmarks.studies.methods.attempt import attempt, scan_for
