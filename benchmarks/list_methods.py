@@ -13,7 +13,7 @@ WIDEST = 24  # characters of a default that others are aligned with
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Flags:
     """List the methods, what they need, and their parameters with defaults, bounds and units."""
 
     method: tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME ...]")]] = ()
@@ -22,7 +22,7 @@ class Arguments:
 
 def main(arguments: list[str]) -> int:
     """Print the list; return 0."""
-    given = tyro.cli(Arguments, prog="run-benchmark methods", args=arguments)
+    given = tyro.cli(Flags, prog="run-benchmark methods", args=arguments)
     sys.stdout.write("\n".join(described(name) for name in given.method or TABLE))
     return 0
 

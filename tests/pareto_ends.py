@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass
 
-from ctsim.benchmarks.studies.pareto.finding import Mark, Run
+from ctsim.benchmarks.studies.pareto.finding import Mark, TimedRun
 
 CALLS = []
 
@@ -37,10 +37,10 @@ class Scene:
 
         CALLS.append(choice.label)
         if choice.label == "c":
-            return Run(ok=False, status="diverged", reason="so")
+            return TimedRun(ok=False, status="diverged", reason="so")
         if choice.label == "d":
             raise MemoryError("no room")
         if choice.label == "e":
             time.sleep(60)
         values = {"rmse": 1.0, "threads": numba.get_num_threads()}
-        return Run(marks=(Mark(label=choice.label, seconds=1.0, values=values),))
+        return TimedRun(marks=(Mark(label=choice.label, seconds=1.0, values=values),))

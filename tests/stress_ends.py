@@ -8,7 +8,7 @@ import numba
 import numpy as np
 
 from ctsim.benchmarks.studies.stress import worker
-from ctsim.benchmarks.studies.stress.study import Outcome, Row, Stress
+from ctsim.benchmarks.studies.stress.study import Stress, StressRow, Judged
 
 
 def fine(side, found):
@@ -52,7 +52,7 @@ ENDS = {
 
 
 def catalogue(*names, code="code"):
-    rows = [Row(f.__name__, "test", "w", "e", code) for f in ENDS]
+    rows = [StressRow(f.__name__, "test", "w", "e", code) for f in ENDS]
     return {(row.case, row.subject): row for row in rows if not names or row.case in names}
 
 
@@ -65,7 +65,7 @@ def judge(task, given):
 def threads(task, given):
     most = numba.config.NUMBA_NUM_THREADS
     numba.set_num_threads(task.hints["threads"])
-    return [Outcome(found=f"{numba.get_num_threads()} of {most} threads")]
+    return [Judged(found=f"{numba.get_num_threads()} of {most} threads")]
 
 
 class Ends(Stress):

@@ -1,12 +1,12 @@
 import pytest
 
-from ctsim.benchmarks.scores.score import Row, anchored, derived, harm, row_of
+from ctsim.benchmarks.scores.score import SeedValue, anchored, derived, harm, row_of
 
 
 def row(method, metric, value, *, variant="metal", protocol="tissue", **more):
     base = {"scene": "lung", "seed": 0, "inputs": "counts only"}
     said = {"variant": variant, "method": method, "protocol": protocol, "metric": metric, "value": value}
-    return Row(**{**base, **said, **more})
+    return SeedValue(**{**base, **said, **more})
 
 
 def found(rows):

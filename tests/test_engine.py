@@ -85,7 +85,7 @@ def in_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
 def timed_in_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the study of run times find one mark of FDK, on scans that are not there, here."""
     mark = pareto_finding.Mark(label="defaults", seconds=0.5, values={"rmse": 0.1, "psnr3d": 30.0}, default=True)
-    run = pareto_finding.Run(marks=(mark,))
+    run = pareto_finding.TimedRun(marks=(mark,))
     monkeypatch.setattr(Pareto, "apart", False)
     monkeypatch.setattr(Pareto, "prepare", lambda self, given: None)
     monkeypatch.setattr(pareto_measure, "measure", lambda task, given: [run])

@@ -15,8 +15,8 @@ from ctsim.benchmarks.studies.pareto import tables as pareto_tables
 from ctsim.benchmarks.studies.pareto.finding import (
     Mark,
     Point,
-    Run,
     Timed,
+    TimedRun,
     enough,
     faster,
     front,
@@ -122,7 +122,7 @@ def timed(of, *marks, status="ok", reason=""):
     """A record of a run whose marks are (label, seconds, error)."""
     names = {"simulator": ("rms", "worst", "off_edges"), "methods": ("rmse",)}[of.part]
     found = tuple(Mark(label=label, seconds=s, values=dict.fromkeys(names, e)) for label, s, e in marks)
-    return record(of, Run(ok=status == "ok", marks=found, status=status, reason=reason))
+    return record(of, TimedRun(ok=status == "ok", marks=found, status=status, reason=reason))
 
 
 def record(of, run):
@@ -203,8 +203,8 @@ def said(records, tmp_path):
 def test_a_protocol_that_was_not_asked_for_has_no_column(tmp_path):
     for scores, shown_there in (({}, False), ({"aligned": 31.5}, True)):
         marks = (Mark(label="a", seconds=1.0, values={"rmse": 0.5, "psnr3d": 30.0, **scores}),)
-        tables = pareto_tables.every_point([record(task(), Run(marks=marks))])
-        tables += pareto_tables.summary([record(task(), Run(marks=marks))])
+        tables = pareto_tables.every_point([record(task(), TimedRun(marks=marks))])
+        tables += pareto_tables.summary([record(task(), TimedRun(marks=marks))])
         assert [("| aligned (dB) |" in t.markdown(), "| 31.50 |" in t.markdown()) for t in tables[:2]] == [
             (shown_there, shown_there)
         ] * 2
@@ -216,7 +216,7 @@ def simulated(*rows):
     for label, rounds, rms, worst in rows:
         values = {"rms": rms, "worst": worst, "off_edges": 1.0}
         marks = [Mark(label=label, seconds=seconds, default=True, values=values) for seconds in rounds]
-        found += [record(task(label, part="simulator", curve="x"), Run(marks=(mark,))) for mark in marks]
+        found += [record(task(label, part="simulator", curve="x"), TimedRun(marks=(mark,))) for mark in marks]
     return found
 
 

@@ -194,7 +194,7 @@ def test_the_command_says_what_is_wrong_and_runs_again_what_failed(command, tmp_
 
 def test_a_row_that_crashes_after_it_was_as_expected_is_shown_so(command, monkeypatch):
     assert command("--case", "fine") == 0
-    lost = study.Outcome(ok=False, status="error", reason="the process died")
+    lost = study.Judged(ok=False, status="error", reason="the process died")
     monkeypatch.setattr(Here, "measure", lambda self, task, given: [lost])
     assert command("--case", "fine", "--force") == 1
 

@@ -8,7 +8,7 @@ import tyro
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Options:
+class Flags:
     """Simulate the scans of a suite, with their ground truth, into a data folder.
 
     An interrupted run continues when it is started again; finished scenes are skipped. A message names finished scenes
@@ -37,7 +37,7 @@ class Options:
 
 def main(argv: list[str]) -> int:
     """Run the command; return 0, 2 for an error of the user's or damaged data, 130 when interrupted."""
-    given: Any = tyro.cli(Options, prog="make-dataset", args=argv)
+    given: Any = tyro.cli(Flags, prog="make-dataset", args=argv)
 
     from ctsim.benchmarks.make_dataset import work  # kernels: --help does not wait for them
 

@@ -14,7 +14,7 @@ from ctsim.benchmarks.engine.compiling import announced
 from ctsim.benchmarks.engine.host import open_jobs
 from ctsim.benchmarks.engine.process import TICK, Jobs, Lost
 from ctsim.benchmarks.engine.terminal import Bar
-from ctsim.benchmarks.make_dataset import Options
+from ctsim.benchmarks.make_dataset import Flags
 from ctsim.benchmarks.suites import load, select
 from ctsim.errors import InputError
 from ctsim.folder import finished, is_complete, listing, other_code, partial_of, recover, remarks, tidy, unfinished
@@ -30,7 +30,7 @@ T = TypeVar("T")
 _SPARE = 64 * 2**20  # bytes left free for the file system's own needs
 
 
-def run(options: Options) -> int:
+def run(options: Flags) -> int:
     """Verify, plan or make what the flags ask for; return the exit code."""
     try:
         if options.verify:
@@ -58,7 +58,7 @@ def _verify(data_dir: Path) -> int:
     return 2 if problems else 0
 
 
-def _dry_run(scenes: tuple[Scene, ...], options: Options) -> int:
+def _dry_run(scenes: tuple[Scene, ...], options: Flags) -> int:
 
     there = {} if options.out is None else _finished(scenes, options.out, options.force)
     seconds, size = 0.0, 0
@@ -98,7 +98,7 @@ def _of_other_code(scenes: tuple[Scene, ...], there: dict[str, Manifest], out: P
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Job:
+class SceneJob:
     """A scene to make, as it travels to a worker."""
 
     scene: Scene
@@ -108,7 +108,7 @@ class Job:
     code: str
 
 
-def _make(scenes: tuple[Scene, ...], out: Path, options: Options) -> int:
+def _make(scenes: tuple[Scene, ...], out: Path, options: Flags) -> int:
 
     source_hash()  # of the code that is loaded, whatever becomes of its files meanwhile
     recover(out)
@@ -126,7 +126,7 @@ def _make(scenes: tuple[Scene, ...], out: Path, options: Options) -> int:
     return 0
 
 
-def _make_all(scenes: list[Scene], out: Path, options: Options) -> None:
+def _make_all(scenes: list[Scene], out: Path, options: Flags) -> None:
     """Plan the scenes, then make them here or on workers."""
     with open_jobs(options.workers, options.scheduler) as pool:
         plans = {scene.name: plan_scene(scene) for scene in scenes}  # all phantoms could be more than memory holds
@@ -138,7 +138,7 @@ def _make_all(scenes: list[Scene], out: Path, options: Options) -> None:
             _make_here(scenes, plans, out, options.force)
             return
         where, code = out.resolve(), source_hash()
-        jobs = [Job(scene=s, plan=plans[s.name], out=where, force=options.force, code=code) for s in scenes]
+        jobs = [SceneJob(scene=s, plan=plans[s.name], out=where, force=options.force, code=code) for s in scenes]
         _make_apart(jobs, pool)
 
 
@@ -169,7 +169,7 @@ def say(text: str) -> None:
     sys.stderr.write(text + "\n")
 
 
-def _make_apart(jobs: list[Job], pool: Jobs) -> None:
+def _make_apart(jobs: list[SceneJob], pool: Jobs) -> None:
     """Make scenes on workers behind one progress bar, which follows the views that the workers noted as safe."""
     views = [job.scene.resolve().geometry.n_views for job in jobs]
     left = set(range(len(jobs)))
@@ -187,7 +187,7 @@ def _make_apart(jobs: list[Job], pool: Jobs) -> None:
             bar.at(sum(noted.get(jobs[k].scene.name, 0) if k in left else n for k, n in enumerate(views)), ended)
 
 
-def do(job: Job) -> None:
+def do(job: SceneJob) -> None:
     """Be the worker: make a scene unless it is there, after any process that makes it just now.
 
     Raises InputError where this process has other code than the command, whose plan it is, and where the scene's lock

@@ -142,7 +142,7 @@ Place = tuple[str, int, str, str, str, str]
 """Scene, seed, variant, method, protocol, metric."""
 
 
-class Row(NamedTuple):
+class SeedValue(NamedTuple):
     """One number of a run, None where it does not exist; `identical` and `volume` are those of its score."""
 
     scene: str
@@ -187,7 +187,7 @@ def harm(scores: list[float | None]) -> tuple[float | None, str]:
     return share if len(known) == len(scores) else None, f"{share:.2f} ({harmed}/{len(known)})"
 
 
-def derived(rows: list[Row]) -> list[Row]:
+def derived(rows: list[SeedValue]) -> list[SeedValue]:
     """Derive the rows of `against` (dB of tissue PSNR3D) and `anchored` ("protocol/metric") from scored rows.
 
     Comparisons are made within one scene and seed, between runs that ended well.
@@ -204,11 +204,13 @@ def derived(rows: list[Row]) -> list[Row]:
     return found
 
 
-def _place(row: Row, method: str, variant: str) -> Place:
+def _place(row: SeedValue, method: str, variant: str) -> Place:
     return row.scene, row.seed, variant, method, row.protocol, row.metric
 
 
-def _gains(row: Row, values: dict[Place, float | None], bases: dict[str, str | None]) -> list[tuple[str, str, float]]:
+def _gains(
+    row: SeedValue, values: dict[Place, float | None], bases: dict[str, str | None]
+) -> list[tuple[str, str, float]]:
     """Return the gain in tissue PSNR3D over FDK and NMAR, where those rows are there."""
     if row.metric != "psnr3d" or row.protocol != "tissue" or row.value is None:
         return []
@@ -219,7 +221,7 @@ def _gains(row: Row, values: dict[Place, float | None], bases: dict[str, str | N
     return found
 
 
-def _anchors(row: Row, values: dict[Place, float | None]) -> list[tuple[str, str, float]]:
+def _anchors(row: SeedValue, values: dict[Place, float | None]) -> list[tuple[str, str, float]]:
     """Return a metric's anchored score, where FDK ran on the scan and its twin."""
     protocol, metric = row.protocol, row.metric
     if metric not in ANCHORED.get(protocol, ()) or row.value is None:

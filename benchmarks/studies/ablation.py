@@ -21,7 +21,8 @@ from ctsim.benchmarks.engine.study import listing, measure_all
 from ctsim.benchmarks.methods import Method, find
 from ctsim.benchmarks.studies.methods import plan, records
 from ctsim.benchmarks.studies.methods.records import METAL, Run, RunRecord, RunTask, task_of
-from ctsim.benchmarks.studies.methods.study import Flags, Methods
+from ctsim.benchmarks.studies.methods.study import Flags as RunFlags
+from ctsim.benchmarks.studies.methods.study import Methods
 from ctsim.benchmarks.studies.paper.layout import Planned, load
 from ctsim.benchmarks.studies.paper.tables import ABLATION, text_of
 from ctsim.durable import write_synced
@@ -36,7 +37,7 @@ SECONDS = {"splat-paper": 0.06, "splat-r2": 0.13}
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Flags:
     """Take the published splat method apart on the suite `ablation`, and print the paper's tables of it.
 
     Scans that are missing are made; what RESULTS already holds is not run again.
@@ -71,7 +72,7 @@ class Ablation(Methods):
         self._listed = {(v.scene, v.label): v for v in listed}
         self._chosen, self._rates = methods_of(listed), rates
 
-    def jobs(self, given: Flags) -> list[plan.Job]:
+    def jobs(self, given: RunFlags) -> list[plan.Job]:
         """List the runs scene by scene; those of scenes that are not in the data folder are left out."""
         folders = {folder.name: folder for folder in list_scans(given.data)} if given.data.is_dir() else {}
         found: list[plan.Job] = []
@@ -81,7 +82,7 @@ class Ablation(Methods):
                 found += plan.jobs_on(open_scan(folders[scene]), (METAL,), placed)
         return found
 
-    def expected(self, task: RunTask, given: Flags) -> float | None:
+    def expected(self, task: RunTask, given: RunFlags) -> float | None:
         """Return the seconds of a run by the time of a step."""
         variant = self._listed[task.settings.scene, task.subject]
         return self._rates[variant.method] * variant.params["steps"]
@@ -94,13 +95,13 @@ class Ablation(Methods):
 
 def main(arguments: list[str]) -> int:
     """Run the command; 0 if every run ended well, 1 if one failed."""
-    asked = tyro.cli(Arguments, prog="run-benchmark ablation", args=arguments)
+    asked = tyro.cli(Flags, prog="run-benchmark ablation", args=arguments)
     check_limit(asked.seconds)
     check_workers(asked.workers, None)
     listed, known = variants(asked.table), records.read(asked.results)
     rates = _rates(known)
     study = Ablation(listed, rates)
-    given = Flags(data=asked.data, results=asked.results, seconds=asked.seconds, workers=asked.workers, anchor=False)
+    given = RunFlags(data=asked.data, results=asked.results, seconds=asked.seconds, workers=asked.workers, anchor=False)
     if asked.dry_run:
         sys.stdout.write(_planned(study, listed, known, given))
         steps = ", ".join(f"{method} {human_time(rate)}" for method, rate in rates.items())
@@ -120,7 +121,7 @@ def main(arguments: list[str]) -> int:
     return 1 if failed else 0
 
 
-def _planned(study: Ablation, listed: Sequence[Variant], known: Sequence[RunRecord], given: Flags) -> str:
+def _planned(study: Ablation, listed: Sequence[Variant], known: Sequence[RunRecord], given: RunFlags) -> str:
     """Return the runs that are left with the rows that show them, those last whose scans are to be made first."""
     tasks = study.tasks(given)
     there = {task.settings.scene for task in tasks}

@@ -33,7 +33,7 @@ Runs = dict[tuple[str, int, str], RunRecord]
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Flags:
     """Make the records behind the claims about FDK, LIMAR, NMAR and OS-SART, and check the claims.
 
     The times are worth something on an idle machine only.
@@ -64,7 +64,7 @@ class Claim:
 
 def main(arguments: list[str]) -> int:
     """Run the command; 0 if every claim holds, 1 if one does not or cannot be judged."""
-    given = tyro.cli(Arguments, prog="run-benchmark reproduce", args=arguments)
+    given = tyro.cli(Flags, prog="run-benchmark reproduce", args=arguments)
     if not given.table:
         code = _compute(given)
         if given.dry_run or code not in (0, 1):  # a method's failure is shown below
@@ -80,7 +80,7 @@ def main(arguments: list[str]) -> int:
     return 0 if all(claim.holds for claim in claims) else 1
 
 
-def _compute(given: Arguments) -> int:
+def _compute(given: Flags) -> int:
     """Make the scans that are missing and run what has no record, or print the plans of both; return the exit code."""
     plan = ["--dry-run"] if given.dry_run else []
     if code := make_dataset.main([given.suite, str(given.data), "--seeds", *map(str, given.seeds), *plan]):

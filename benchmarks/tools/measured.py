@@ -70,7 +70,7 @@ PAGES: dict[str, Page] = {
     ),
     "speed": _of(
         "peers", "Speed and error of ctsim, RTK and XCIST", "peers.md",
-        *SIMULATOR, "reconstruct/fdk.py", f"{STUDIES}peers/", f"{SUITES}peers.toml",
+        *SIMULATOR, "reconstruct/fdk.py", f"{STUDIES}peers/",
     ),
     "stability": _of(
         "stress", "Numerical stability", "stability.md",

@@ -76,9 +76,8 @@ def forms() -> dict[str, type]:
 
 def _form(module: types.ModuleType) -> type:
     """Return the dataclass of a command's flags, which its module or the module's package declares."""
-    found = (getattr(module, name, None) for name in ("Flags", "Arguments", "Options"))
     declared = (module.__name__, module.__name__.rpartition(".")[0])
-    return next(form for form in found if form is not None and form.__module__ in declared)
+    return next(form for name in declared if (form := getattr(sys.modules[name], "Flags", None)) is not None)
 
 
 def command(name: str, form: type) -> str:

@@ -48,7 +48,7 @@ CELL, LABEL, DPI = 1.75, 1.1, 150  # inches, inches, dots an inch
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Row:
+class PanelRow:
     """What is shown of one method: its name and scores, its volume [z, y, x] in 1/mm, and what it worked with."""
 
     caption: str
@@ -98,9 +98,9 @@ def write_panels(records: Sequence[RunRecord], scans: list[StoredScan], results:
     return written
 
 
-def _row(record: RunRecord, path: Path) -> Row:
+def _row(record: RunRecord, path: Path) -> PanelRow:
     shown = read_intermediates(intermediates_of(path), record.identity)
-    return Row(caption=_caption(record), volume=map_volume(path), shown=shown)
+    return PanelRow(caption=_caption(record), volume=map_volume(path), shown=shown)
 
 
 def _digest(stored: StoredScan, kept: list[tuple[RunRecord, Path]]) -> str:
@@ -152,7 +152,7 @@ def look_of(truth: Truth, measured: NDArray[Any] | None, shadow: NDArray[np.bool
     return Look(top=TOP * middle, error=ERROR * middle, projection=max(highest, 1e-3), water=water)
 
 
-def draw(stored: StoredScan, truth: Truth, rows: list[Row]) -> Figure:
+def draw(stored: StoredScan, truth: Truth, rows: list[PanelRow]) -> Figure:
     """Draw the reference and each row: volumes in one window, errors on one scale, colourbars below."""
     worked = any(r.shown for r in rows)
     view = next((int(r.shown["view"]) for r in rows if "view" in r.shown), None)
@@ -164,7 +164,7 @@ def draw(stored: StoredScan, truth: Truth, rows: list[Row]) -> Figure:
     figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.02, h_pad=0.02, wspace=0.01, hspace=0.01))
     plan = figure.add_gridspec(n_rows + 1, n_columns, height_ratios=[1] * n_rows + [0.07])
     grid = np.array([[figure.add_subplot(plan[i, k]) for k in range(n_columns)] for i in range(n_rows)])
-    reference = Row(caption="reference\neffective\nspectrum", volume=truth.references["effective"])
+    reference = PanelRow(caption="reference\neffective\nspectrum", volume=truth.references["effective"])
     for i, row in enumerate([reference, *rows]):
         _slices(grid[i], row.volume, truth, at, look)
         grid[i, 0].set_ylabel(pictured(row.caption), rotation=0, ha="right", va="center", fontsize=8)

@@ -19,7 +19,7 @@ from ctsim.benchmarks.engine.latex import comment
 from ctsim.benchmarks.engine.record import OK, uncollected
 from ctsim.benchmarks.engine.table import Cell, Column, Table
 from ctsim.benchmarks.engine.texts import escape, harmless
-from ctsim.benchmarks.scores.score import AS_RETURNED, COLUMNS, COMPARED, NMAR, Metric, Row, derived, harm, row_of
+from ctsim.benchmarks.scores.score import AS_RETURNED, COLUMNS, COMPARED, NMAR, Metric, SeedValue, derived, harm, row_of
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest, outdated, remarks
 from ctsim.durable import write_synced
 from ctsim.errors import InputError
@@ -49,7 +49,7 @@ Numbers = dict[Key, Number]
 def numbers(shown: Sequence[RunRecord]) -> Numbers:
     """Return the numbers of records that `records.latest` kept, in their order, those derived from them last."""
     seeds: dict[Key, list[Number]] = defaultdict(list)
-    compared: list[Row] = []
+    compared: list[SeedValue] = []
 
     def add(key: Key, value: float | None, status: str, volume: str = "", identical: bool = False) -> None:
         seeds[key].append((value, None, 0 if value is None else 1, status, volume, identical))
@@ -62,7 +62,7 @@ def numbers(shown: Sequence[RunRecord]) -> Numbers:
             for metric, value in score.values.items():
                 add((*who, protocol, metric), value, *said)
                 if metric in wanted:
-                    compared.append(Row(who[0], run.seed, *who[1:], protocol, metric, value, *said))
+                    compared.append(SeedValue(who[0], run.seed, *who[1:], protocol, metric, value, *said))
         for metric in COLUMNS["cost"] if record.cost is not None else ():
             add((*who, "cost", metric), float(getattr(record.cost, metric)), status)
         if record.cost is None and not any(score.values for score in record.scores.values()):

@@ -34,7 +34,7 @@ ABLATION = "ablation"
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Flags:
     """Print the paper's tables, its own figures beside ours from records, computing nothing."""
 
     results: tyro.conf.Positional[tuple[Path, ...]]
@@ -49,7 +49,7 @@ class Arguments:
 
 def main(arguments: list[str]) -> int:
     """Run the command; return 0. Raises InputError where a folder is not there, or none is given."""
-    given = tyro.cli(Arguments, prog="run-benchmark paper-tables", args=arguments)
+    given = tyro.cli(Flags, prog="run-benchmark paper-tables", args=arguments)
     if not given.results:
         raise InputError("no folder is given, expected one or more with records of run-benchmark")
     for folder in given.results:

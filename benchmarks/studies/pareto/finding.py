@@ -31,14 +31,14 @@ class Mark(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     default: bool = False
 
 
-class Run(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class TimedRun(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One timed run; `warm_up` are the seconds of the call before it that compiled, if there was one."""
 
     marks: tuple[Mark, ...] = ()
     warm_up: float | None = None
 
 
-class Timed(Record[Run], frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Timed(Record[TimedRun], frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The record of a run, which has all that a point needs."""
 
     def __post_init__(self) -> None:
@@ -76,7 +76,7 @@ class Point:
         return self.pair[0], *(self.values[error] for error in errors)
 
 
-def points(records: Sequence[Record[Run]]) -> list[Point]:
+def points(records: Sequence[Record[TimedRun]]) -> list[Point]:
     """Make a point of every mark, in the order of their first appearance."""
     marks = [(r.task, mark) for r in records for run in r.found if run.status == OK for mark in run.marks]
     return [

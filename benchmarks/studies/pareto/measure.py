@@ -26,7 +26,7 @@ from ctsim.benchmarks.scores import metrics
 from ctsim.benchmarks.scores.protocol import Truth, aligned_score, tissue_range, truth_of
 from ctsim.benchmarks.studies.methods.attempt import describe, run_here, scan_for, skip, warm_up
 from ctsim.benchmarks.studies.pareto import Flags, suite
-from ctsim.benchmarks.studies.pareto.finding import Mark, Run
+from ctsim.benchmarks.studies.pareto.finding import Mark, TimedRun
 from ctsim.benchmarks.studies.pareto.suite import EXACT, HIGHEST, SCATTER, Choice, Effort
 from ctsim.noise import Noise
 from ctsim.plan import Plan, make_plan
@@ -44,7 +44,7 @@ USUALLY = Choice(curve=EXACT, label="default")
 _WARM: set[tuple[Hashable, ...]] = set()
 
 
-def measure(task: Task, given: Flags) -> list[Run]:
+def measure(task: Task, given: Flags) -> list[TimedRun]:
     """Take one timed run of a task."""
     host.use_threads(given.threads)
     asked = suite.load(given.suite)
@@ -56,7 +56,7 @@ def measure(task: Task, given: Flags) -> list[Run]:
     return [timed(MethodBench, of, msgspec.convert(task.settings, Effort), task.subject)]
 
 
-def timed(make: Callable[..., Any], of: tuple[Hashable, ...], choice: Any, kind: str) -> Run:
+def timed(make: Callable[..., Any], of: tuple[Hashable, ...], choice: Any, kind: str) -> TimedRun:
     """Time a choice on the bench that `make(*of)` returns, after a warm-up if it is the first of its kind there."""
     first, key = None, (make, *of, kind)
     try:
@@ -67,7 +67,7 @@ def timed(make: Callable[..., Any], of: tuple[Hashable, ...], choice: Any, kind:
         return msgspec.structs.replace(bench.run(choice), warm_up=first)
     except Exception as error:  # a method's failure is a result
         status = "out_of_memory" if isinstance(error, MemoryError) else "error"
-        return Run(ok=False, status=status, reason=describe(error), warm_up=first)
+        return TimedRun(ok=False, status=status, reason=describe(error), warm_up=first)
 
 
 @functools.lru_cache(maxsize=1)  # a scene's tasks come one after the other
@@ -98,7 +98,7 @@ class SimulatorBench:
         """Run the defaults, so that compiling and the reference are not timed with a choice; return the seconds."""
         return sum(mark.seconds for mark in self.run(USUALLY).marks)
 
-    def run(self, choice: Choice) -> Run:
+    def run(self, choice: Choice) -> TimedRun:
         """Time all views of a choice and return its errors."""
         plan, phantom, scanner = self._plan(choice)
         start = time.perf_counter()
@@ -108,7 +108,7 @@ class SimulatorBench:
         s = open_fraction(Scatter(level=HIGHEST), scanner.geometry) if choice.curve == SCATTER else 0.0
         label = f"{choice.label}, {len(plan.rule.energies)} energies"
         mark = Mark(label=label, seconds=seconds, values=self.errors(found, s), default=choice.default)
-        return Run(marks=(mark,))
+        return TimedRun(marks=(mark,))
 
     def errors(self, p: NDArray[np.float32], scatter: float = 0.0) -> dict[str, float]:
         """Compare P of the checked views with the reference, to which `scatter` (S/I0) is added.
@@ -168,17 +168,17 @@ class MethodBench:
         method = find(effort.method, effort.changes)
         return warm_up(method, scan_for(method, self.stored, "metal"))
 
-    def run(self, effort: Effort) -> Run:
+    def run(self, effort: Effort) -> TimedRun:
         """Time one run, with a mark at each stop, the default and the end, or one if the method cannot be watched."""
         method, usual = find(effort.method, effort.changes), find(effort.method).params.get("iterations")
         marks = Marks(score=self.values, stops={*effort.stops, usual, method.params.get("iterations")})
         with watch(marks) if effort.watched else contextlib.nullcontext():
             outcome = skip(method, self.stored, "metal") or run_here(self.stored, "metal", method, 0.0)
         if outcome.status != Status.OK or outcome.values is None or outcome.cost is None:
-            return Run(ok=outcome.status == Status.SKIPPED, status=outcome.status, reason=outcome.reason)
+            return TimedRun(ok=outcome.status == Status.SKIPPED, status=outcome.status, reason=outcome.reason)
         end, around, count = self.values(outcome.values), outcome.cost.wall - marks.watched, len(marks.seen)
         if not count:
-            return Run(marks=(Mark(label=effort.label, seconds=around, values=end, default=effort.default),))
+            return TimedRun(marks=(Mark(label=effort.label, seconds=around, values=end, default=effort.default),))
         # the volume that is returned may be finished, such as by a last cut at 0
         marks.seen[-1] = marks.seen[-1][0], end
         default = min(usual or count, count) if effort.default else None
@@ -187,7 +187,7 @@ class MethodBench:
             for k, (seconds, values) in enumerate(marks.seen, 1)
             if values
         ]
-        return Run(marks=tuple(passed))
+        return TimedRun(marks=tuple(passed))
 
     def values(self, volume: NDArray[np.float32]) -> dict[str, float]:
         """Return RMSE (1/mm) and PSNR3D (dB) of `tissue`, and PSNR3D of `aligned` where it is asked for.

@@ -21,7 +21,7 @@ from ctsim.benchmarks.methods import code_version, find
 from ctsim.benchmarks.scores import score
 from ctsim.benchmarks.studies.methods import estimates
 from ctsim.benchmarks.studies.pareto import Flags, figure, suite, tables
-from ctsim.benchmarks.studies.pareto.finding import Part, Run, Timed, points
+from ctsim.benchmarks.studies.pareto.finding import Part, Timed, TimedRun, points
 from ctsim.benchmarks.studies.pareto.suite import Choice, Effort
 from ctsim.errors import InputError
 from ctsim.folder import is_complete
@@ -36,12 +36,12 @@ VERSION = 2  # of what is measured
 RAY = 6.2e-7  # seconds of the simulator for a pixel of a view by default, on two cores (docs/measured/pareto.md)
 
 
-class Pareto(study.Study[Record[Run], Flags]):
+class Pareto(study.Study[Record[TimedRun], Flags]):
     """The study."""
 
     name = file = "pareto"
     unit = "run"
-    kind, record, flags = Run, Timed, Flags
+    kind, record, flags = TimedRun, Timed, Flags
     work = "ctsim.benchmarks.studies.pareto.measure:measure"
     apart = rounds = True
     estimate = "without compiling, planning and the reference"
@@ -91,7 +91,7 @@ class Pareto(study.Study[Record[Run], Flags]):
         """Whether a record is of this version."""
         return task.version == VERSION
 
-    def pending(self, tasks: Sequence[Task], records: Sequence[Record[Run]], given: Flags) -> list[Task]:
+    def pending(self, tasks: Sequence[Task], records: Sequence[Record[TimedRun]], given: Flags) -> list[Task]:
         """Return the runs that are not recorded: all rounds of a scene before the next one's, which is opened once."""
         return sorted(super().pending(tasks, records, given), key=lambda task: task.place[:1])
 
@@ -105,7 +105,7 @@ class Pareto(study.Study[Record[Run], Flags]):
         fdks = estimates.in_fdks(find(effort.method, effort.changes), geometry) or estimates.UNKNOWN
         return fdks * estimates.fdk_seconds(geometry)
 
-    def took(self, record: Record[Run], given: Flags) -> float:
+    def took(self, record: Record[TimedRun], given: Flags) -> float:
         """Return the seconds of a run, which ended with its last mark."""
         return max((mark.seconds for run in record.found for mark in run.marks), default=0.0)
 
@@ -113,19 +113,19 @@ class Pareto(study.Study[Record[Run], Flags]):
         """Return a scene and a curve."""
         return f"{task.part} {task.case}", task.settings["curve"]
 
-    def tables(self, records: Sequence[Record[Run]], given: Flags) -> list[Table]:
+    def tables(self, records: Sequence[Record[TimedRun]], given: Flags) -> list[Table]:
         """Return the fronts, the defaults and each curve's knee."""
         return tables.summary(records)
 
-    def details(self, records: Sequence[Record[Run]], given: Flags) -> list[Table]:
+    def details(self, records: Sequence[Record[TimedRun]], given: Flags) -> list[Table]:
         """Return every point."""
         return tables.every_point(records)
 
-    def code(self, tasks: Sequence[Task], records: Sequence[Record[Run]], given: Flags) -> int:
+    def code(self, tasks: Sequence[Task], records: Sequence[Record[TimedRun]], given: Flags) -> int:
         """Return the exit code: 1 if a run that was asked for failed, 0 with --table."""
         return super().code(tasks, records, given) if tasks else 0
 
-    def write(self, records: Sequence[Record[Run]], given: Flags) -> str:
+    def write(self, records: Sequence[Record[TimedRun]], given: Flags) -> str:
         """Write the tables and draw the figure."""
         text = super().write(records, given)
         if drawn := points(self.shown(records)):

@@ -9,7 +9,7 @@ from ctsim.benchmarks.studies.pareto.finding import (
     NEAR,
     Part,
     Point,
-    Run,
+    TimedRun,
     enough,
     faster,
     front,
@@ -33,7 +33,7 @@ ABOUT: dict[Part, str] = {
 NUMBERS = ("s", "slowest", *(name for heads in HEADS.values() for name in heads.values()))
 
 
-def summary(records: Sequence[Record[Run]]) -> list[Table]:
+def summary(records: Sequence[Record[TimedRun]]) -> list[Table]:
     """Return the front and the curves of each group, and what failed or was skipped."""
     tables = [table for group in groups(points(records)) for table in (_front(group), _curves(group))]
     bad = [(r.task.settings["curve"], r.task.settings["label"], r.found[0]) for r in records if not r.finished]
@@ -41,7 +41,7 @@ def summary(records: Sequence[Record[Run]]) -> list[Table]:
     return tables + [simple(("not measured", "setting", "status", "reason"), rows)] * bool(rows)
 
 
-def every_point(records: Sequence[Record[Run]]) -> list[Table]:
+def every_point(records: Sequence[Record[TimedRun]]) -> list[Table]:
     """Return a table of all points of each group, each with the errors in which it is on its group's front."""
     tables = []
     for group in groups(points(records)):

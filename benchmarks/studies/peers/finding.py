@@ -1,4 +1,4 @@
-"""What `run-benchmark peers` compares: the catalogue `benchmarks/suites/peers.toml`, and what a contender reaches."""
+"""What `run-benchmark peers` compares: the catalogue `peers.toml` next to it, and what a contender reaches."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -88,7 +88,7 @@ def parse(text: str, where: str) -> Catalogue:
 @functools.cache
 def load() -> Catalogue:
     """Read the bundled catalogue."""
-    file = resources.files("ctsim.benchmarks.suites") / "peers.toml"
+    file = resources.files("ctsim.benchmarks.studies.peers") / "peers.toml"
     return parse(file.read_text(encoding="utf-8"), str(file))
 
 

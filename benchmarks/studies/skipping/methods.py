@@ -23,7 +23,7 @@ from ctsim.benchmarks.studies.methods import study as cli_run
 from ctsim.benchmarks.studies.methods.attempt import scan_for
 from ctsim.benchmarks.studies.methods.volumes import read_volume
 from ctsim.benchmarks.studies.skipping import simulator
-from ctsim.benchmarks.studies.skipping.pairs import Cases, Pair, Setup, largest
+from ctsim.benchmarks.studies.skipping.pairs import Bench, Cases, Pair, largest
 from ctsim.benchmarks.studies.skipping.study import Flags, Skip
 from ctsim.phantoms.scene import scene_to_toml
 from ctsim.reconstruct.fdk import fdk_stream
@@ -37,7 +37,7 @@ HOW = "rows"
 MOVED, MOVED_AT = 1e-5, "tests/test_fdk.py"
 
 
-def made(setup: Setup, *flags: str) -> StoredScan:
+def made(setup: Bench, *flags: str) -> StoredScan:
     """Make the thorax' scan in the setup's folder unless it is there, and open it."""
     scene = setup.scene()
     recipe = setup.folder / "scene.toml"
@@ -89,7 +89,7 @@ def without_metal_check(scan: Scan, name: str) -> torch.Tensor:
 # --- pairs ---------------------------------------------------------------------------------------------
 
 
-def metal_free(setup: Setup) -> Iterator[Pair]:
+def metal_free(setup: Bench) -> Iterator[Pair]:
     """Yield LIMAR and NMAR on the twin, where they stop after FDK, and all they would do for an empty trace."""
     stored = made(setup)
     for name in ("limar", "nmar"):
@@ -105,7 +105,7 @@ def metal_free(setup: Setup) -> Iterator[Pair]:
         )
 
 
-def rows(setup: Setup) -> Iterator[Pair]:
+def rows(setup: Bench) -> Iterator[Pair]:
     """Yield LIMAR and NMAR reconstructing what they change, and reconstructing all of it again.
 
     FDK, the trace and the prior, which both ways need, are prepared.
@@ -133,7 +133,7 @@ def rows(setup: Setup) -> Iterator[Pair]:
         )
 
 
-def stored_scan(setup: Setup) -> Iterator[Pair]:
+def stored_scan(setup: Bench) -> Iterator[Pair]:
     """Yield make-dataset where the scan is there, and made again."""
     stored = made(setup)
     names = sorted(name.removesuffix(".tif") for name in stored.files if name.endswith(".tif"))
@@ -151,7 +151,7 @@ def stored_scan(setup: Setup) -> Iterator[Pair]:
     )
 
 
-def recorded_run(setup: Setup) -> Iterator[Pair]:
+def recorded_run(setup: Bench) -> Iterator[Pair]:
     """Yield run-benchmark where the run is recorded, and run again; both render the tables and pictures."""
     name = made(setup).name
     results = setup.folder / "results"
@@ -174,7 +174,7 @@ CASES: Cases = {"metal-free": metal_free, "rows": rows, "scan": stored_scan, "re
 
 def measure(task: Task, given: Flags) -> list[Skip]:
     """Measure all pairs of a case."""
-    setup = Setup(size=task.part, repeats=given.repeats, folder=_folder())
+    setup = Bench(size=task.part, repeats=given.repeats, folder=_folder())
     return [pair.measure(given.repeats) for pair in (simulator.CASES | CASES)[task.case](setup)]
 
 

@@ -83,7 +83,7 @@ class Pair:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Planned:
+class PlannedScan:
     """A scene's scan, ready to be simulated."""
 
     scene: Scene
@@ -97,7 +97,7 @@ class Planned:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Setup:
+class Bench:
     """How large the cases are, counted runs, and a folder of their own.
 
     `size` "core" is the scene lung-Fe of that suite as it is, "small" one that proves the command only.
@@ -121,13 +121,13 @@ class Setup:
         phantom = msgspec.structs.replace(found.phantom, n_voxel=(24, 24, 24))
         return msgspec.structs.replace(found, phantom=phantom, scanner=scanner)
 
-    def inside_and_outside(self) -> Iterator[Planned]:
+    def inside_and_outside(self) -> Iterator[PlannedScan]:
         """Yield a scan whose metal is seen through the body only, and one whose metal is seen beside it, too."""
         yield from map(self.planned, (self.scene(), self.scene("real", "chicken-Fe")))
 
     def planned(
         self, scene: Scene | None = None, truth: Truth = LINES, *, phantom: Phantom | None = None, **changes: Any
-    ) -> Planned:
+    ) -> PlannedScan:
         """Plan a scene, the thorax by default, with another phantom than its own and with `changes` of its scanner.
 
         It has new views for every run, and one to prepare.
@@ -137,22 +137,22 @@ class Setup:
         geometry = msgspec.structs.replace(scanner.geometry, n_views=1 + self.views * (self.repeats + 1))
         scanner = msgspec.structs.replace(scanner, geometry=geometry)
         plan = make_plan(phantom, scanner, scene.simulation, truth, stream_id(scene))
-        return Planned(scene=scene, plan=plan, phantom=phantom, scanner=scanner)
+        return PlannedScan(scene=scene, plan=plan, phantom=phantom, scanner=scanner)
 
-    def next_views(self, scan: Planned) -> Callable[[], Images]:
+    def next_views(self, scan: PlannedScan) -> Callable[[], Images]:
         """Prepare a scan and make its first view; return what makes the next few views at each call."""
         views = scan.views()
         next(views)
         return lambda: [images for _, images in itertools.islice(views, self.views)]
 
-    def pair(self, what: str, skipping: Planned, whole: Planned, **more: Any) -> Pair:
+    def pair(self, what: str, skipping: PlannedScan, whole: PlannedScan, **more: Any) -> Pair:
         """Return a pair of scans; their P without noise is compared unless `more` says otherwise."""
         ways = {"skipping": self.next_views(skipping), "whole": self.next_views(whole)}
         given: dict[str, Any] = {"difference": partial(apart, names=P_IMAGES)} | ways | more
         return Pair(scene=skipping.scene.name, what=what, **given)
 
 
-def rounding(scan: Planned) -> float:
+def rounding(scan: PlannedScan) -> float:
     """Bound |ΔP| of two ways that take the same rays, or equal ones more often, under a plan that skips nothing.
 
     Each way rounds, in float32: a product and a sum a material in every τ; exp(−τ), within 4e-7·max(1, τ/4)
@@ -168,4 +168,4 @@ def rounding(scan: Planned) -> float:
     return 2 * ((materials * p + energies + rays + 1 + 8 * p) * HALF_ULP + 4e-7 * (1 + p / 4))
 
 
-Cases = dict[str, Callable[[Setup], Iterator[Pair]]]
+Cases = dict[str, Callable[[Bench], Iterator[Pair]]]

@@ -12,7 +12,17 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.benchmarks.studies.skipping.pairs import LINES, Cases, Images, Pair, Planned, Setup, apart, largest, rounding
+from ctsim.benchmarks.studies.skipping.pairs import (
+    LINES,
+    Bench,
+    Cases,
+    Images,
+    Pair,
+    PlannedScan,
+    apart,
+    largest,
+    rounding,
+)
 from ctsim.bricks import Bricks, make_bricks
 from ctsim.phantoms.bodies import Validation
 from ctsim.phantoms.scene import build
@@ -27,7 +37,7 @@ ABSENT = ("Al", "Ti", "Cu", "Au")  # metals that a table may name and a thorax d
 Signals = list[NDArray[np.float32]]
 
 
-def materials(setup: Setup) -> Iterator[Pair]:
+def materials(setup: Bench) -> Iterator[Pair]:
     """Yield a phantom whose table names metals that it does not hold, traced without and with them."""
     body = build(setup.scene())
     scan = setup.planned(phantom=replace(body, materials=body.materials + ABSENT))
@@ -50,7 +60,7 @@ def all_mixed(phantom: Phantom) -> Bricks:
     return found._replace(pool=found.pool >> np.uint8(1))
 
 
-def bricks(setup: Setup) -> Iterator[Pair]:
+def bricks(setup: Bench) -> Iterator[Pair]:
     """Yield path lengths with bricks of one label crossed in one step, and voxel by voxel."""
     scan = setup.planned()
     fast = replace(Tracer.of(scan.phantom), columns=None)
@@ -72,7 +82,7 @@ def bricks(setup: Setup) -> Iterator[Pair]:
     )
 
 
-def rays(setup: Setup) -> Iterator[Pair]:
+def rays(setup: Bench) -> Iterator[Pair]:
     """Yield scans whose rays and primitives are looked at where shadows fall, and everywhere."""
     for scan in setup.inside_and_outside():
         settings = msgspec.structs.replace(scan.plan.settings, skip=False)
@@ -81,7 +91,7 @@ def rays(setup: Setup) -> Iterator[Pair]:
         yield setup.pair(what, scan, every, limit=rounding(every), stated="rounding")
 
 
-def signals(setup: Setup, scan: Planned, tracer: Tracer, response: Response) -> Signals:
+def signals(setup: Bench, scan: PlannedScan, tracer: Tracer, response: Response) -> Signals:
     """Measure the first views of a scan without noise.
 
     No pixel gets further sub-rays for its estimated error: whether it does may depend on the rule.
@@ -95,7 +105,7 @@ def in_logarithm(one: Signals, other: Signals) -> float:
     return largest([np.log(a) for a in one], [np.log(b) for b in other])
 
 
-def energies(setup: Setup) -> Iterator[Pair]:
+def energies(setup: Bench) -> Iterator[Pair]:
     """Yield a scan at the plan's Gauss nodes and at every energy of the spectrum, with the same sub-rays."""
     scan = setup.planned()
     plan, tracer = scan.plan, Tracer.of(compact(scan.phantom, scan.plan.materials))
@@ -117,7 +127,7 @@ def energies(setup: Setup) -> Iterator[Pair]:
     )
 
 
-def edges(setup: Setup) -> Iterator[Pair]:
+def edges(setup: Bench) -> Iterator[Pair]:
     """Yield a scan of solids with sub-rays at their edges, and with all of them wherever a solid's thickness varies.
 
     What is compared is the pixels left to their central ray, in a few views; the others get as many sub-rays as the
@@ -158,7 +168,7 @@ def edges(setup: Setup) -> Iterator[Pair]:
     )
 
 
-def refining(setup: Setup) -> Iterator[Pair]:
+def refining(setup: Bench) -> Iterator[Pair]:
     """Yield scans without and with further sub-rays for edge pixels that are too far off: their cost, not an error."""
     for scan in setup.inside_and_outside():
         settings = msgspec.structs.replace(scan.plan.settings, edge_tolerance=math.inf)
@@ -168,7 +178,7 @@ def refining(setup: Setup) -> Iterator[Pair]:
         yield setup.pair(what, without, scan, limit=None, stated="a choice", note=note)
 
 
-def scatter(setup: Setup) -> Iterator[Pair]:
+def scatter(setup: Bench) -> Iterator[Pair]:
     """Yield a scan without and with the constant scatter of level 1: what level 0 leaves out, not an error."""
     plain, scattering = setup.planned(), setup.planned(scatter=Scatter(level=1))
     note = f"level 1 adds S/I0 = {scattering.plan.scatter_fraction:.2g} to every pixel"
@@ -177,7 +187,7 @@ def scatter(setup: Setup) -> Iterator[Pair]:
     )
 
 
-def twin(setup: Setup) -> Iterator[Pair]:
+def twin(setup: Bench) -> Iterator[Pair]:
     """Yield scans with their metal-free twins, measured in the metal's shadow only, and as two whole scans."""
     for scan in setup.inside_and_outside():
         single = msgspec.structs.replace(LINES, twin=False)
@@ -202,7 +212,7 @@ def in_pairs(scan: Callable[[], Images], bare: Callable[[], Images]) -> Callable
     ]
 
 
-def truth(setup: Setup) -> Iterator[Pair]:
+def truth(setup: Bench) -> Iterator[Pair]:
     """Yield a scan with no more ground truth than is asked for, and with all there is."""
     every = Truth(noise_free=True, scatter_free=True, mono_kev=(60.0,), trace=True, metal_path=True, paths=True)
     asked, all_of_it = (setup.planned(truth=t) for t in (Truth(), every))

@@ -71,7 +71,7 @@ PROGRAMS = {
 """Case, what it is and what is expected, of rows that are no scene; what judges them is in `worker`."""
 
 
-class Row(NamedTuple):
+class StressRow(NamedTuple):
     """One row: a scene, a method (name and settings), both or neither.
 
     `subject` is SIMULATOR, SPLAT_KERNELS or a method's label. `code` hashes scene and sources, which decide the result.
@@ -87,7 +87,7 @@ class Row(NamedTuple):
 
 
 @functools.lru_cache
-def catalogue(path: Path | None = None, methods: tuple[str, ...] = ()) -> dict[tuple[str, str], Row]:
+def catalogue(path: Path | None = None, methods: tuple[str, ...] = ()) -> dict[tuple[str, str], StressRow]:
     """Return all rows by (case, subject), those of methods on the scenes of a file; only those of `methods` if named.
 
     Raises InputError for a file that is wrong and a method that does not exist.
@@ -112,29 +112,29 @@ def _code(module: str) -> str:
     return code_version(f"ctsim.benchmarks.studies.stress.{module}")
 
 
-def _programs(subject: str, module: str) -> Iterator[Row]:
+def _programs(subject: str, module: str) -> Iterator[StressRow]:
     for case, what, expected in PROGRAMS[subject]:
-        yield Row(case, subject, what, expected, _code(module))
+        yield StressRow(case, subject, what, expected, _code(module))
 
 
-def _of_simulator() -> Iterator[Row]:
+def _of_simulator() -> Iterator[StressRow]:
     for scene in load():
         if scene.simulated:
             words = (CLOSED_FORM, MASS if scene.lone else "", CHECKS.get(scene.name, ""))
             expected, code = "; ".join(filter(None, words)), _code("simulator") + scene.digest
-            yield Row(scene.name, SIMULATOR, scene.what, expected, code, scene=scene)
+            yield StressRow(scene.name, SIMULATOR, scene.what, expected, code, scene=scene)
     yield from _programs(SIMULATOR, "simulator")
 
 
-def _of_methods(scenes: Sequence[Scene], names: Sequence[str]) -> Iterator[Row]:
+def _of_methods(scenes: Sequence[Scene], names: Sequence[str]) -> Iterator[StressRow]:
     """Yield every scene by every method, scene by scene, so that methods share scans."""
     methods = [(method, label(*method), _code("methods") + _code_of(method[0])) for method in subjects(names)]
     for scene in scenes:
         for method, named, code in methods if scene.methods else ():
             expected = _expected(method[0], scene)
-            yield Row(scene.name, named, scene.what, expected, code + scene.digest, method, scene)
+            yield StressRow(scene.name, named, scene.what, expected, code + scene.digest, method, scene)
     for method, named, code in methods:
-        yield Row("threads", named, THREADS, BITS, code, method)
+        yield StressRow("threads", named, THREADS, BITS, code, method)
 
 
 def _code_of(name: str) -> str:
@@ -157,7 +157,7 @@ def _expected(name: str, scene: Scene) -> str:
 # --- the command ----------------------------------------------------------------------------------------------
 
 
-class Outcome(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Judged(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How a row ended: `found` says in words what was found; the seconds are those of "row"."""
 
     found: str = ""
@@ -173,7 +173,7 @@ class Outcome(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return sum(self.seconds.get("row", ()))
 
 
-class StressRecord(Record[Outcome], frozen=True, kw_only=True, forbid_unknown_fields=True):
+class StressRecord(Record[Judged], frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The record of a row: one outcome."""
 
     @property
@@ -182,12 +182,12 @@ class StressRecord(Record[Outcome], frozen=True, kw_only=True, forbid_unknown_fi
         return True
 
 
-class Stress(study.Study[Record[Outcome], Flags]):
+class Stress(study.Study[Record[Judged], Flags]):
     """The study."""
 
     name = file = "stress"
     unit = "row"
-    kind, record, flags = Outcome, StressRecord, Flags
+    kind, record, flags = Judged, StressRecord, Flags
     work = "ctsim.benchmarks.studies.stress.worker:judge"
     apart = True
     estimate = "on one idle core, without compiling (a minute)"
@@ -199,11 +199,11 @@ class Stress(study.Study[Record[Outcome], Flags]):
         """Let the process have two threads at least."""
         return {"NUMBA_NUM_THREADS": str(max(2, self.threads))}
 
-    def measure(self, task: Task, given: Flags) -> Sequence[Outcome]:
+    def measure(self, task: Task, given: Flags) -> Sequence[Judged]:
         """Judge a row on the threads that there are."""
         return super().measure(msgspec.structs.replace(task, hints={"threads": self.threads}), given)
 
-    def rows(self, given: Flags) -> dict[tuple[str, str], Row]:
+    def rows(self, given: Flags) -> dict[tuple[str, str], StressRow]:
         """Return the rows by (case, subject)."""
         return catalogue(given.suite, given.method)
 
@@ -231,7 +231,7 @@ class Stress(study.Study[Record[Outcome], Flags]):
         asked = not given.case or task.case in given.case
         return asked and task.part == part(given) and (task.case, task.subject) in self.rows(given)
 
-    def pending(self, tasks: Sequence[Task], records: Sequence[Record[Outcome]], given: Flags) -> list[Task]:
+    def pending(self, tasks: Sequence[Task], records: Sequence[Record[Judged]], given: Flags) -> list[Task]:
         """Return the rows that were not as expected when they last ran, or never ran."""
         last = {} if given.force else {r.task.identity: r.found[0].ok for r in records}
         return [task for task in tasks if not last.get(task.identity)]
@@ -240,7 +240,7 @@ class Stress(study.Study[Record[Outcome], Flags]):
         """Return the seconds that rows of a subject take."""
         return SECONDS.get(task.subject, SECONDS_OF_METHOD)[0 if given.short else 1]
 
-    def took(self, record: Record[Outcome], given: Flags) -> float | None:
+    def took(self, record: Record[Judged], given: Flags) -> float | None:
         """Return the seconds that the row took, if it ended."""
         return record.found[0].took or None
 
@@ -248,7 +248,7 @@ class Stress(study.Study[Record[Outcome], Flags]):
         """Return a line for each case."""
         return task.case, task.hints["what"]
 
-    def tables(self, records: Sequence[Record[Outcome]], given: Flags) -> list[Table]:
+    def tables(self, records: Sequence[Record[Judged]], given: Flags) -> list[Table]:
         """Return what is not as expected, the cases, and every row."""
         side = records[0].task.settings["side"]
         caption = f"{side} voxels a side; {_how_many(records)}; {_seconds(records):.0f} s in all."
@@ -264,7 +264,7 @@ class Stress(study.Study[Record[Outcome], Flags]):
             simple(["case", "subject", "expected", "found", "ok"], rows, title="Rows"),
         ]
 
-    def write(self, records: Sequence[Record[Outcome]], given: Flags) -> str:
+    def write(self, records: Sequence[Record[Judged]], given: Flags) -> str:
         """Write the tables; return what is not as expected. Warns of rows that other sources gave."""
         super().write(records, given)
         shown, path = latest(records), self.folder(given) / f"{self.file}.md"
@@ -281,9 +281,9 @@ def part(given: Flags) -> str:
     return "short" if given.short else "full"
 
 
-def by_case(records: Sequence[Record[Outcome]], caption: str = "") -> Table:
+def by_case(records: Sequence[Record[Judged]], caption: str = "") -> Table:
     """Return a table of the cases, with how many of their rows are as expected."""
-    cases: dict[str, list[Record[Outcome]]] = {}
+    cases: dict[str, list[Record[Judged]]] = {}
     for record in records:
         cases.setdefault(record.task.case, []).append(record)
     rows = [
@@ -294,11 +294,11 @@ def by_case(records: Sequence[Record[Outcome]], caption: str = "") -> Table:
     return simple(["case", "what", *numbers], rows, numbers=numbers, title="Cases", caption=caption)
 
 
-def _seconds(records: Sequence[Record[Outcome]]) -> float:
+def _seconds(records: Sequence[Record[Judged]]) -> float:
     return sum(r.found[0].took for r in records)
 
 
-def _how_many(records: Sequence[Record[Outcome]]) -> str:
+def _how_many(records: Sequence[Record[Judged]]) -> str:
     return f"{sum(r.found[0].ok for r in records)} of {len(records)} rows are as expected"
 
 

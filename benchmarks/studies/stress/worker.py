@@ -8,7 +8,7 @@ import numba
 from ctsim.benchmarks.engine.record import Task
 from ctsim.benchmarks.studies.stress import Flags, methods, simulator, splats
 from ctsim.benchmarks.studies.stress.scans import Findings, carry_out
-from ctsim.benchmarks.studies.stress.study import SIMULATOR, SPLAT_KERNELS, Outcome, Row, catalogue
+from ctsim.benchmarks.studies.stress.study import SIMULATOR, SPLAT_KERNELS, StressRow, Judged, catalogue
 
 PROGRAMS: dict[tuple[str, str], Callable[[int, Findings], None]] = {
     ("flat-solids", SIMULATOR): simulator.flat_solids,
@@ -28,7 +28,7 @@ PROGRAMS: dict[tuple[str, str], Callable[[int, Findings], None]] = {
 """What judges the rows that are no scene, by (case, subject)."""
 
 
-def run(row: Row, side: int, found: Findings) -> None:
+def run(row: StressRow, side: int, found: Findings) -> None:
     """Judge a row on side³ voxels."""
     if row.method is None:
         if row.scene is None:
@@ -41,9 +41,9 @@ def run(row: Row, side: int, found: Findings) -> None:
         methods.on_scene(*row.method, row.scene, side, found)
 
 
-def judge(task: Task, given: Flags) -> list[Outcome]:
+def judge(task: Task, given: Flags) -> list[Judged]:
     """Judge a row on as many threads as the task says."""
     numba.set_num_threads(task.hints["threads"])
     row = catalogue(given.suite, given.method)[task.case, task.subject]
     found, seconds = carry_out(functools.partial(run, row, task.settings["side"]))
-    return [Outcome(ok=not found.wrong, found=str(found), seconds={"row": (round(seconds, 3),)})]
+    return [Judged(ok=not found.wrong, found=str(found), seconds={"row": (round(seconds, 3),)})]
