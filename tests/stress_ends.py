@@ -8,7 +8,7 @@ import numba
 import numpy as np
 
 from ctsim.benchmarks.studies.stress import worker
-from ctsim.benchmarks.studies.stress.study import Stress, StressRow, Judged
+from ctsim.benchmarks.studies.stress.study import Judged, Stress, StressRow
 
 
 def fine(side, found):

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from ctsim.phantoms.scene import Scene
 
-STUDY_SUITES = ("pareto", "peers", "stress", "tune-settings")
+STUDY_SUITES = ("pareto", "stress", "tune-settings")
 """Suites of studies, which make-dataset does not know."""
 
 

@@ -8,7 +8,7 @@ import numba
 from ctsim.benchmarks.engine.record import Task
 from ctsim.benchmarks.studies.stress import Flags, methods, simulator, splats
 from ctsim.benchmarks.studies.stress.scans import Findings, carry_out
-from ctsim.benchmarks.studies.stress.study import SIMULATOR, SPLAT_KERNELS, StressRow, Judged, catalogue
+from ctsim.benchmarks.studies.stress.study import SIMULATOR, SPLAT_KERNELS, Judged, StressRow, catalogue
 
 PROGRAMS: dict[tuple[str, str], Callable[[int, Findings], None]] = {
     ("flat-solids", SIMULATOR): simulator.flat_solids,
