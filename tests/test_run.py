@@ -403,11 +403,11 @@ def use_double(monkeypatch):
 def test_the_command_writes_tables_and_a_picture(tmp_path, monkeypatch, capsys):
     use_double(monkeypatch)
     code, said = command(monkeypatch, capsys, tmp_path, tmp_path / "r", "--method", "test_run:good")
-    assert code == 0 and "Protocol tissue" in said.out
+    assert code == 0 and "(protocol tissue)" in said.out
     names = {p.relative_to(tmp_path / "r").as_posix() for p in (tmp_path / "r").rglob("*") if p.is_file()}
     assert {"records.jsonl", "table.md", "table.csv", "table.tex", "panels/box.png"} <= names
     code, said = command(monkeypatch, capsys, tmp_path, tmp_path / "r", "--table")
-    assert code == 0 and "Protocol tissue" in said.out
+    assert code == 0 and "(protocol tissue)" in said.out
     code, _ = command(monkeypatch, capsys, tmp_path, tmp_path / "r", "--method", "test_run:broken")
     assert code == 1
 
