@@ -14,6 +14,8 @@ from ctsim.benchmarks.suites import load as load_suite
 from ctsim.errors import InputError
 from ctsim.store import list_scans, open_scan
 
+pytestmark = pytest.mark.slow
+
 STUB = """
 from ctsim.errors import InputError
 from ctsim.reconstruct.fdk import reconstruct as fdk

@@ -122,6 +122,7 @@ def ruled(row: Row, seed: int) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 @EACH
 @SEEDED
 def test_bone_lies_inside_the_skin(row: Row, seed: int) -> None:
@@ -142,6 +143,7 @@ def test_nothing_floats_in_air(row: Row, seed: int) -> None:
         assert not (part(phantom, *row.bones) & beside_air).any()
 
 
+@pytest.mark.slow
 @EACH
 @SEEDED
 def test_nothing_is_cut_along_the_grid(row: Row, seed: int) -> None:

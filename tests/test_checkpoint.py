@@ -39,7 +39,7 @@ def test_any_damage_is_refused_in_one_sentence(tmp_path):
     cut = [whole[:n] for n in (0, 1, 31, 32, 33, len(whole) // 2, len(whole) - 1)]
     for damaged in [*flipped, *cut, whole + b"\0", whole[1:], b"PK" * 99]:
         kept.path.write_bytes(damaged)
-        with pytest.raises(InputError, match=r"is damaged .*: delete it to start anew") as caught:
+        with pytest.raises(InputError, match=r"is damaged .*: delete it to start again") as caught:
             kept.read()
         assert str(kept.path) in str(caught.value) and "\n" not in str(caught.value)
 

@@ -42,6 +42,7 @@ def stopped(command, arguments, folder, begun):
     return child.returncode, said
 
 
+@pytest.mark.slow
 def test_a_terminated_make_dataset_goes_on_to_the_same_bytes(tmp_path):
     scene, data = tmp_path / "scene.toml", tmp_path / "data"
     scene.write_text(SMALLEST.replace("n_views = 12", "n_views = 200"), encoding="utf-8")
@@ -54,6 +55,7 @@ def test_a_terminated_make_dataset_goes_on_to_the_same_bytes(tmp_path):
     assert len(hashes) == 1
 
 
+@pytest.mark.slow
 def test_a_terminated_run_benchmark_keeps_its_records_and_goes_on(smallest, tmp_path, monkeypatch, capsys):
     (tmp_path / "waiting_method.py").write_text(WAITING, encoding="utf-8")
     arguments = [smallest, tmp_path / "r", "--method", "fdk", "--method", "waiting_method:reconstruct", "--isolate"]
@@ -85,6 +87,7 @@ def test_what_cannot_go_on_does_not_say_that_it_will(monkeypatch, capsys):
     assert "begins anew" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
 @pytest.mark.parametrize(
     ("command", "words", "shown"),

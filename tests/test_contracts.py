@@ -20,6 +20,7 @@ def stored(smallest):
     return open_scan(list_scans(smallest)[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TABLE)
 def test_a_method_gives_a_finite_volume_of_the_scans_grid(name, stored):
     method = find(name, SHORT.get(name))
@@ -39,6 +40,7 @@ def test_a_method_gives_a_finite_volume_of_the_scans_grid(name, stored):
     assert np.median(water) / 2 < np.median(measured) < 2 * np.median(water)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TABLE)
 def test_a_remark_on_a_truncated_scan_is_no_reason(name, stored):
     """Six columns see 10 mm of an object of three times that, and the mask of no metal is doubted."""
@@ -55,6 +57,7 @@ def test_a_remark_on_a_truncated_scan_is_no_reason(name, stored):
         assert volume.details["mask_status"] == "mask_unreliable" and volume.details["mask_reason"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TABLE)
 def test_a_method_leaves_the_scan_as_it_was_and_repeats_itself(name, stored):
     method = find(name, SHORT.get(name))
@@ -74,6 +77,7 @@ def unlit(scan, kind):
     return torch.full(scan.counts.shape, {"nan": torch.nan, "inf": torch.inf, "negative": -1e6}[kind])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["zero", "dark", "nan", "inf", "negative"])
 @pytest.mark.parametrize(
     "name",

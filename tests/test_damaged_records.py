@@ -44,7 +44,7 @@ KINDS = {
                 study="stress", part="full", case="c", subject="s", settings={"side": 24, "expected": "e"},
                 hints={"what": "w"},
             ),
-            found=(stress.Outcome(found="f", seconds={"row": (1.0,)}),),
+            found=(stress.Judged(found="f", seconds={"row": (1.0,)}),),
             **BY,
         ),
     ),
@@ -133,6 +133,7 @@ def taken(kind: str, ours: Path, theirs: Path) -> None:
     study.store(flags(results=ours, **({"data": ours} if kind == "records" else {}))).collect([theirs])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_damaged_file_is_read_or_refused(kind, tmp_path, caplog):
     """A single exception of another kind is a traceback on every further call on that folder."""

@@ -25,6 +25,7 @@ def test_there_are_examples():
     assert {page.parent.name for page in PAGES} >= {"tutorials", "how-to", "explanation", "reference", "measured"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "text"), MARKED)
 def test_an_example_works(kind, text, smallest, tmp_path, monkeypatch):
     """Python runs where data/ holds a dataset; TOML is read as scenes, one of head.tif, and every phantom is built."""

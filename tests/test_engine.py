@@ -32,7 +32,7 @@ from ctsim.benchmarks.studies.peers.study import Peers
 from ctsim.benchmarks.studies.skipping import simulator
 from ctsim.benchmarks.studies.skipping.pairs import Pair
 from ctsim.benchmarks.studies.skipping.study import Skipping
-from ctsim.benchmarks.studies.stress.study import Outcome, Row, Stress
+from ctsim.benchmarks.studies.stress.study import Judged, Stress, StressRow
 
 COMMIT = "a" * 40
 TINY = tiny_study.Tiny
@@ -111,10 +111,10 @@ def without_peers(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def three_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the stress suite have three rows that find nothing, here."""
-    rows = {(case, "s"): Row(case, "s", "w", "e", "code") for case in STUDIES["stress"].cases}
+    rows = {(case, "s"): StressRow(case, "s", "w", "e", "code") for case in STUDIES["stress"].cases}
 
-    def measure(self: Stress, task: Any, given: Any) -> list[Outcome]:
-        return [Outcome(found="nothing", seconds={"row": (0.5,)})]
+    def measure(self: Stress, task: Any, given: Any) -> list[Judged]:
+        return [Judged(found="nothing", seconds={"row": (0.5,)})]
 
     monkeypatch.setattr(Stress, "apart", False)
     monkeypatch.setattr(Stress, "limit", lambda self, task, given: None if given.seconds == 120 else given.seconds)
@@ -253,6 +253,7 @@ def test_a_line_that_was_cut_short_is_warned_of_once(command, tmp_path, capsys, 
         assert len([r for r in caplog.records if "cut short" in r.getMessage()]) == 1, words
 
 
+@pytest.mark.slow
 def test_what_was_found_may_be_anything_and_is_shown_or_refused(command, tmp_path, capsys):
     """A single exception of another kind is a traceback on every further call on that folder."""
     assert command.call(tmp_path, cases=1) == 0
@@ -299,6 +300,7 @@ def test_records_of_other_folders_are_taken_over(command, measured, tmp_path, ca
     assert command.call(ours) == 0 and measured == done  # what was taken over is not measured again
 
 
+@pytest.mark.slow
 def test_flags_that_cannot_be_are_one_sentence(command, measured, tmp_path, capsys):
     folder, name = tmp_path / "new", command.study.name
     for words, said in (
@@ -428,6 +430,7 @@ def test_what_a_task_raises_ends_the_command_and_keeps_what_is_finished(tiny, tm
     assert tiny(tmp_path, "refuses") == 2 and "run-benchmark tiny: not this one" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [tiny_study.Apart, tiny_study.Tiny])
 def test_a_task_that_hangs_or_dies_is_a_row_and_costs_no_other(tiny, tmp_path, capsys, kind):
     assert tiny(tmp_path, "slow good dies better", "--seconds", "4", kind=kind) == 1
@@ -518,6 +521,7 @@ def test_two_workers_find_the_same_as_one(tiny, tmp_path, capsys):
     assert log(tmp_path / "2")[5:] == ["fails"]
 
 
+@pytest.mark.slow
 def test_a_cluster_finds_the_same_also_within_a_limit(tiny, tmp_path, capsys):
     pytest.importorskip("distributed")
     from distributed import LocalCluster
@@ -541,6 +545,7 @@ def test_a_task_whose_worker_dies_each_time_is_a_row(tiny, tmp_path, capsys):
     assert log(tmp_path).count("dies") == 3
 
 
+@pytest.mark.slow
 def test_workers_keep_limits(tiny, tmp_path, capsys):
     assert tiny(tmp_path, "slow good", "--workers", "2", "--seconds", "3") == 1
     assert sorted(found(tmp_path)) == [("good", "ok", ""), ("slow", "timeout", "did not end within 3 s")]
@@ -575,6 +580,7 @@ def start(folder: Path, *words: str) -> subprocess.Popen:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words", [(), ("--seconds", "600"), ("--workers", "2"), ("--workers", "2", "--seconds", "600")]
 )

@@ -25,6 +25,8 @@ from ctsim.folder import partial_of
 from ctsim.manifest import list_scans, read_manifest, verify
 from ctsim.tiffstack import map_array
 
+pytestmark = pytest.mark.slow
+
 KILLS = int(os.environ.get("CTSIM_FAULTS", "50"))
 VIEWS = 12
 LONG = 300  # views of scenes that are written for a while

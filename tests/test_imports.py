@@ -98,6 +98,7 @@ def test_making_data_does_without_torch():
     )
 
 
+@pytest.mark.slow
 def test_nothing_below_benchmarks_draws_or_talks():
     names = [m for m in modules("benchmarks", "reports") if m != "ctsim.data.make_spectrum_table"]
     assert len(names) > 30
@@ -105,6 +106,7 @@ def test_nothing_below_benchmarks_draws_or_talks():
     assert not (loaded("import " + ", ".join(names)) - brought) & DRAWS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", ["make-dataset", "run-benchmark", *(f"run-benchmark {name}" for name in OTHERS)])
 def test_help_loads_nothing_slow(words):
     command, *more = words.split()
@@ -118,6 +120,7 @@ def test_help_loads_nothing_slow(words):
     assert words in run(code)
 
 
+@pytest.mark.slow
 def test_importing_everything_neither_prints_nor_warns():
     names = modules("reports")
     left_out = {"ctsim.data.make_spectrum_table"}  # it needs what only an extra installs

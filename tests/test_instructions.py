@@ -95,6 +95,7 @@ def here() -> dict[str, np.ndarray]:
     return measure()
 
 
+@pytest.mark.slow
 def test_paths_and_draws_are_the_same_to_the_bit(here, other):
     """Their kernels let the compiler neither fuse nor reorder."""
     for name in ("paths", "counts"):

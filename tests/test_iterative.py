@@ -183,6 +183,7 @@ def test_thread_count_changes_no_bit(name):
     assert all(torch.equal(results[0], other) for other in results)
 
 
+@pytest.mark.slow
 def test_tilted_poses_and_shifted_detectors():
     turn = np.array([[1, 0, 0], [0, np.cos(0.2), -np.sin(0.2)], [0, np.sin(0.2), np.cos(0.2)]])
     poses = (GEOMETRY.pose_array().reshape(-1, 4, 3) @ turn.T).reshape(-1, 12)

@@ -233,6 +233,7 @@ def test_an_update_of_sart_is_that_of_the_definition(threads, positivity):
     assert (x[sums == 0] < 0).any()  # is left alone
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mode", "padding"), [("mirror", "symmetric"), ("zero", "constant")])
 def test_ssim_of_slices_is_that_of_the_definition(threads, mode, padding):
     x, y = normal(*SHAPE), normal(*SHAPE, seed=1)

@@ -227,6 +227,7 @@ HARD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("case", HARD)
 def test_hard_scans_stay_finite_and_counted(name, case):

@@ -118,6 +118,7 @@ def test_nothing_floats(name: str, seed: int) -> None:
     assert pieces_of(made(name, seed).labels > 0, AROUND).max() == 1
 
 
+@pytest.mark.slow
 @EACH
 def test_no_flat_lies_across_an_axis(name: str, seed: int) -> None:
     assert flats(made(name, seed).labels, LEAST) == []

@@ -55,11 +55,12 @@ def limited(*arguments: object) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 def test_planning_and_running_need_few_files_however_many_scans_there_are(many, tmp_path):
-    planned = limited(many, tmp_path / "results", "--dry-run")
+    planned = limited(many, tmp_path / "results", "--method", "fdk", "--dry-run")
     assert planned.returncode == 0 and "200 of 200 runs" in planned.stdout, planned.stderr
     asked = [word for k in range(0, 100, 5) for word in ("--scene", f"s{k:04d}")]
-    done = limited(many, tmp_path / "results", "--no-keep-volumes", *asked)
+    done = limited(many, tmp_path / "results", "--method", "fdk", "--no-keep-volumes", *asked)
     assert done.returncode == 0, done.stderr
     assert [r.status for r in records.read(tmp_path / "results")] == ["ok"] * 40
 

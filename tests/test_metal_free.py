@@ -35,6 +35,7 @@ def scene(recipe: str, seed: int) -> Scene:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("skip", [True, False])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("recipe", RECIPES)

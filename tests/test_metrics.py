@@ -34,6 +34,7 @@ def slicewise(values, reference, data_range):
     return np.mean(maps, 0)
 
 
+@pytest.mark.slow
 def test_ssim_equals_scikit_image_slice_by_slice():
     values, reference = volumes()
     expected = slicewise(values, reference, 0.7).mean()
@@ -121,6 +122,7 @@ def test_compatibility_columns():
     assert metrics.ssim3d_r2(values, np.zeros_like(reference)) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 def test_compatibility_columns_are_always_there_and_are_scikit_images(kind):
     t = truth()

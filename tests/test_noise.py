@@ -79,6 +79,7 @@ def test_gaussian_numbers_follow_the_inverse_distribution_to_seven_digits():
 # --- One view ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [Noise(), Noise(adc_bits=None), Noise(adc_bits=12, electronic=0.0)])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_the_kernel_writes_the_same_counts_as_the_reference(noise, dtype):

@@ -156,6 +156,7 @@ def test_a_scan_with_metal_has_no_notes(smallest):
     assert b"notes" not in text and b"notes" not in (smallest / "smallest" / "plan.json").read_bytes()
 
 
+@pytest.mark.slow
 def test_scoring_it_says_it(data, tmp_path, caplog):
     methods = [word for name in ("fdk", "nmar") for word in ("--method", name)]
     assert run_benchmark([str(data), str(tmp_path), *methods]) == 0

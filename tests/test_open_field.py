@@ -70,6 +70,7 @@ def test_the_simulators_scatter_is_found_in_its_scans(stored):
     assert open_excess(p.numpy(), ~clamped.numpy()) == pytest.approx(0.05, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_fit_undoes_scatter_that_it_finds_itself(stored):
     truth = truth_of(stored)
     found, blind = (reconstruct(stored.scan, **told) for told in ({}, {"scatter": 0.0}))

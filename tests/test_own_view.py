@@ -100,6 +100,7 @@ def stored(smallest):
     return open_scan(list_scans(smallest)[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("isolate", [False, True])
 def test_what_a_method_writes_into_its_scan_is_its_error_and_no_others(stored, tmp_path, isolate):
     (alone,) = run_all(stored, tmp_path / "alone", "mean")

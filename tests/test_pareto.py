@@ -58,6 +58,7 @@ def test_a_scene_is_opened_once_and_each_kind_of_choice_warmed_up_once():
     }
 
 
+@pytest.mark.slow
 def test_the_run_after_one_that_overstayed_warms_up_again():
     def timed_there(process, label, seconds=60.0):
         tried = pareto_ends.Tried(label, "x")
@@ -71,6 +72,7 @@ def test_the_run_after_one_that_overstayed_warms_up_again():
         assert timed_there(process, "a") == first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loaded", ["", "import numba, torch"])
 def test_threads_are_set_before_and_after_the_kernels_are_loaded(loaded):
     code = f"""
@@ -263,6 +265,7 @@ def test_volumes_are_scored_under_aligned_where_that_is_asked_for(smallest):
     assert not bench.values(volume)
 
 
+@pytest.mark.slow
 def test_methods_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(host, "use_threads", lambda threads: None)  # the threads of this process are not ours to set
     out = tmp_path / "out"
@@ -348,6 +351,7 @@ def test_scatter_is_judged_with_scatter(bench):
     assert on < 2 * plain < off
 
 
+@pytest.mark.slow
 def test_simulator_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(host, "use_threads", lambda threads: None)
     choices = "tolerances = [1e-4]\nsubrays = [4]\ngrids = [1.0]\nlevels = [0, 1]"

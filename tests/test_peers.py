@@ -292,6 +292,7 @@ def test_the_command_without_peers_says_so_and_stores_records(tmp_path, monkeypa
     assert (tmp_path / "new" / "peers.md").read_text() in table
 
 
+@pytest.mark.slow
 def test_poly_is_measured_alone_in_a_process_too():
     found = poly.poly(setup("poly", side=16, repeats=1), POLY_SCENE)
     assert [m.contender for m in found] == [name for name in poly.NOTES if name.startswith(OURS)]

@@ -18,7 +18,7 @@ from test_run import GEOMETRY, Double, double, once
 
 from ctsim.benchmarks.scores.protocol import truth_of
 from ctsim.benchmarks.studies.methods import panels
-from ctsim.benchmarks.studies.methods.panels import Row, draw
+from ctsim.benchmarks.studies.methods.panels import PanelRow, draw
 from ctsim.benchmarks.studies.methods.volumes import write_volume
 from ctsim.benchmarks.studies.pareto import figure as pareto_figure
 from ctsim.benchmarks.studies.pareto.finding import points
@@ -62,6 +62,7 @@ def test_a_picture_is_drawn_again_only_where_it_would_show_something_else(tmp_pa
     assert saved(tmp_path, first) == ["box.png"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, OSError])
 def test_a_drawing_that_was_stopped_leaves_the_picture_before(tmp_path, monkeypatch, stop):
     first, second = once("good", tmp_path), once("shows", tmp_path)
@@ -95,7 +96,7 @@ def scored(label, scene, psnr):
 def test_panels_draw_the_very_text(text):
     stored = replace(double(Path()), name=f"scene {text}")
     truth = truth_of(stored)
-    shown = text_of(draw(stored, truth, [Row(caption=text, volume=truth.references["effective"])]))
+    shown = text_of(draw(stored, truth, [PanelRow(caption=text, volume=truth.references["effective"])]))
     assert f"\n{text}\n" in shown and f"scene {text} · protocol" in shown
 
 

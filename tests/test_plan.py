@@ -3,6 +3,7 @@
 import tracemalloc
 
 import numpy as np
+import pytest
 
 from ctsim.phantoms.bodies import Validation
 from ctsim.phantoms.recipes import build_recipe
@@ -34,6 +35,7 @@ def test_the_edge_error_is_found_where_inserts_are_and_falls_with_sub_rays():
     assert "worst edge pixel" in plan(parts).text() and "edge pixel" not in plan((no_solids, parts[1])).text()
 
 
+@pytest.mark.slow
 def test_the_memory_that_a_plan_names_is_what_simulating_takes():
     tracemalloc.start()
     try:

@@ -343,6 +343,7 @@ def test_answers_come_by_number(opened):
     assert ended(opened.answers(len, [])) == {}
 
 
+@pytest.mark.slow
 def test_a_job_that_kills_its_process_each_time_is_given_up_and_the_others_done(opened):
     found = ended(opened.answers(jobs.job, ["die", "two"]))
     assert isinstance(found[0], Lost) and found[1].startswith("two")
@@ -443,6 +444,7 @@ def test_a_job_that_cannot_be_sent_costs_the_pool_no_process():
 # --- a cluster --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("workers", "scheduler", "said"),
     [
@@ -468,6 +470,7 @@ def test_what_workers_are_asked_for():
         assert isinstance(found, Pool)
 
 
+@pytest.mark.slow
 def test_a_cluster_that_loses_all_its_workers_goes_on_with_those_that_come(cluster):
     address, client = cluster
     with Cluster(address) as found:
@@ -534,6 +537,7 @@ def certificate(folder: Path, name: str) -> dict[str, str]:
     return {"ca-file": str(cert), "cert": str(cert), "key": str(key)}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl, which makes the certificates, is not installed")
 def test_a_scheduler_with_certificates_works_for_those_who_have_them_alone(tmp_path, monkeypatch):
     config = pytest.importorskip("dask").config

@@ -58,6 +58,7 @@ def reference_lengths(tracer, geometry, view):
     return lengths
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solids", [(), INSERTS], ids=["body", "body and solids"])
 @pytest.mark.parametrize("dense", [False, True])
 def test_path_lengths_equal_the_reference(solids, dense):
@@ -162,6 +163,7 @@ def response(materials=MATERIALS):
     return Response.of(rule, materials)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("tolerance", "views"), [(math.inf, 2), (0.2, 1)])
 def test_intensities_equal_the_reference(tolerance, views):
     tracer, g, r = Tracer.of(blobs(solids=INSERTS)), geometry(n_detector=(6, 9), n_views=2, pixel=6.0), response()
@@ -272,6 +274,7 @@ def rods_in_air(rods, mu, g, view, finer):
     return -np.log(np.exp(-tau).reshape(n_v, finer, n_u, finer).mean((1, 3)))
 
 
+@pytest.mark.slow
 def test_pixels_that_a_bright_sliver_decides_are_refined():
     rods = [
         ((-4.0, -3.0, 2.0), (0.1, 0.25, 1.0), 3.0, 10.0),

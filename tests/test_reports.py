@@ -31,6 +31,8 @@ from ctsim.benchmarks.studies.stress import study as stress
 from ctsim.errors import InputError
 from ctsim.reports import figures, kept, report, show, slices, view
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 METHODS = ("fdk", "limar", "nmar")
 NOTEBOOKS = ROOT / "reports" / "notebooks"
@@ -186,7 +188,7 @@ def stress_record(folder, ok, found, *, case="starved", subject="fdk"):
         study="stress", part="short", case=case, subject=subject, settings={"side": 16, "expected": "finite"},
         hints={"what": "no photons"},
     )  # fmt: skip
-    outcome = stress.Outcome(ok=ok, found=found, seconds={"row": (0.5,)})
+    outcome = stress.Judged(ok=ok, found=found, seconds={"row": (0.5,)})
     record = stress.StressRecord(
         task=task, found=(outcome,), host=host.host(), commit="0" * 40, time="2026-01-01T00:00:00"
     )

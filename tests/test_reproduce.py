@@ -85,6 +85,7 @@ def test_a_dry_run_plans_scans_and_lists_runs(tmp_path, capsys):
     assert "on 1 scans to be made and their twins: 16 s" in out
 
 
+@pytest.mark.slow
 def test_one_command_makes_the_scans_the_records_and_the_verdict(tmp_path, monkeypatch, capsys):
     suite = tmp_path / "suite.toml"
     suite.write_text(SMALLEST.replace('"smallest"', '"lung-Fe"'), encoding="utf-8")

@@ -17,7 +17,7 @@ from ctsim.benchmarks.scores.protocol import truth_of
 from ctsim.benchmarks.scores.score import NOT_ASKED
 from ctsim.benchmarks.studies.methods import attempt, plan, records
 from ctsim.benchmarks.studies.methods import study as cli_run
-from ctsim.benchmarks.studies.methods.panels import Row, cut, draw, write_panels
+from ctsim.benchmarks.studies.methods.panels import PanelRow, cut, draw, write_panels
 from ctsim.benchmarks.studies.methods.tables import caption
 from ctsim.benchmarks.studies.methods.volumes import (
     at_50kev_of,
@@ -184,6 +184,7 @@ def test_failures_have_a_status_and_a_reason(tmp_path, name, status, reason):
     assert records.read(tmp_path) == [record]
 
 
+@pytest.mark.slow
 def test_isolated_runs_end_as_they_do_here(tmp_path):
     record = once("good", tmp_path, isolate=True)
     assert record.status == "ok" and record.cost.isolated and record.scores == once("good", tmp_path).scores
@@ -196,6 +197,7 @@ def test_a_time_limit_is_a_status(tmp_path):
     assert record.status == "timeout" and "0.5 s" in record.reason
 
 
+@pytest.mark.slow
 def test_a_method_that_can_be_told_its_seconds_ends_by_itself(tmp_path):
     told = methods.within(methods.find("test_run:punctual"), 0.5)
     assert told.label == "test_run:punctual[seconds=0.5]"
@@ -206,6 +208,7 @@ def test_a_method_that_can_be_told_its_seconds_ends_by_itself(tmp_path):
     assert methods.within(mine, 0.5) == mine and methods.within(methods.find("fdk"), 0.5) == methods.find("fdk")
 
 
+@pytest.mark.slow
 def test_the_command_leaves_a_method_that_knows_its_seconds_the_time_to_end(smallest, tmp_path, monkeypatch, capsys):
     words = ("--method", "test_run:punctual", "--method", "test_run:slow", "--no-anchor", "--seconds", "0.5")
     assert command(monkeypatch, capsys, smallest, tmp_path, *words)[0] == 1
@@ -214,6 +217,7 @@ def test_the_command_leaves_a_method_that_knows_its_seconds_the_time_to_end(smal
     assert {r.inputs for r in found.values()} == {"counts only"}  # a class of its own would be another table
 
 
+@pytest.mark.slow
 def test_a_warm_up_goes_on_until_nothing_is_left_to_compile(tmp_path):
     CALLS.clear()
     seconds = attempt.warm_up(methods.find("test_run:compiling"), double(tmp_path).scan)
@@ -293,6 +297,7 @@ def test_panels_show_every_kept_volume(tmp_path):
     assert write_panels([record], [double(tmp_path)], tmp_path) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("isolate", [False, True])
 def test_what_a_method_knows_of_50_kev_is_scored_there_and_kept(tmp_path, isolate):
     record, plain = once("spectral", tmp_path, isolate=isolate), once("good", tmp_path)
@@ -330,6 +335,7 @@ def test_reading_at_50_kev_is_no_time_of_the_method(tmp_path):
     assert outcome.status == "ok" and outcome.cost is not None and outcome.cost.wall < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("isolate", [False, True])
 def test_what_a_method_worked_with_is_kept_beside_its_volume(tmp_path, isolate):
     record = once("shows", tmp_path, isolate=isolate)
@@ -344,6 +350,7 @@ def test_what_a_method_worked_with_is_kept_beside_its_volume(tmp_path, isolate):
         kept(tmp_path, record)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("isolate", [False, True])
 def test_a_record_keeps_what_a_method_says_of_its_result(tmp_path, isolate):
     record = once("talks", tmp_path, isolate=isolate)
@@ -360,7 +367,7 @@ def test_panels_hold_what_each_method_gave():
     stored = double(Path())
     truth = truth_of(stored)
     reference = truth.references["effective"]
-    rows = [Row(caption="fdk", volume=reference + np.float32(0.001))]
+    rows = [PanelRow(caption="fdk", volume=reference + np.float32(0.001))]
     plain = images(draw(stored, truth, rows))
     # the reference has two slices, the method two and their errors
     assert len(plain) == 2 + 4
@@ -370,7 +377,7 @@ def test_panels_hold_what_each_method_gave():
     clims = np.array([a.images[0].get_clim() for a in plain])
     assert clims == pytest.approx(np.array([[0, 0.05]] * 4 + [[-0.02, 0.02]] * 2), abs=1e-8)
     found = attached(shows(stored.scan, device="cpu").details, GEOMETRY)
-    all_axes = images(draw(stored, truth, [*rows, Row(caption="nmar", volume=reference, shown=found)]))
+    all_axes = images(draw(stored, truth, [*rows, PanelRow(caption="nmar", volume=reference, shown=found)]))
     measured, bridged = (a for a in all_axes if a.images[0].get_array().shape == GEOMETRY.n_detector)
     assert np.allclose(measured.images[0].get_array(), np.log(2.0), atol=1e-6)  # 1000 counts of 2000
     assert np.allclose(bridged.images[0].get_array(), 0.7) and len(bridged.collections) == 1  # the trace's outline

@@ -375,6 +375,7 @@ ABSURD = {
 ABSURDITIES = [(path, value) for path, values in ABSURD.items() for value in values]
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(
     plain=table(

@@ -31,6 +31,7 @@ def rows_of(kind, seed):
     return pack([Solid(name="s", material="Fe", primitives=pieces, metal=True)], ("air", "Fe"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SIZES)
 def test_no_ray_that_meets_a_primitive_lies_outside_its_shadow(kind):
     prims, (n_v, n_u) = rows_of(kind, kind), GEOMETRY.n_detector

@@ -56,6 +56,7 @@ VOLUMES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("solid", "expected"), VOLUMES)
 def test_volume_has_its_closed_form(solid, expected):
     # Midpoint rule over 101² chords: 1 % bounds its error for all of these; a wrong size is off by far more.

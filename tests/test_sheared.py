@@ -91,6 +91,7 @@ def test_central_rays_have_a_balls_chord_with_and_without_skipping(case, lengths
         assert np.count_nonzero(tau) > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("body", [False, True])
 def test_skipping_changes_nothing(case, body):
@@ -108,6 +109,7 @@ def test_skipping_changes_nothing(case, body):
         np.testing.assert_allclose(lengths[0], want, atol=4e-6)  # float32 of lengths below 30 mm
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_pixels_hold_a_balls_mean_intensity(case):
     g, ball, finer = sheared(*case), ((4.0, -3.0, 5.0), 7.0), 64
@@ -142,6 +144,7 @@ def test_a_ball_in_the_corner_of_a_pixel_is_seen(case, corner):
     assert not lost.any()  # sums of ones are exact
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_a_scan_is_the_same_with_and_without_skipping(case):
     there = phantom(solid((4.0, -3.0, 5.0), (7.0, 3.0, 5.0)), body=True)

@@ -156,6 +156,7 @@ def test_scatter_does_not_carry_the_heel_of_the_pixel_it_meets(fraction):
     np.testing.assert_allclose(flat / machine.i0, np.broadcast_to(heel, flat.shape), rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("skip", [True, False])
 def test_tigre_noise_is_normalised_by_the_largest_p_of_the_whole_scan(skip):
     # seen along its length in one view of two, the rods make P far larger there
@@ -269,6 +270,7 @@ def test_arbitrary_poses_give_what_the_orbit_gives():
     np.testing.assert_array_equal(orbit["counts"], posed["counts"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case",
     [

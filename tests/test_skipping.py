@@ -19,6 +19,8 @@ from ctsim.phantoms.scene import build
 from ctsim.project import Tracer, transmit
 from ctsim.scatter import Scatter, open_fraction
 
+pytestmark = pytest.mark.slow
+
 CASES = get_args(skipping.Case)
 
 

@@ -137,6 +137,7 @@ def matrices(geometry, lattice):
     return forward, np.stack([projector.adjoint(projector.arranged(one), view)[:, 0] for one in pixels], 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("z", range(2, 8))
 def test_rounding_at_the_cutoff_is_the_same_in_both_directions(z):
     geometry, support = shifted(GEOMETRY, n_detector=(13, 11)), np.zeros(GEOMETRY.n_voxel, bool)

@@ -169,6 +169,7 @@ def test_subsets_come_in_the_order_of_their_reversed_bits():
     assert sorted(bit_reversed(37)) == list(range(37))
 
 
+@pytest.mark.slow
 def test_it_beats_fdk_with_and_without_metal(small):
     truth = truth_of(small)
     for scan in (small.scan, small.metal_free.scan):
@@ -176,6 +177,7 @@ def test_it_beats_fdk_with_and_without_metal(small):
         assert ours < 0.6 * theirs  # measured: 0.52 and 0.53
 
 
+@pytest.mark.slow
 def test_two_passes_over_the_finest_grid_reach_35_db(tmp_path):
     """Prototypes on as many voxels, views and pixels, but another object, had 34.9 dB quickly and 36.0 after more.
 
@@ -205,6 +207,7 @@ def test_steps_shorten_in_the_last_passes(passes, begins):
     assert step_length(float(passes), passes) == 1 / (3 if passes > 3 else 2)
 
 
+@pytest.mark.slow
 def test_shorter_steps_in_the_last_passes_let_the_fit_settle(small, monkeypatch):
     given, thin = small.scan, 300  # of the dose, so that subsets disagree by noise
     signal = np.maximum(given.counts.numpy().astype(np.float64) - given.dark, 0) / thin
@@ -278,6 +281,7 @@ def test_poses_need_no_circle(stored):
     assert torch.equal(found, reconstruct(stored.scan, passes=(1, 1)).values)
 
 
+@pytest.mark.slow
 def test_a_dark_that_cannot_be_is_called_divergence(tmp_path):
     (tmp_path / "scene.toml").write_text(SMALL.replace("Ti", "Fe"), encoding="utf-8")
     assert make_dataset([str(tmp_path / "scene.toml"), str(tmp_path / "data")]) == 0
@@ -312,6 +316,7 @@ def test_values_without_sense_are_refused_by_name(stored):
             reconstruct(stored.scan, **bad)
 
 
+@pytest.mark.slow
 def test_early_passes_and_coarser_grids_denoise_more(small, monkeypatch):
     told, denoise = [], Lattice.denoise
 
@@ -333,6 +338,7 @@ class Interrupted(Exception):
     pass
 
 
+@pytest.mark.slow
 def test_an_interrupted_fit_goes_on_to_the_same_bits(small, tmp_path, monkeypatch):
     monkeypatch.setattr("ctsim.reconstruct.splat.checkpoint.EVERY", 0.0)
     shares: list[float] = []

@@ -109,6 +109,7 @@ def integrals(shapes, camera, n_v, n_u):
     return total * (t[1] - t[0]) / np.sqrt(a)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", GEOMETRIES)
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_exact_form_is_the_integral_along_the_ray(name, kind):

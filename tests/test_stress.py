@@ -48,6 +48,7 @@ def judged(row, side=SMALLEST):
     return carry_out(functools.partial(worker.run, row, side))[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", CASES, ids=lambda row: f"{row.case}-{row.subject}")
 def test_a_case_is_as_expected(row):
     found = judged(row)
@@ -129,6 +130,7 @@ def test_a_volume_that_depends_on_the_number_of_threads_is_reported(monkeypatch)
 # --- how rows end ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_hang_a_crash_and_a_warning_are_failed_rows_and_the_rest_goes_on(tmp_path, capsys):
     assert engine.main(Ends(), [str(tmp_path), "--short"]) == 1
     records = {r.task.case: r.found[0] for r in Ends().store(study.Flags(results=tmp_path)).read()}
@@ -144,9 +146,9 @@ def test_the_process_can_have_two_threads_and_a_row_has_those_that_there_are(mon
     monkeypatch.setattr(study.host, "threads", lambda: 1)
     given = study.Flags(results=tmp_path)
     stress = Threads()
-    with engine._Here(stress, given) as here:
+    with engine._measuring(stress, given) as record:
         (task,) = [t for t in stress.tasks(given) if t.case == "fine"]
-        assert here.record(task).found[0].found == "1 of 2 threads"
+        assert record(task).found[0].found == "1 of 2 threads"
 
 
 def test_an_infinite_value_and_a_missing_refusal_are_found():
@@ -199,6 +201,7 @@ def test_a_row_that_crashes_after_it_was_as_expected_is_shown_so(command, monkey
     assert command("--case", "fine", "--force") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kvp", [20.0, 33.3, 90.0, 300.0])
 def test_a_scan_finds_the_table_of_its_tube(kvp):
     given = scan_of(tube=Tube(kvp=kvp)).scan
@@ -224,6 +227,7 @@ def everywhere(monkeypatch, name, value):
         monkeypatch.setattr(module, name, value)
 
 
+@pytest.mark.slow
 def test_dead_pixels_are_left_out_by_weight_0(monkeypatch):
     """A pixel that never sees anything has P = 0, as an open one: counted in, it carves the object away."""
     given = scan_of(noise=Noise(dead_fraction=0.02))
@@ -234,6 +238,7 @@ def test_dead_pixels_are_left_out_by_weight_0(monkeypatch):
     assert masked < 0.2 < 2 * masked < error(given)
 
 
+@pytest.mark.slow
 def test_starved_rays_count_for_little(monkeypatch):
     """Iron at a thousand photons: rays behind it say nothing but noise, at unit weight as loudly as the others."""
     given = scan_of("water", "bone", Rod(material="Fe", radius=5.0, at=(9.0, 2.0)), i0=1e3)
@@ -246,6 +251,7 @@ def test_starved_rays_count_for_little(monkeypatch):
     assert 1.4 * weighted < error(given)  # 0.16 and 0.29
 
 
+@pytest.mark.slow
 def test_ssim_has_one_range_for_all_views():
     """With a range of its own a view of air and noise would weigh as much as one of iron."""
     given = scan_of("water", Rod(material="Fe", radius=5.0))

@@ -161,6 +161,7 @@ def test_only_methods_that_are_like_each_other_are_held_against_the_other_form(t
     assert [name for name, has in others.items() if has] == ["fdk"]
 
 
+@pytest.mark.slow
 def test_methods_of_the_users_own_run_on_scenes_of_their_own(tmp_path, own, capsys):
     text = HEAD + "near = false\n" + HEAD.replace("own", "bare") + "scanner.geometry.n_views = 1\n"
     (tmp_path / "own.toml").write_text(text, encoding="utf-8")

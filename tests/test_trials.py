@@ -59,6 +59,7 @@ def greatest_error(source, detector, names, longest, rng):
     return float(np.max(np.abs(-np.log(np.exp(-paths @ mu_rule) @ rule.w1) - exact))), rule
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("table", [USUAL, EXOTIC], ids=["usual", "exotic"])
 def test_rule_keeps_its_tolerance_in_random_chemistries(table):
     for seed in range(int(os.environ.get("CTSIM_CHEMISTRIES", "24"))):

@@ -213,6 +213,7 @@ def masked(scan, *, device, mask="oracle"):
     return Volume(values=scan.metal.to(torch.float32))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("isolate", [False, True])
 def test_the_true_mask_goes_to_methods_that_ask_for_it_and_is_empty_in_the_twin(tmp_path, isolate):
     twin, record = do(tmp_path, name="masked", isolate=isolate)[1]

@@ -14,6 +14,8 @@ from test_cli import stopped
 from ctsim.benchmarks import cli
 from ctsim.benchmarks.engine import dask as dask_jobs
 
+pytestmark = pytest.mark.slow
+
 SUITE = """
 [defaults.scanner]
 n_views = 12

@@ -55,6 +55,7 @@ def counted(monkeypatch, fail_at: int, error: BaseException, *, forever: bool) -
     return calls
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("forever", [False, True])
 def test_interrupted_at_any_system_call_it_resumes_to_the_same_bytes(tmp_path, whole, monkeypatch, forever):
     with monkeypatch.context() as patch:
@@ -234,6 +235,7 @@ sys.exit(make_dataset())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n_detector", "n_voxel"), [([128, 128], [10, 12, 12]), ([12, 12], [64, 64, 64])], ids=["stack", "volume"]
 )
