@@ -111,8 +111,8 @@ def _cell(values: Sequence[float | None], failed: str, best: Sequence[bool]) -> 
         return Text(failed.rjust(len(HEAD)), "red")
     out = Text()
     for k, (value, (protocol, metric, width)) in enumerate(zip(values, SHOWN, strict=True)):
-        digits = 1 if metric == "wall" else COLUMNS[protocol][metric].digits
-        text = "–" if value is None else f"{value:.{digits}f}"
+        form = f".{COLUMNS[protocol][metric].digits}f" if metric != "wall" else ".2g" if (value or 0) < 10 else ".0f"
+        text = "–" if value is None else f"{value:{form}}"
         out.append("  " if k else "").append(text.rjust(width), "bold" if k < len(best) and best[k] else "")
     return out
 
