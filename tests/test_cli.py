@@ -84,7 +84,7 @@ def test_what_cannot_go_on_does_not_say_that_it_will(monkeypatch, capsys):
 
     monkeypatch.setattr("ctsim.benchmarks.tools.tune_nmar.main", stopped)
     assert cli.guarded("tune_nmar", "ctsim.benchmarks.tools.tune_nmar", [], resumes=False) == 130
-    assert "begins anew" in capsys.readouterr().err
+    assert "from the beginning" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -121,10 +121,10 @@ def test_a_scan_is_of_one_version_of_the_simulator(tmp_path, suite, monkeypatch,
     other_code("v2")
     capsys.readouterr()
     assert main([suite, str(data), "--only", "rods", "--dry-run"]) == 0
-    assert "begun by other code of the simulator, so they begin anew: rods\n" in capsys.readouterr().out
+    assert "begun by other code of the simulator, so they start again: rods\n" in capsys.readouterr().out
     assert main([suite, str(data), "--only", "rods"]) == 0
     error = capsys.readouterr().err
-    assert "begin anew: rods\n" in error and "goes on from view" not in error
+    assert "start again: rods\n" in error and "goes on from view" not in error
     assert (open_scan(data / "rods").scan.counts.numpy() == 1).all() and verify(data) == []
     assert read_manifest(data / "rods").code == read_index(data)["rods"].code == "v2"
 

@@ -41,6 +41,26 @@ def test_many_scenes_are_averaged():
     assert row(text, "fdk") == ["23.00", "0.500", "1.5"]
 
 
+def test_scenes_that_do_not_fit_side_by_side_go_into_a_second_table():
+    text = overview.overview(records([f"scene-{k}" for k in range(5)]))
+    assert max(map(len, text.splitlines())) <= WIDEST and text.count("method") == 2
+    assert all(f"scene-{k}" in text for k in range(5)) and "mean" not in text
+
+
+def test_a_narrow_terminal_loses_no_number(monkeypatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "80")
+    text = re.sub(r"\x1b\[[\d;]*m", "", overview.overview(records()))
+    assert max(map(len, text.splitlines())) <= 80 and text.count("method") == 2
+    assert "…" not in text and text.count("25.00") == 1 and text.count("0.500") == 12
+
+
+def test_of_many_failures_the_first_are_named(tmp_path):
+    given = [record(f"m{k}", "lung-Fe", status="timeout") for k in range(25)]
+    text = overview.text(given, tmp_path / "r", tmp_path / "d")
+    assert text.count("timeout – ") == 10 and "15 more runs failed or were skipped, see table.md" in text
+
+
 def test_a_method_without_a_scene_has_no_mean_over_all():
     given = [r for r in records([f"s{k}" for k in range(7)]) if (r.label, r.run.scene) != ("splat", "s3")]
     assert row(overview.overview(given), "splat") == ["–", "–", "–"]

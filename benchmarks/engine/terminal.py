@@ -64,8 +64,7 @@ class Bar:
             self._rich.update(self._task, completed=done, description=text or None)
         elif text or (time.monotonic() - self._said > EVERY):
             self._said = time.monotonic()
-            line = f"{done}/{self._total} {self._unit}s" if self._unit else f"{done}/{self._total}"
-            self._stream.write(f"{line}: {text}\n" if text else f"{line}\n")
+            self._stream.write(f"{done}/{self._total} {self._unit}s{': ' if text else ''}{text}\n")
             self._stream.flush()
 
     def over(self, items: Iterable[T], text: str) -> Iterator[T]:
@@ -74,6 +73,12 @@ class Bar:
         for item in items:
             yield item
             self.at(self.done + 1)
+
+
+def width() -> int:
+    """Return how many columns a table may take: those of the terminal, at most `WIDEST`."""
+    console = Console()
+    return min(WIDEST, console.width) if console.is_terminal else WIDEST
 
 
 def rendered(*parts: RenderableType) -> str:
@@ -86,7 +91,7 @@ def rendered(*parts: RenderableType) -> str:
         file=io.StringIO(),
         force_terminal=plain.is_terminal,
         color_system=plain.color_system,  # type: ignore[arg-type]
-        width=min(WIDEST, plain.width) if plain.is_terminal else WIDEST,
+        width=width(),
         highlight=False,
         legacy_windows=False,
     )

@@ -49,7 +49,6 @@ def run(options: Flags) -> int:
 
 
 def _verify(data_dir: Path) -> int:
-
     problems = verify(data_dir)
     for text in [*problems, *remarks(data_dir)]:
         say(text)
@@ -59,7 +58,6 @@ def _verify(data_dir: Path) -> int:
 
 
 def _dry_run(scenes: tuple[Scene, ...], options: Flags) -> int:
-
     there = {} if options.out is None else _finished(scenes, options.out, options.force)
     seconds, size = 0.0, 0
     for scene in scenes:
@@ -82,7 +80,6 @@ def _finished(scenes: tuple[Scene, ...], out: Path, force: bool) -> dict[str, Ma
 
 
 def _complete(manifest: Manifest) -> str:
-
     return f"{manifest.name}: already complete" + (", by other code" if manifest.code != source_hash() else "")
 
 
@@ -91,9 +88,9 @@ def _of_other_code(scenes: tuple[Scene, ...], there: dict[str, Manifest], out: P
     code = source_hash()
     said = [other_code([m for m in there.values() if m.code != code], len(there))]
     left = unfinished(out) if out else {}
-    anew = [s.name for s in scenes if s.name not in there and s.name in left and left[s.name].code != code]
-    if anew:
-        said.append(f"begun by other code of the simulator, so they begin anew: {listing(anew)}")
+    again = [s.name for s in scenes if s.name not in there and s.name in left and left[s.name].code != code]
+    if again:
+        said.append(f"begun by other code of the simulator, so they start again: {listing(again)}")
     return [text for text in said if text]
 
 
@@ -109,8 +106,7 @@ class SceneJob:
 
 
 def _make(scenes: tuple[Scene, ...], out: Path, options: Flags) -> int:
-
-    source_hash()  # of the code that is loaded, whatever becomes of its files meanwhile
+    source_hash()  # of the code that is loaded, even if its files change meanwhile
     recover(out)
     # what is in the way shows before the first hour is spent, not after it
     there = _finished(scenes, out, options.force)
@@ -165,7 +161,7 @@ def _watch(bar: Bar, name: str, title: str, views: Iterable[T], first: int, n_vi
 
 
 def say(text: str) -> None:
-    """Write a line for people, beside what the command prints."""
+    """Write a line for people, to stderr."""
     sys.stderr.write(text + "\n")
 
 
@@ -195,7 +191,7 @@ def do(job: SceneJob) -> None:
     """
     name, waited = job.scene.name, 0.0
     if source_hash() != job.code:
-        raise InputError(f"{name}: a worker runs other code of the simulator than make-dataset; start the workers anew")
+        raise InputError(f"{name}: a worker runs other code of the simulator than make-dataset; restart the workers")
     while job.force or not is_complete(job.out, name, scene_id(job.scene)):
         try:
             make_scene(job.scene, job.out, plan=job.plan, force=job.force)

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ctsim.benchmarks.engine.record import OK
-from ctsim.benchmarks.engine.terminal import WIDEST, rendered
+from ctsim.benchmarks.engine.terminal import rendered, width
 from ctsim.benchmarks.engine.texts import one_line, ranked
 from ctsim.benchmarks.scores.score import COLUMNS
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest
@@ -20,8 +20,14 @@ PROTOCOL = "tissue"
 SHOWN = ((PROTOCOL, "psnr3d", 5), (PROTOCOL, "ssim3d", 5), ("cost", "wall", 6))
 """Protocol, metric and width of the numbers of a scene."""
 HEAD = "  ".join(f"{title:>{width}}" for title, (_, _, width) in zip(("PSNR", "SSIM", "s"), SHOWN, strict=True))
-MEAN = "mean"
-Cells = dict[str, list[float | None]]
+Row = tuple[str, str]
+"""Inputs and method."""
+Values = dict[tuple[str, Row], list[float | None]]
+"""Numbers by scene and row, as in `SHOWN`."""
+MOST_TABLES = 2
+"""Tables below each other, into which scenes are parted; more scenes are averaged."""
+MOST_FAILURES = 10
+"""Runs that failed or were skipped and are named."""
 
 
 def text(records: Sequence[RunRecord], results: Path, data: Path) -> str:
@@ -29,7 +35,7 @@ def text(records: Sequence[RunRecord], results: Path, data: Path) -> str:
     shown = latest(records)
     lines = [
         f"PSNR3D in dB and SSIM3D of the body outside metal (protocol {PROTOCOL}); seconds of a run.",
-        *(f"{r.run.scene} ({r.run.variant}), {r.label}: {r.status} – {r.reason}" for r in shown if r.status != OK),
+        *_failures(shown),
         f"All protocols: {results}/table.md, .csv, .tex; records: {results}/records.jsonl",
     ]
     if any(record.volume for record in shown):
@@ -42,26 +48,41 @@ def text(records: Sequence[RunRecord], results: Path, data: Path) -> str:
     return overview(shown) + "\n" + "\n".join(map(one_line, lines)) + "\n"
 
 
-def overview(shown: Sequence[RunRecord]) -> str:
-    """Return PSNR3D, SSIM3D and seconds of every method on every scene, as text of at most `WIDEST` columns.
+def _failures(shown: Sequence[RunRecord]) -> list[str]:
+    """Say of the first runs that did not end well what they were and why, and how many more there are."""
+    bad = [f"{r.run.scene} ({r.run.variant}), {r.label}: {r.status} – {r.reason}" for r in shown if r.status != OK]
+    more = len(bad) - MOST_FAILURES
+    return [*bad[:MOST_FAILURES], *([f"{more} more runs failed or were skipped, see table.md"] if more > 0 else [])]
 
-    Where scenes are too many for that, the mean over all scenes stands for them. Numbers are means over noise seeds.
+
+def overview(shown: Sequence[RunRecord]) -> str:
+    """Return PSNR3D, SSIM3D and seconds of every method on every scene, as text that fits the terminal.
+
+    Scenes stand side by side, in two tables where one is too narrow for all; of more scenes the mean over all is shown.
+    Numbers are means over noise seeds.
     """
     own = [record for record in shown if record.run.variant == METAL]
     found, scenes = numbers(own), list(dict.fromkeys(record.run.scene for record in own))
     rows = sorted(dict.fromkeys((record.inputs, record.label) for record in own), key=lambda row: row[0])
     failed = {(r.run.scene, r.label): r.status for r in own if r.status != OK}
     values = {(scene, row): _values(found, scene, row) for scene in scenes for row in rows}
-    columns = scenes
-    if _width(rows, scenes) > WIDEST:
-        values |= {(MEAN, row): _mean([values[scene, row] for scene in scenes]) for row in rows}
-        columns = [MEAN]
+    stubs = sum(max(map(len, column)) + 2 for column in zip(("inputs", "method"), *rows, strict=True))
+    wide = max([len(HEAD), *map(len, scenes)]) + 2
+    fit = max((width() - stubs) // wide, 1)
+    if len(scenes) > fit * MOST_TABLES:
+        title = f"mean of {len(scenes)} scenes"
+        values |= {(title, row): _mean([values[scene, row] for scene in scenes]) for row in rows}
+        scenes = [title]
+    return "\n".join(_table(rows, scenes[n : n + fit], values, failed) for n in range(0, len(scenes), fit))
+
+
+def _table(rows: Sequence[Row], columns: Sequence[str], values: Values, failed: dict[tuple[str, str], str]) -> str:
+    """Return a table with a column for each scene; `failed` says how a run of a scene and method ended."""
     table = Table(box=box.SIMPLE_HEAD if _unicode() else box.ASCII2, pad_edge=False, show_edge=False)
     table.add_column("\ninputs", no_wrap=True)
     table.add_column("\nmethod", overflow="fold")
     for column in columns:
-        title = column if column in scenes else f"mean of {len(scenes)} scenes"
-        table.add_column(f"{one_line(title)}\n{HEAD}", no_wrap=True)
+        table.add_column(f"{one_line(column)}\n{HEAD}", no_wrap=True)
     best = {(column, k): _best(rows, column, k, values) for column in columns for k in range(len(SHOWN))}
     for number, row in enumerate(rows):
         first = not number or rows[number - 1][0] != row[0]
@@ -73,13 +94,7 @@ def overview(shown: Sequence[RunRecord]) -> str:
     return rendered(table)
 
 
-def _width(rows: Sequence[tuple[str, str]], scenes: Sequence[str]) -> int:
-    """Return how wide a table with a column for each scene is."""
-    stubs = [max(map(len, column)) for column in zip(("inputs", "method"), *rows, strict=True)]
-    return sum(width + 2 for width in [*stubs, *(max(len(scene), len(HEAD)) for scene in scenes)])
-
-
-def _values(found: Numbers, scene: str, row: tuple[str, str]) -> list[float | None]:
+def _values(found: Numbers, scene: str, row: Row) -> list[float | None]:
     inputs, label = row
     numbers = (found.get((scene, METAL, label, inputs, protocol, metric)) for protocol, metric, _ in SHOWN)
     return [None if number is None else number[0] for number in numbers]
@@ -94,9 +109,9 @@ def _mean(scenes: Sequence[list[float | None]]) -> list[float | None]:
     return out
 
 
-def _best(rows: Sequence[tuple[str, str]], column: str, k: int, values: dict) -> set[tuple[str, str]]:
+def _best(rows: Sequence[Row], column: str, k: int, values: Values) -> set[Row]:
     """Return the rows that are best of their inputs in a number."""
-    found: set[tuple[str, str]] = set()
+    found: set[Row] = set()
     protocol, metric, _ = SHOWN[k]
     for inputs in dict.fromkeys(row[0] for row in rows):
         group = [row for row in rows if row[0] == inputs]
@@ -110,10 +125,10 @@ def _cell(values: Sequence[float | None], failed: str, best: Sequence[bool]) -> 
     if failed and values[0] is None:
         return Text(failed.rjust(len(HEAD)), "red")
     out = Text()
-    for k, (value, (protocol, metric, width)) in enumerate(zip(values, SHOWN, strict=True)):
+    for k, (value, (protocol, metric, size)) in enumerate(zip(values, SHOWN, strict=True)):
         form = f".{COLUMNS[protocol][metric].digits}f" if metric != "wall" else ".2g" if (value or 0) < 10 else ".0f"
         text = "–" if value is None else f"{value:{form}}"
-        out.append("  " if k else "").append(text.rjust(width), "bold" if k < len(best) and best[k] else "")
+        out.append("  " if k else "").append(text.rjust(size), "bold" if k < len(best) and best[k] else "")
     return out
 
 
