@@ -8,7 +8,6 @@ import contextlib
 import importlib
 import io
 import os
-import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import NamedTuple
 import msgspec
 import tyro
 
+from ctsim.benchmarks.engine.process import interruptible
 from ctsim.benchmarks.engine.terminal import complain
 from ctsim.errors import InputError
 
@@ -68,13 +68,9 @@ def guarded(name: str, module: str, arguments: list[str], *, resumes: bool = Tru
     stays, and the same command goes on from it where it `resumes`. Other exceptions are ours and keep their traceback.
     """
     _write_anything()
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        package, _, _ = module.rpartition(".")
-        if flags := getattr(importlib.import_module(package), "Flags", None) if package else None:
-            tyro.cli(flags, prog=name, args=arguments)  # --help and unknown flags end here, before the heavy imports
-        main: Callable[[list[str]], int] = importlib.import_module(module).main
-        return main(arguments)
+        with interruptible():
+            return _run(name, module, arguments)
     except BrokenPipeError:  # the reader of a pipe, such as head, went away
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
@@ -89,8 +85,14 @@ def guarded(name: str, module: str, arguments: list[str], *, resumes: bool = Tru
             then = "it starts from the beginning the next time"
         print(f"\n{name}: interrupted; {then}", file=sys.stderr)
         return EXIT_INTERRUPTED
-    finally:
-        signal.signal(signal.SIGTERM, before)
+
+
+def _run(name: str, module: str, arguments: list[str]) -> int:
+    package, _, _ = module.rpartition(".")
+    if flags := getattr(importlib.import_module(package), "Flags", None) if package else None:
+        tyro.cli(flags, prog=name, args=arguments)  # --help and unknown flags end here, before the heavy imports
+    main: Callable[[list[str]], int] = importlib.import_module(module).main
+    return main(arguments)
 
 
 def quietly(command: Callable[[list[str]], int], *arguments: str | Path) -> None:

@@ -1,6 +1,7 @@
 """Functions in processes of their own, one with a time limit or several at once, and on a Dask cluster."""
 
 import contextlib
+import ctypes
 import gc
 import json
 import multiprocessing
@@ -571,3 +572,17 @@ def test_a_scheduler_with_certificates_works_for_those_who_have_them_alone(tmp_p
         plain = address.replace("tls://", "tcp://")
         with config.set(configured(ours)), pytest.raises(InputError, match=r"encryption required by Dask"):
             Cluster(plain)
+
+
+def test_an_interrupt_within_a_callback_from_c_is_not_lost(capsys):
+    def compare(_a, _b):
+        signal.raise_signal(signal.SIGTERM)
+        return 0
+
+    kind = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
+    hook = sys.unraisablehook
+    with pytest.raises(KeyboardInterrupt), process.interruptible():
+        ctypes.CDLL(None).qsort((ctypes.c_int * 2)(), 2, 4, kind(compare))
+        time.sleep(10)  # without `interruptible` the sort's interrupt is printed, and this goes on to its end
+        pytest.fail("the interrupt was lost")
+    assert "KeyboardInterrupt" not in capsys.readouterr().err and sys.unraisablehook is hook

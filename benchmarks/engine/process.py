@@ -5,6 +5,7 @@ worker, counts its own memory only, and ends with the process that started it. W
 cached there stays for the next one.
 """
 
+import _thread
 import contextlib
 import math
 import os
@@ -19,9 +20,12 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing import connection
-from typing import Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from ctsim.errors import InputError
+
+if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
 
 THREADS = {"numba": "NUMBA_NUM_THREADS", "torch": "OMP_NUM_THREADS"}  # a library and its variable
 TRIES = 3  # how often a job is started whose process dies
@@ -55,6 +59,29 @@ def at_most(threads: int) -> dict[str, str]:
     """Return the variables that give libraries so many threads, or fewer where they are set to fewer."""
     before = {v: os.environ.get(v, "").partition(",")[0] for v in THREADS.values()}
     return {v: str(min(threads, int(given)) if given.isdecimal() else threads) for v, given in before.items()}
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Let SIGTERM, by which schedulers stop a job, interrupt as Ctrl-C does, and let no interrupt be lost.
+
+    An interrupt that arrives in a callback from C, such as those of LLVM while a kernel compiles, cannot pass through
+    C: Python prints it and goes on. Here it is raised again shortly after, in code that it can end.
+    """
+    before, hook = signal.signal(signal.SIGTERM, signal.default_int_handler), sys.unraisablehook
+
+    def repeat(lost: "UnraisableHookArgs") -> None:
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            threading.Timer(0.05, _thread.interrupt_main, (signal.SIGTERM,)).start()
+        else:
+            hook(lost)
+
+    sys.unraisablehook = repeat
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
+        signal.signal(signal.SIGTERM, before)
 
 
 class Stopped(RuntimeError):
@@ -172,8 +199,7 @@ def serve(pipe: connection.Connection) -> None:
     threading.Thread(target=_follow_parent, args=(os.dup(0),), daemon=True).start()
     with open(os.devnull) as nothing:
         os.dup2(nothing.fileno(), 0)  # a job that asks the user gets no answer
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a job can write down where it stopped
-    with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
+    with interruptible(), contextlib.suppress(EOFError, OSError, KeyboardInterrupt):  # a job notes where it stopped
         while True:
             answer = answered(_called, pipe.recv_bytes())
             try:
