@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ctsim.benchmarks.engine.texts import pictured
+from ctsim.benchmarks.engine.table import pictured
 from ctsim.errors import InputError
 from ctsim.reports.kept import Case
 

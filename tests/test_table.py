@@ -9,9 +9,17 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from ctsim.benchmarks.engine import latex
-from ctsim.benchmarks.engine.table import Cell, Column, Table, simple
-from ctsim.benchmarks.engine.texts import ranked
+from ctsim.benchmarks.engine.table import (
+    Cell,
+    Column,
+    Table,
+    ranked,
+    simple,
+    tex_comment,
+    tex_prose,
+    tex_row,
+    tex_spanning,
+)
 
 ODD = "a|b $x_1$ 5% & <i>#{}~^\\ \"q\" 'r' µ"
 CONTROLS = "".join(map(chr, (*range(0x20), *range(0x7F, 0xA0)))) + "\u2028\u2029"
@@ -105,8 +113,8 @@ def test_latex_as_booktabs_prints_it():
 
 
 def test_groups_over_columns():
-    head, rules = latex.spanning(0, [(title, 1) for title in ("", "A", "A", "", "", "B & C", "A")])
-    assert head == latex.row(
+    head, rules = tex_spanning([(title, 1) for title in ("", "A", "A", "", "", "B & C", "A")])
+    assert head == tex_row(
         ["", r"\multicolumn{2}{c}{A}", "", "", r"\multicolumn{1}{c}{B \& C}", r"\multicolumn{1}{c}{A}"]
     )
     assert rules == r"\cmidrule(lr){2-3}\cmidrule(lr){6-6}\cmidrule(lr){7-7}"
@@ -227,8 +235,8 @@ def test_a_number_below_zero_stays_a_number(text):
 
 
 def test_prose_in_latex():
-    assert latex.prose("`a_b --c` & d--e") == r"\texttt{a\_b -{}-c} \& d-{}-e"
-    assert latex.comment("a\nb  c%") == "% a b c%\n"
+    assert tex_prose("`a_b --c` & d--e") == r"\texttt{a\_b -{}-c} \& d-{}-e"
+    assert tex_comment("a\nb  c%") == "% a b c%\n"
 
 
 # --- ranks -------------------------------------------------------------------------------------------------

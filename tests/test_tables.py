@@ -11,8 +11,7 @@ import pandas as pd
 import pytest
 from run_records import changed, make_record
 
-from ctsim.benchmarks.engine import latex
-from ctsim.benchmarks.engine.texts import escape
+from ctsim.benchmarks.engine.table import escape, simple
 from ctsim.benchmarks.scores.score import Score
 from ctsim.benchmarks.studies.methods import records, tables
 from ctsim.benchmarks.studies.methods.records import Cost
@@ -231,7 +230,7 @@ def test_latex_compiles_with_whatever_a_caption_or_a_reason_holds(tmp_path):
     odd = "50 % of {a_b} & c^2 ≤ 3 µm ~ $x$ # \\n ± − – > 2×10³ μ γ ² ° ·"
     failed = record("net", status="error", scene="teeth")
     given = [record(odd), record("b", scene="teeth"), changed(failed, reason=f"{odd}\nand more")]
-    sheet = tables.render(given, "tex") + latex.table(latex.prose(f"{odd} `--flag {odd}`"), "l", [], [latex.row(["1"])])
+    sheet = tables.render(given, "tex") + simple(["a"], [["1"]], caption=f"{odd} `--flag {odd}`").latex()
     page = "\\documentclass{article}\\usepackage{booktabs}\\begin{document}" + sheet + "\\end{document}"
     (tmp_path / "page.tex").write_text(page, encoding="utf-8")
     told = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex"]

@@ -4,14 +4,42 @@ import csv
 import html
 import io
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from ctsim.benchmarks.engine import latex
-from ctsim.benchmarks.engine.texts import escape, harmless, one_line, ranked
-
 Better = Literal["", "max", "min", "one"]
+_TEX = {
+    "\\": r"\textbackslash{}",
+    "&": r"\&",
+    "%": r"\%",
+    "$": r"\$",
+    "#": r"\#",
+    "_": r"\_",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "±": r"$\pm$",
+    "–": "--",
+    "−": "$-$",
+    "≤": r"$\leq$",
+    "<": "$<$",
+    ">": "$>$",
+    "|": r"\textbar{}",
+    "μ": r"$\mu$",
+    "γ": r"$\gamma$",
+    "²": "$^2$",
+    "³": "$^3$",
+    "×": r"$\times$",
+    "°": r"$^\circ$",
+    "·": r"$\cdot$",
+}
+_LINE = dict.fromkeys((*range(0x20), *range(0x7F, 0xA0), 0x2028, 0x2029), " ")
+"""Control characters, line ends among them, and Unicode's line and paragraph separators."""
+_ESCAPED = {"md": str.maketrans({**_LINE, "|": "\\|"}), "tex": str.maketrans({**_LINE, **_TEX})}
+_FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")
 
 
 class Cell(NamedTuple):
@@ -22,10 +50,10 @@ class Cell(NamedTuple):
 
 
 class Column(NamedTuple):
-    """A column: title, the group it stands in, whether it holds numbers, and which number is best.
+    """A column: its title and group, whether it holds numbers, and which number is best.
 
-    `better` is "max", "min", "one" (nearest to 1), or "" for a column without ranks. Neighbouring columns that are
-    parts of one, such as "paper" and "here", have its title and a `part` each.
+    `better` is "max", "min", "one" (nearest to 1), or "" for a column without ranks. Neighbouring columns
+    with one title, such as "paper" and "here", differ in `part`.
     """
 
     title: str
@@ -39,7 +67,7 @@ class Column(NamedTuple):
 class Table:
     """Rows of cells under columns, with a title, a caption and notes.
 
-    `rank_within` is the number of the column whose cells part the rows into classes that compete; None for no ranks.
+    Rows are ranked within classes: those with equal text in the column number `rank_within`; None for no ranks.
     """
 
     columns: Sequence[Column]
@@ -77,7 +105,7 @@ class Table:
         return "\n".join(parts)
 
     def html(self) -> str:
-        """Return the table as HTML; a cell with a number has it in `data-number`, by which a page sorts."""
+        """Return the table as HTML; `data-number` holds a cell's number, by which a page sorts."""
         marks = {"best": "<strong>{}</strong>", "second": "<u>{}</u>"}
         lines = []
         for row, texts in zip(self.rows, self._marked(_html, marks), strict=True):
@@ -96,7 +124,7 @@ class Table:
         )
 
     def _html_head(self) -> str:
-        """Return a line of heads, or two where columns stand in groups; each column's own has its number."""
+        """Return one line of heads, or two where columns have groups; `data-column` is a column's number."""
         grouped = any(column.group for column in self.columns)
         upper, lower = "", ""
         for group, members in itertools.groupby(enumerate(self.columns), lambda member: member[1].group):
@@ -113,7 +141,7 @@ class Table:
         return f"<tr>{upper}</tr>" + (f"<tr>{lower}</tr>" if grouped else "")
 
     def csv(self) -> str:
-        """Return columns and cells as CSV that no spreadsheet takes for formulas."""
+        """Return the table as CSV; no cell is a formula to a spreadsheet."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(harmless(_title(c)) for c in self.columns)
@@ -121,22 +149,32 @@ class Table:
         return out.getvalue()
 
     def latex(self, label: str = "", *, footnotes: bool = False) -> str:
-        """Return a table environment by booktabs, its notes as comments below it, or as `footnotes` within it."""
+        """Return a booktabs table; its notes are comments below it, or `footnotes` within it."""
         marks = {"best": r"\textbf{{{}}}", "second": r"\underline{{{}}}"}
-        groups = [(c.group, 1) for c in self.columns]
-        head = latex.spanning(0, groups) if any(c.group for c in self.columns) else []
+        head = tex_spanning([(c.group, 1) for c in self.columns]) if any(c.group for c in self.columns) else []
         if any(c.part for c in self.columns):
             whole = itertools.groupby(self.columns, lambda c: (c.group, c.title if c.part else ""))
-            head += latex.spanning(0, [(title, len(list(of))) for (_, title), of in whole], merge=False)
-        head.append(latex.row([latex.prose(c.part or c.title) for c in self.columns]))
-        body = [latex.row(row) for row in self._marked(lambda text: escape(text, "tex"), marks)]
-        columns = "".join("r" if c.number else "l" for c in self.columns)
-        notes = [latex.prose(note) for note in self.notes if footnotes]
-        text = latex.table(latex.prose(self.caption or self.title), columns, head, body, label=label, notes=notes)
-        return text if footnotes else text + "".join(map(latex.comment, self.notes))
+            head += tex_spanning([(title, len(list(of))) for (_, title), of in whole], merge=False)
+        lines = [
+            r"\begin{table}",
+            r"\centering",
+            rf"\caption{{{tex_prose(self.caption or self.title)}}}",
+            *([rf"\label{{{label}}}"] if label else []),
+            rf"\begin{{tabular}}{{{''.join('r' if c.number else 'l' for c in self.columns)}}}",
+            r"\toprule",
+            *head,
+            tex_row([tex_prose(c.part or c.title) for c in self.columns]),
+            r"\midrule",
+            *(tex_row(row) for row in self._marked(lambda text: escape(text, "tex"), marks)),
+            r"\bottomrule",
+            r"\end{tabular}",
+            *(rf"\par\footnotesize {tex_prose(note)}" for note in self.notes if footnotes),
+            r"\end{table}",
+        ]
+        return "\n".join(lines) + "\n" + "".join(tex_comment(note) for note in self.notes if not footnotes)
 
     def _marked(self, write: Callable[[str], str], marks: dict[str, str]) -> list[list[str]]:
-        """Return the texts of all cells, written for a format, with the marks of the best and the second."""
+        """Return the texts of all cells, escaped by `write`, the best and the second marked."""
         places = self.places()
         return [
             [
@@ -153,6 +191,79 @@ def simple(columns: Sequence[str], rows: Sequence[Sequence[Any]], *, numbers: Se
     return Table(columns=heads, rows=[[Cell(str(cell)) for cell in row] for row in rows], **more)
 
 
+def ranked(numbers: Sequence[float | None], better: str) -> dict[int, str]:
+    """Return {index: "best" or "second"}; equal numbers share a place, a lone number and NaN have none.
+
+    `better` is "max", "min", "one" (nearest to 1), or "" for no ranking.
+    """
+    numbers = [None if n is None or math.isnan(n) else n for n in numbers]
+    keys: dict[str, Callable[[float], float]] = {"max": lambda v: -v, "min": lambda v: v, "one": lambda v: abs(v - 1)}
+    if better not in keys or sum(n is not None for n in numbers) < 2:
+        return {}
+    found = {i: keys[better](n) for i, n in enumerate(numbers) if n is not None}
+    places = dict(zip(sorted(set(found.values())), ("best", "second"), strict=False))
+    return {i: places[n] for i, n in found.items() if n in places}
+
+
+def one_line(text: str) -> str:
+    """Replace line ends and other control characters by spaces."""
+    return text.translate(_LINE)
+
+
+def escape(text: str, form: Literal["md", "tex"]) -> str:
+    """Escape the markup of Markdown tables or LaTeX; the text becomes one line."""
+    return text.translate(_ESCAPED[form])
+
+
+def pictured(text: object) -> str:
+    """Escape matplotlib's mathematics, so that it draws the text as it is."""
+    return str(text).replace("$", r"\$")
+
+
+def harmless(text: str) -> str:
+    """Return a text as one line of CSV that no spreadsheet takes for a formula."""
+    text = one_line(text)
+    return f"'{text}" if text.lstrip().startswith(_FORMULA) else text
+
+
+def html_prose(text: str) -> str:
+    """Return prose as HTML; text in backquotes is code."""
+    parts = _html(text).split("`")
+    return "".join(f"<code>{part}</code>" if n % 2 else part for n, part in enumerate(parts))
+
+
+def tex_comment(text: str) -> str:
+    """Return a text as a LaTeX comment of one line."""
+    return f"% {' '.join(one_line(text).split())}\n"
+
+
+def tex_prose(text: str) -> str:
+    """Escape prose for LaTeX: `--` stays two hyphens, text in backquotes is typewriter."""
+    parts = ["-{}-".join(escape(piece, "tex") for piece in part.split("--")) for part in text.split("`")]
+    return "".join(rf"\texttt{{{part}}}" if n % 2 else part for n, part in enumerate(parts))
+
+
+def tex_row(cells: Sequence[str]) -> str:
+    """Return a table's row of cells that are LaTeX already."""
+    return " & ".join(cells) + r" \\"
+
+
+def tex_spanning(titles: Sequence[tuple[str, int]], *, merge: bool = True) -> list[str]:
+    """Return a head line of (title, number of columns), and the rules below the titles; "" has no rule.
+
+    `merge` lets equal neighbours share one title.
+    """
+    if merge:
+        grouped = itertools.groupby(titles, key=lambda t: t[0])
+        titles = [(title, sum(n for _, n in group)) for title, group in grouped]
+    cells, rules, first = [], "", 1
+    for title, n in titles:
+        cells += [rf"\multicolumn{{{n}}}{{c}}{{{tex_prose(title)}}}"] if title else [""] * n
+        rules += rf"\cmidrule(lr){{{first}-{first + n - 1}}}" if title else ""
+        first += n
+    return [tex_row(cells), rules]
+
+
 def _title(column: Column) -> str:
     title = f"{column.title}, {column.part}" if column.part else column.title
     return f"{column.group}: {title}" if column.group else title
@@ -162,18 +273,12 @@ def _html(text: str) -> str:
     return html.escape(one_line(text))
 
 
-def html_prose(text: str) -> str:
-    """Return prose as HTML; what stands in backquotes is code."""
-    parts = _html(text).split("`")
-    return "".join(f"<code>{part}</code>" if n % 2 else part for n, part in enumerate(parts))
-
-
 def _kind(column: Column) -> str:
     return ' class="num"' if column.number else ""
 
 
 def _csv(text: str) -> str:
-    """Return a cell of CSV; a number below zero is no formula."""
+    """Return a cell of CSV; a negative number is no formula."""
     try:
         float(text)
     except ValueError:

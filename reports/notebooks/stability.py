@@ -27,7 +27,7 @@ import torch
 from matplotlib.figure import Figure
 
 from ctsim.benchmarks.engine.record import latest
-from ctsim.benchmarks.engine.texts import pictured
+from ctsim.benchmarks.engine.table import pictured
 from ctsim.benchmarks.studies.stress.study import Flags, Stress, by_case
 from ctsim.detector import Detector
 from ctsim.geometry import Geometry

@@ -10,8 +10,8 @@ from rich.table import Table
 from rich.text import Text
 
 from ctsim.benchmarks.engine.record import OK
+from ctsim.benchmarks.engine.table import one_line, ranked
 from ctsim.benchmarks.engine.terminal import rendered, width
-from ctsim.benchmarks.engine.texts import one_line, ranked
 from ctsim.benchmarks.scores.score import COLUMNS
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest
 from ctsim.benchmarks.studies.methods.tables import Numbers, numbers

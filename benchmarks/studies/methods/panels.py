@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ctsim.benchmarks.engine.record import OK
-from ctsim.benchmarks.engine.texts import pictured
+from ctsim.benchmarks.engine.table import pictured
 from ctsim.benchmarks.scores.artefact import water_attenuation
 from ctsim.benchmarks.scores.protocol import Truth, truth_of
 from ctsim.benchmarks.studies.methods.records import RunRecord, latest

@@ -15,10 +15,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ctsim.benchmarks.engine.latex import comment
 from ctsim.benchmarks.engine.record import OK, uncollected
-from ctsim.benchmarks.engine.table import Cell, Column, Table
-from ctsim.benchmarks.engine.texts import escape, harmless
+from ctsim.benchmarks.engine.table import Cell, Column, Table, escape, harmless, tex_comment
 from ctsim.benchmarks.scores.score import AS_RETURNED, COLUMNS, COMPARED, NMAR, Metric, SeedValue, derived, harm, row_of
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest, outdated, remarks
 from ctsim.durable import write_synced
@@ -283,8 +281,8 @@ def _page(found: Sequence[Table], form: Format, failed: Sequence[str], said: Seq
     if form == "md" and failed:
         parts.append("## Failures and skips\n\n" + "\n".join(f"- {escape(line, form)}" for line in failed) + "\n")
     elif failed:
-        parts.append("".join(map(comment, failed)))
-    parts += [f"{escape(text, form)}.\n" if form == "md" else comment(f"{text}.") for text in said]
+        parts.append("".join(map(tex_comment, failed)))
+    parts += [f"{escape(text, form)}.\n" if form == "md" else tex_comment(f"{text}.") for text in said]
     return "\n".join(parts)
 
 

@@ -18,8 +18,7 @@ import tyro
 
 from ctsim.benchmarks import suites
 from ctsim.benchmarks.engine.record import OK, merged
-from ctsim.benchmarks.engine.table import Cell, Column, Table
-from ctsim.benchmarks.engine.texts import ranked
+from ctsim.benchmarks.engine.table import Cell, Column, Table, ranked
 from ctsim.benchmarks.methods import TABLE
 from ctsim.benchmarks.scores.score import VERSION
 from ctsim.benchmarks.studies.methods import records, tables

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator
 
-from ctsim.benchmarks.engine.texts import pictured
+from ctsim.benchmarks.engine.table import pictured
 from ctsim.benchmarks.studies.pareto.finding import Part, Point, front, groups, knee, parted
 from ctsim.durable import replacing
 
