@@ -9,7 +9,7 @@ from numba.core.errors import TypingError
 from numba.core.event import end_event, start_event
 from test_simulate import EVERYTHING, phantom, run, scanner
 
-from ctsim.benchmarks.engine import compiling
+from ctsim.benchmarks.engine import terminal
 from ctsim.kernels import raytrace_cpu
 from ctsim.kernels.once import compiled_once
 
@@ -76,7 +76,7 @@ def test_other_types_are_refused_while_compiling():
 
 def test_compiling_is_announced_once_and_only_where_it_takes_long(monkeypatch):
     now, said = [0.0], []
-    monkeypatch.setattr(compiling.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
 
     def compile_for(seconds, within=0.0):
         start_event("numba:compile")
@@ -85,13 +85,13 @@ def test_compiling_is_announced_once_and_only_where_it_takes_long(monkeypatch):
         now[0] += seconds
         end_event("numba:compile")
 
-    with compiling.announced(said.append):
+    with terminal.announced(said.append):
         for _ in range(4):
             compile_for(0.2)
             now[0] += 100.0  # of other work
         assert said == []
         compile_for(0.1, within=0.2)
-        assert said == [compiling.TEXT]
+        assert said == [terminal.COMPILING]
         compile_for(10.0, within=10.0)
     compile_for(10.0)
-    assert said == [compiling.TEXT]
+    assert said == [terminal.COMPILING]

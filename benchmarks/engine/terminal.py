@@ -1,29 +1,34 @@
-"""What a person sees while a command works: progress, tables and errors; plain lines where nobody watches."""
+"""What a command shows on a terminal: progress, tables, errors; in a log, plain lines."""
 
 import contextlib
 import io
 import sys
 import time
-from collections.abc import Iterable, Iterator
-from typing import TextIO, TypeVar
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, TextIO, TypeVar
 
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.text import Text
 
+if TYPE_CHECKING:
+    from numba.core.event import Event
+
 WIDEST = 100
-"""Columns that a table may take."""
+"""Most columns of characters that a table may take."""
 EVERY = 10.0
-"""Seconds between lines of progress where nobody watches."""
+"""Seconds between lines of progress in a log."""
+PATIENCE = 1.0
+"""Seconds of compiling that need no message."""
+COMPILING = "compiling kernels, once (about 20 s) …"
 
 T = TypeVar("T")
 
 
 class Bar:
-    """How far a command is: `total` units of work, what was done last, and what is done now.
+    """Progress of a command: `done` of `total` units, and what it does now.
 
-    On a terminal a bar follows. Elsewhere, as in the log of a job, every finished unit that has a name is a line, and
-    others are counted in a line every `EVERY` seconds. `done` is how many units are finished.
+    A terminal shows a bar. A log has a line for each finished unit with a name, and a count every `EVERY` seconds.
     """
 
     def __init__(self, total: int, unit: str, done: int = 0, stream: TextIO | None = None) -> None:
@@ -49,16 +54,16 @@ class Bar:
             self._rich.stop()
 
     def note(self, text: str) -> None:
-        """Say what is done now."""
+        """Say what the command does now."""
         if self._rich:
             self._rich.update(self._task, description=text)
 
     def advance(self, n: int = 1, text: str = "") -> None:
-        """Count finished units; `text` names what has ended, and how."""
+        """Add `n` finished units; `text` names what has ended, and how."""
         self.at(self.done + n, text)
 
     def at(self, done: int, text: str = "") -> None:
-        """Say how many units are finished."""
+        """Set the number of finished units; `text` names what has ended, and how."""
         self.done = done
         if self._rich:
             self._rich.update(self._task, completed=done, description=text or None)
@@ -68,7 +73,7 @@ class Bar:
             self._stream.flush()
 
     def over(self, items: Iterable[T], text: str) -> Iterator[T]:
-        """Yield items, counting each as a unit once it was worked on."""
+        """Yield items; each counts as a finished unit once the caller asks for the next."""
         self.note(text)
         for item in items:
             yield item
@@ -76,16 +81,13 @@ class Bar:
 
 
 def width() -> int:
-    """Return how many columns a table may take: those of the terminal, at most `WIDEST`."""
+    """Return the width of a table in characters: the terminal's, at most `WIDEST`."""
     console = Console()
     return min(WIDEST, console.width) if console.is_terminal else WIDEST
 
 
 def rendered(*parts: RenderableType) -> str:
-    """Return tables and texts as this process's stdout shows them: with colours on a terminal, else without.
-
-    No line is wider than `WIDEST` columns or the terminal.
-    """
+    """Return tables and texts as stdout shows them: in colour on a terminal, no table wider than `width()`."""
     plain = Console()
     console = Console(
         file=io.StringIO(),
@@ -102,7 +104,36 @@ def rendered(*parts: RenderableType) -> str:
 
 
 def complain(name: str, sentence: str) -> None:
-    """Write an error of the user's to stderr: the command's name and one sentence."""
+    """Write a user's error to stderr: the command's name and one sentence."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     with contextlib.suppress(BrokenPipeError):
         console.print(Text.assemble((f"{name}:", "bold red"), f" {sentence}"))
+
+
+@contextlib.contextmanager
+def announced(say: Callable[[str], object]) -> Iterator[None]:
+    """Call `say` once if compiling kernels in this process takes longer than `PATIENCE`; a cached kernel is silent."""
+    from numba.core.event import Listener, install_listener  # numba is slow to load, and only this needs it
+
+    Listener.register(_Compilation)
+    with install_listener("numba:compile", _Compilation(say)):
+        yield
+
+
+class _Compilation:
+    """Adds up the seconds of compiling, where one compilation may start another: a `Listener` of numba's."""
+
+    def __init__(self, say: Callable[[str], object]) -> None:
+        self._say, self._said = say, False
+        self._depth, self._spent, self._since = 0, 0.0, 0.0
+
+    def notify(self, event: "Event") -> None:
+        now = time.monotonic()
+        if self._depth == 0:
+            self._since = now
+        if not self._said and self._spent + now - self._since > PATIENCE:
+            self._said = True
+            self._say(COMPILING)
+        self._depth += 1 if event.is_start else -1
+        if self._depth == 0:
+            self._spent += now - self._since

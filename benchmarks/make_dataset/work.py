@@ -10,10 +10,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TypeVar
 
-from ctsim.benchmarks.engine.compiling import announced
 from ctsim.benchmarks.engine.host import open_jobs
 from ctsim.benchmarks.engine.process import TICK, Jobs, Lost
-from ctsim.benchmarks.engine.terminal import Bar
+from ctsim.benchmarks.engine.terminal import Bar, announced
 from ctsim.benchmarks.make_dataset import Flags
 from ctsim.benchmarks.suites import load, select
 from ctsim.errors import InputError

@@ -15,6 +15,7 @@ import tyro
 from ctsim.benchmarks import methods
 from ctsim.benchmarks.engine import study
 from ctsim.benchmarks.engine.record import Task
+from ctsim.benchmarks.engine.terminal import announced
 from ctsim.benchmarks.studies.methods import overview, plan, tables
 from ctsim.benchmarks.studies.methods.records import FILE, METAL, Result, RunRecord, RunTask
 from ctsim.errors import InputError
@@ -127,8 +128,6 @@ class Methods(study.Study[RunRecord, Flags]):
 
         def told(now: Progress) -> None:
             say(f"now {now.share:.0%}, loss {now.loss:.3g}, {now.remaining:.0f} s to go")
-
-        from ctsim.benchmarks.engine.compiling import announced  # loads numba
 
         with announced(lambda text: sys.stderr.write(f"{text}\n")), listen(told):
             yield
