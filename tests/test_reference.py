@@ -10,7 +10,6 @@ import tyro
 
 from ctsim.benchmarks.methods import TABLE, find, parameters, resolve
 from ctsim.benchmarks.tools import reference
-from ctsim.benchmarks.tools import typetext as text
 from ctsim.benchmarks.tools.reference import COMMAND, main, pages
 
 FOLDER = Path(__file__).parents[1] / "docs" / "reference"
@@ -79,7 +78,7 @@ def test_every_method_has_its_parameters_with_their_defaults():
         section = page.partition(f"\n## {name}\n")[2].partition("\n## ")[0]
         assert section, name
         for key, value in find(name).params.items():
-            default = "none" if value is None else text.code(value)
+            default = "none" if value is None else reference.code(value)
             (row,) = (row for row in section.splitlines() if row.startswith(f"| `{key}` |"))
             parameter = parameters(name, resolve(find(name).target))[key]
             assert all(said in row for said in (default, parameter.expected, parameter.meaning)), (name, key)
@@ -100,4 +99,4 @@ def test_types_are_named_in_words():
     }
     for words, kind in named.items():
         links = {Inner: "[inner](#inner)"} if words.startswith("[inner") else {}
-        assert text.kind_name(kind, links) == words
+        assert reference.kind_name(kind, links) == words

@@ -4,15 +4,19 @@
 tyro parses; of the scene keys, from the structs that read a scene; of the methods; and of the bundled suites.
 """
 
+import ast
 import dataclasses
 import functools
 import importlib
+import inspect
 import itertools
 import sys
+import textwrap
 import types
 import typing
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import tyro
@@ -20,7 +24,6 @@ import tyro
 from ctsim.benchmarks.cli import OTHERS, guarded
 from ctsim.benchmarks.methods import TABLE, find, parameters, resolve
 from ctsim.benchmarks.suites import bundled, load
-from ctsim.benchmarks.tools import typetext as text
 from ctsim.errors import InputError
 from ctsim.materials import _TABLE as MATERIALS
 from ctsim.phantoms.bodies import Recipe
@@ -52,6 +55,7 @@ The files lie in `benchmarks/suites/`. A suite of your own is a TOML file: see
 POSITIONAL = typing.get_args(tyro.conf.Positional[int])[1]
 REPEATED = typing.get_args(tyro.conf.UseAppendAction[int])[1]
 NO_PAIR = typing.get_args(tyro.conf.FlagCreatePairsOff[int])[1]
+PLAIN = {str: "text", float: "number", int: "integer", bool: "true or false", types.NoneType: "nothing"}
 
 
 def pages() -> dict[str, str]:
@@ -60,7 +64,7 @@ def pages() -> dict[str, str]:
     parts = {
         "commands.md": [COMMANDS, *(command(name, form) for name, form in forms().items())],
         "scene-keys.md": [SCENE_KEYS, *_scene_tables(), _presets(), _materials()],
-        "methods.md": [METHODS, text.table(("method", "inputs", "what it does"), first), *map(method, TABLE)],
+        "methods.md": [METHODS, table(("method", "inputs", "what it does"), first), *map(method, TABLE)],
         "suites.md": [SUITES, *map(suite, sorted(bundled()))],
     }
     return {name: "\n\n".join([NOTE, *found]).strip() + "\n" for name, found in parts.items()}
@@ -82,12 +86,12 @@ def _form(module: types.ModuleType) -> type:
 
 def command(name: str, form: type) -> str:
     """Return heading, call, description and flags of one command."""
-    hints, said = typing.get_type_hints(form, include_extras=True), text.field_texts(form)
+    hints, said = typing.get_type_hints(form, include_extras=True), field_texts(form)
     flags = [_flag(item, hints[item.name], said.get(item.name, "")) for item in dataclasses.fields(form)]
     flags.sort(key=lambda flag: flag[0].startswith("`-"))  # folders first, as they are typed
     call = " ".join([name, *(f[0].strip("`") for f in flags if not f[0].startswith("`-")), "[flags]"])
-    rows = text.table(("argument", "value", "default", "meaning"), flags)
-    return f"## {name}\n\n```text\n{call}\n```\n\n{text.described(form)}\n\n{rows}"
+    rows = table(("argument", "value", "default", "meaning"), flags)
+    return f"## {name}\n\n```text\n{call}\n```\n\n{described(form)}\n\n{rows}"
 
 
 def _flag(item: dataclasses.Field[Any], hint: Any, said: str) -> tuple[str, str, str, str]:
@@ -101,9 +105,9 @@ def _flag(item: dataclasses.Field[Any], hint: Any, said: str) -> tuple[str, str,
     if kind is bool:
         shown = f"`{flag}`" if NO_PAIR in marks else f"`{flag}`, `--no-{flag[2:]}`"
         return shown, "", "on" if item.default else "off", said
-    default = "" if item.default in (None, (), dataclasses.MISSING) else text.code(item.default)
+    default = "" if item.default in (None, (), dataclasses.MISSING) else code(item.default)
     often = ", may be repeated" if REPEATED in marks else ""
-    return f"`{flag}`", f"`{metavar}`{often}" if metavar else text.kind_name(kind), default, said
+    return f"`{flag}`", f"`{metavar}`{often}" if metavar else kind_name(kind), default, said
 
 
 def _stripped(hint: Any) -> tuple[Any, list[Any]]:
@@ -120,7 +124,7 @@ def _stripped(hint: Any) -> tuple[Any, list[Any]]:
 
 
 def _method_row(name: str, target: str, inputs: str) -> tuple[str, str, str]:
-    first = text.described(resolve(target)).partition("\n\n")[0].split(";")[0].rstrip(".")
+    first = described(resolve(target)).partition("\n\n")[0].split(";")[0].rstrip(".")
     return f"[`{name}`](#{name})", inputs, f"{first}."
 
 
@@ -130,11 +134,11 @@ def method(name: str) -> str:
     function = resolve(found.target)
     known = parameters(name, function)
     rows = [
-        (f"`{key}`", known[key].expected, "none" if value is None else text.code(value), known[key].meaning)
+        (f"`{key}`", known[key].expected, "none" if value is None else code(value), known[key].meaning)
         for key, value in found.params.items()
     ]
-    head = f"## {name}\n\nInputs: {found.inputs}. Function: `{found.target}`.\n\n{text.described(function)}"
-    return f"{head}\n\n{text.table(('parameter', 'value', 'default', 'meaning'), rows)}" if rows else head
+    head = f"## {name}\n\nInputs: {found.inputs}. Function: `{found.target}`.\n\n{described(function)}"
+    return f"{head}\n\n{table(('parameter', 'value', 'default', 'meaning'), rows)}" if rows else head
 
 
 def _scene_tables() -> list[str]:
@@ -164,14 +168,14 @@ def _structs(kind: Any) -> list[type[msgspec.Struct]]:
 
 def _section(title: str, kind: type[msgspec.Struct], links: dict[type, str], without: tuple[str, ...] = ()) -> str:
     """Return heading, description and keys of one table."""
-    said, rows = text.field_texts(kind), []
+    said, rows = field_texts(kind), []
     for item in msgspec.structs.fields(kind):
         is_recipe = any(issubclass(inner, Recipe) for inner in _structs(item.type))
-        value = "table [phantom](#phantom)" if is_recipe else text.kind_name(item.type, links)
+        value = "table [phantom](#phantom)" if is_recipe else kind_name(item.type, links)
         rows.append((f"`{item.encode_name}`", value, _default(item), said.get(item.name, "")))
     rows = [row for row in rows if row[0].strip("`") not in without]
-    keys = "\n\n" + text.table(("key", "value", "default", "meaning"), rows) if rows else ""
-    return f"## {title}\n\n{text.described(kind)}{keys}"
+    keys = "\n\n" + table(("key", "value", "default", "meaning"), rows) if rows else ""
+    return f"## {title}\n\n{described(kind)}{keys}"
 
 
 def _default(item: msgspec.structs.FieldInfo) -> str:
@@ -179,7 +183,7 @@ def _default(item: msgspec.structs.FieldInfo) -> str:
         return "required"
     if isinstance(item.default, msgspec.Struct):
         return "its own defaults"
-    return "none" if item.default is None else "" if item.default is msgspec.NODEFAULT else text.code(item.default)
+    return "none" if item.default is None else "" if item.default is msgspec.NODEFAULT else code(item.default)
 
 
 def _recipes(links: dict[type, str]) -> list[str]:
@@ -202,8 +206,8 @@ def _presets() -> str:
         distances = f"{m.dso:g}", f"{m.dsd:g}", size, f"{m.arc_deg:g}"
         rows.append((f"`{name}`", *distances, f"{m.tube.kvp:g}", _filters(m.tube, " + "), detector))
     head = ("preset", "dso (mm)", "dsd (mm)", "panel v × u (mm)", "arc (deg)", "kVp", "filter", "detector")
-    said = f"A preset bins its panel so that `n_detector` pixels cover the object. {text.described(ScannerSettings)}"
-    return f"## Scanner presets\n\n{said.partition('. ')[0]}.\n\n{text.table(head, rows)}"
+    said = f"A preset bins its panel so that `n_detector` pixels cover the object. {described(ScannerSettings)}"
+    return f"## Scanner presets\n\n{said.partition('. ')[0]}.\n\n{table(head, rows)}"
 
 
 def _filters(tube: Any, between: str) -> str:
@@ -217,7 +221,7 @@ def _materials() -> str:
         "Any element by its symbol and any formula with a density, such as `NaI@3.67`, is a material too. "
         "Compositions are formulas or percent by weight."
     )
-    return f"## Materials\n\n{said}\n\n{text.table(('name', 'composition', 'density (g/cm3)'), rows)}"
+    return f"## Materials\n\n{said}\n\n{table(('name', 'composition', 'density (g/cm3)'), rows)}"
 
 
 def suite(name: str) -> str:
@@ -231,7 +235,86 @@ def suite(name: str) -> str:
         volume, views = " × ".join(map(str, g.n_voxel)), f"{g.n_views} of {' × '.join(map(str, g.n_detector))}"
         beam = f"{tube.kvp:g} kVp, {_filters(tube, ', ')}"
         rows.append((f"`{scene.name}`", f"`{scene.phantom.recipe}`", scene.phantom.metal, volume, views, beam))
-    return f"## {name}\n\n{said}\n\n" + text.table(("scene", "recipe", "metal", "volume", "views", "tube"), rows)
+    return f"## {name}\n\n{said}\n\n" + table(("scene", "recipe", "metal", "volume", "views", "tube"), rows)
+
+
+def field_texts(kind: type) -> dict[str, str]:
+    """Return the string literals that follow the fields of a class and of its bases, by field name."""
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        try:
+            source = textwrap.dedent(inspect.getsource(base))
+        except (OSError, TypeError):
+            continue  # built in
+        (body,) = (node.body for node in ast.parse(source).body if isinstance(node, ast.ClassDef))
+        for field, after in itertools.pairwise(body):
+            if not (isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)):
+                continue
+            if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+                found[field.target.id] = inspect.cleandoc(str(after.value.value))
+    return found
+
+
+def described(thing: Any) -> str:
+    """Return the docstring as paragraphs of one line each; sections such as Raises are left out."""
+    text = inspect.cleandoc(thing.__doc__ or "").partition("\nRaises\n")[0]
+    return "\n\n".join(" ".join(part.split()) for part in text.split("\n\n")).strip()
+
+
+def kind_name(kind: Any, links: Mapping[type, str] | None = None) -> str:
+    """Return a type in words; `links` holds Markdown for types that have a place of their own."""
+    links = links or {}
+    if isinstance(kind, type) and kind in links:
+        return links[kind]
+    if kind in PLAIN:
+        return PLAIN[kind]
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if origin is typing.Annotated:
+        return " ".join([kind_name(inner[0], links), *(bounds(m) for m in inner[1:])]).strip()
+    if origin is Literal:
+        return " or ".join(code(value) for value in inner)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(dict.fromkeys(kind_name(i, links) for i in inner if i is not types.NoneType))
+    if origin is tuple:
+        if inner[-1] is Ellipsis:
+            return f"list of {kind_name(inner[0], links)}"
+        names = [kind_name(i, links) for i in inner]
+        return f"[{len(names)} × {names[0]}]" if len(set(names)) == 1 else f"[{', '.join(names)}]"
+    if isinstance(origin or kind, type) and issubclass(origin or kind, Mapping | msgspec.Struct):
+        return "table"
+    return getattr(kind, "__name__", str(kind)).lower()
+
+
+def bounds(meta: Any) -> str:
+    """Return the range that a `msgspec.Meta` states, in brackets; nothing for other annotations."""
+    if not isinstance(meta, msgspec.Meta):
+        return ""
+    signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+    values = {sign: getattr(meta, name) for name, sign in signs.items()}
+    found = [f"{sign} {'2^63 − 1' if v == 2**63 - 1 else f'{v:g}'}" for sign, v in values.items() if v is not None]
+    return f"({', '.join(found)})" if found else ""
+
+
+def code(value: Any) -> str:
+    """Return a value as code, written as in TOML or JSON."""
+    if isinstance(value, msgspec.Struct):
+        items = {f.encode_name: getattr(value, f.name) for f in msgspec.structs.fields(value)}
+        return "`{ " + ", ".join(f"{k} = {code(v).strip('`')}" for k, v in items.items()) + " }`"
+    if isinstance(value, tuple | list):
+        return "`[" + ", ".join(code(v).strip("`") for v in value) + "]`"
+    return f"`{str(value).lower()}`" if isinstance(value, bool) else f"`{_quoted(value)}`"
+
+
+def _quoted(value: Any) -> str:
+    return f'"{value}"' if isinstance(value, str) else f"{value}"
+
+
+def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    """Return a Markdown table; a column without any text is left out."""
+    rows = [tuple(" ".join(cell.split()).replace("|", "\\|") for cell in row) for row in rows]
+    kept = [k for k in range(len(head)) if any(row[k] for row in rows)]
+    lines = [[head[k] for k in kept], ["---"] * len(kept), *([row[k] for k in kept] for row in rows)]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
 
 
 def main(arguments: list[str]) -> int:
