@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ctsim.benchmarks.tools import freshness, measured
+from ctsim.benchmarks.tools import measured
 from ctsim.errors import InputError
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -19,7 +19,7 @@ def repository(tmp_path, monkeypatch):
     for name in ("GIT_AUTHOR", "GIT_COMMITTER"):
         monkeypatch.setenv(f"{name}_NAME", "A")
         monkeypatch.setenv(f"{name}_EMAIL", "a@example.org")
-    freshness.git(tmp_path, "init", "-q")
+    measured.git(tmp_path, "init", "-q")
     for folder in ("core", "suites", "pages"):
         (tmp_path / folder).mkdir()
     (tmp_path / "core" / "a.py").write_text('"""Doc."""\n\nimport os\n\n\nclass S:\n    n: int = 3\n\n\nx = os.sep\n')
@@ -31,13 +31,13 @@ def repository(tmp_path, monkeypatch):
 
 
 def commit(root):
-    freshness.git(root, "add", "-A")
-    freshness.git(root, "commit", "-qm", "change")
-    return freshness.git(root, "rev-parse", "--short=12", "HEAD").strip()
+    measured.git(root, "add", "-A")
+    measured.git(root, "commit", "-qm", "change")
+    return measured.git(root, "rev-parse", "--short=12", "HEAD").strip()
 
 
 def found(root):
-    return freshness.age_of(root / "pages" / "mine.md")
+    return measured.age_of(root / "pages" / "mine.md")
 
 
 def test_a_page_is_fresh_while_its_sources_compute_the_same(repository):
@@ -45,7 +45,7 @@ def test_a_page_is_fresh_while_its_sources_compute_the_same(repository):
     (repository / "other.py").write_text("n = 4\n")
     path = repository / "core" / "a.py"
     path.write_text(path.read_text().replace("Doc.", "Better.").replace("import os", "import os  # why"))
-    freshness.git(repository, "mv", "core/a.py", "core/b.py")
+    measured.git(repository, "mv", "core/a.py", "core/b.py")
     commit(repository)
     assert found(repository).state == "fresh"
 
@@ -79,7 +79,7 @@ def test_the_oldest_commit_counts_and_a_strange_one_is_said(repository):
 
 def test_the_report_lists_every_page_and_ends_well(repository, capsys, monkeypatch):
     monkeypatch.chdir(repository)
-    assert freshness.main(["pages"]) == 0
+    assert measured.main(["freshness", "pages"]) == 0
     head, row = capsys.readouterr().out.splitlines()
     assert head.split()[:2] == ["page", "state"] and row.split()[:2] == ["mine", "fresh"]
 
@@ -87,7 +87,7 @@ def test_the_report_lists_every_page_and_ends_well(repository, capsys, monkeypat
 def test_a_page_without_a_declaration_is_refused(repository):
     (repository / "pages" / "new.md").write_text("commit 0123456789ab\n")
     with pytest.raises(InputError, match="no measured page 'new'"):
-        freshness.main([str(repository / "pages")])
+        measured.main(["freshness", str(repository / "pages")])
 
 
 def test_every_measured_page_is_declared_and_names_a_commit():
@@ -126,5 +126,5 @@ def test_a_study_s_table_becomes_a_page(tmp_path, monkeypatch, capsys):
 
 def test_git_s_errors_are_one_sentence(tmp_path):
     with pytest.raises(InputError, match="git rev-parse: "):
-        freshness.git(tmp_path, "rev-parse", "--show-toplevel")
+        measured.git(tmp_path, "rev-parse", "--show-toplevel")
     assert subprocess.run(["git", "--version"], capture_output=True, check=False).returncode == 0
