@@ -29,7 +29,7 @@ class Command(NamedTuple):
 
 
 OTHERS = {
-    "methods": Command("ctsim.benchmarks.list_methods", "list the methods, what they need, and their parameters"),
+    "methods": Command("ctsim.benchmarks.methods", "list the methods, what they need, and their parameters"),
     "report": Command("ctsim.reports.report", "write results as one HTML page with the slices of every volume"),
     "inspect": Command("ctsim.benchmarks.studies.inspect.study", "score a volume by other conventions of PSNR, SSIM"),
     "pareto": Command("ctsim.benchmarks.studies.pareto.study", "error against run time, simulator and methods"),

@@ -1,10 +1,10 @@
-"""The methods table: a name to a plain function `reconstruct(scan, ...) -> Volume`.
+"""The methods: names of plain functions `reconstruct(scan, ...) -> Volume`. `run-benchmark methods` lists them.
 
-A method states its parameters as a struct of settings (`ctsim.reconstruct.settings`). `--method
-my_lab.net:reconstruct` names a function outside the table in the same way: its keyword parameters are its settings,
-converted by their annotations where it has some; one called `device` is always "cpu". Its module may define
-`skip(scan) -> str | None` (a reason, or None to run) and `INPUTS`, a sentence fragment saying what the method needs
-beside the counts; methods are ranked within one such class.
+A method of ours states its parameters as a struct of settings (`ctsim.reconstruct.settings`). `--method
+my_lab.net:reconstruct` names a function of your own: its keyword parameters are its settings, converted to the types
+that they are annotated with; one called `device` is always "cpu". Its module may define `skip(scan) -> str | None`
+(a reason, or None to run) and `INPUTS`, which says what the method needs in addition to the counts. Methods are ranked
+within one class of inputs.
 """
 
 import ast
@@ -19,10 +19,11 @@ import sys
 import typing
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import msgspec
 import msgspec.inspect
+import tyro
 
 from ctsim.errors import InputError
 from ctsim.reconstruct.settings import Parameter, build, convert, parameters_of
@@ -51,17 +52,15 @@ TABLE: dict[str, tuple[str, str]] = {
     "splat-paper": ("ctsim.reconstruct.splat.published:paper", COUNTS_ONLY),
     "splat-r2": ("ctsim.reconstruct.splat.published:r2", COUNTS_ONLY),
 }
-"""name -> ("module:function", what it needs beside the counts)."""
+"""name -> ("module:function", what it needs in addition to the counts)."""
 GONE = {("splat", "preset"): "presets are methods of their own; expected --method splat-paper or --method splat-r2"}
-"""(method, parameter that it no longer has) -> what to do instead."""
+"""(method, removed parameter) -> what to do instead."""
+WIDEST = 24  # characters; a longer default is not aligned with the others
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Method:
-    """A method that was found, with its parameters as plain JSON values.
-
-    `params` are all of them, `overrides` those that differ from the defaults.
-    """
+    """A method and its parameters as plain JSON values: all in `params`, those not at their default in `overrides`."""
 
     name: str
     target: str
@@ -90,7 +89,7 @@ class Method:
         return function(scan, **given)
 
     def skip(self, scan: "Scan") -> str | None:
-        """Ask the method's module why it would rather not run on `scan`; None to run."""
+        """Return why the method's module would skip `scan`; None to run."""
         asked = getattr(sys.modules[resolve(self.target).__module__], "skip", None)
         return asked(scan) if asked else None
 
@@ -142,14 +141,14 @@ def find(name: str, overrides: dict[str, Any] | None = None) -> Method:
 
 
 def chosen(names: tuple[str, ...], settings: tuple[str, ...], seconds: float | None = None) -> list[Method]:
-    """Return the methods that --method names, with what --set and --seconds say.
+    """Return the methods that --method names, with the parameters that --set and --seconds give.
 
-    Raises InputError for what is wrong with either, before anything is run.
+    Raises InputError for a wrong name, parameter or value.
     """
     given = parse_overrides(settings, names)
     found = []
     for name in names:
-        find(name)  # that there is none is not the fault of --set
+        find(name)  # the error for an unknown name does not speak of --set
         try:
             found.append(within(find(name, given[name]), seconds))
         except InputError as error:
@@ -158,15 +157,15 @@ def chosen(names: tuple[str, ...], settings: tuple[str, ...], seconds: float | N
 
 
 def within(method: Method, seconds: float | None) -> Method:
-    """Tell a method how many seconds it has, where it can be told and was not."""
+    """Set a method's parameter `seconds`, if it has one and --set gives none."""
     if seconds is None or "seconds" not in method.params or "seconds" in method.overrides:
         return method
-    whole = int(seconds) if float(seconds).is_integer() else seconds  # which suits whole numbers, too
+    whole = int(seconds) if float(seconds).is_integer() else seconds  # so that a parameter of whole numbers takes it
     return find(method.name, {**method.overrides, "seconds": whole})
 
 
 def parameters(name: str, function: Callable[..., Any]) -> dict[str, Parameter]:
-    """Return the parameters of a method: those of its settings, else its keyword parameters but `device`."""
+    """Return the parameters of a method: those of its settings, or its keyword parameters except `device`."""
     settings = getattr(function, "settings", None)
     if settings is not None:
         return parameters_of(settings)
@@ -175,7 +174,7 @@ def parameters(name: str, function: Callable[..., Any]) -> dict[str, Parameter]:
         raise InputError(f"method {name!r} must be reconstruct(scan, ...), got {inspect.signature(function)}")
     try:
         types = typing.get_type_hints(function, include_extras=True)
-    except (NameError, TypeError, AttributeError):  # a name that is there for type checkers only
+    except (NameError, TypeError, AttributeError):  # an annotation that only a type checker can resolve
         types = {}
     several = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
     return {
@@ -188,7 +187,7 @@ def parameters(name: str, function: Callable[..., Any]) -> dict[str, Parameter]:
 
 
 def _known(kind: Any) -> Any:
-    """Return a type that values can be converted to, Any for those that msgspec does not know, such as arrays."""
+    """Return a type that msgspec converts values to: Any for types that it does not know, such as arrays."""
     try:
         return Any if isinstance(msgspec.inspect.type_info(kind), msgspec.inspect.CustomType) else kind
     except TypeError:
@@ -196,7 +195,7 @@ def _known(kind: Any) -> Any:
 
 
 def _settings(name: str, function: Callable[..., Any], given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Check settings; return all parameters, and those that differ from the defaults, as plain JSON values."""
+    """Check settings; return all parameters, and those not at their default, as plain JSON values."""
     known, where = parameters(name, function), f"{name}."
     for key in given:
         if key not in known and (name, key) in GONE:
@@ -210,15 +209,15 @@ def _settings(name: str, function: Callable[..., Any], given: dict[str, Any]) ->
 
 
 def _plain(value: Any) -> Any:
-    """Return a value in the types of JSON, for records; by its `repr` where it has none."""
+    """Return a value in the types of JSON, for records; its `repr` where JSON has no such type."""
     plain = msgspec.to_builtins(value, enc_hook=repr)
     return [_plain(item) for item in plain] if isinstance(plain, tuple) else plain
 
 
 def parse_overrides(settings: tuple[str, ...], names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
-    """Parse "method.parameter=value" settings; values are JSON, or text where they are not.
+    """Parse "method.parameter=value" settings; a value that is not JSON is text.
 
-    Raises InputError where a setting has another form or names a method that is not run.
+    Raises InputError for a setting of another form, or of a method that is not run.
     """
     found: dict[str, dict[str, Any]] = {name: {} for name in names}
     for setting in settings:
@@ -237,7 +236,7 @@ def parse_overrides(settings: tuple[str, ...], names: tuple[str, ...]) -> dict[s
 
 @functools.cache
 def code_version(module: str) -> str:
-    """Hash the sources of `module` and of all it imports from its own package and from this project."""
+    """Hash the sources of `module` and of what it imports from its own package and from ctsim, directly or not."""
     roots = {*OURS, module.partition(".")[0]}
     digest = hashlib.sha256()
     for name, source in sorted(_sources(module, roots).items()):
@@ -246,12 +245,12 @@ def code_version(module: str) -> str:
 
 
 def _sources(module: str, roots: set[str]) -> dict[str, bytes]:
-    """Collect the sources that are reachable from `module` through import statements within `roots`."""
+    """Return the sources of `module` and of what it imports within the packages `roots`, directly or not."""
     found: dict[str, bytes] = {}
     waiting, plain = [module], set[str]()
     while waiting:
         name = waiting.pop()
-        # what a module defines is no module: to look for one there would load it
+        # a name that a module defines is no module, and looking for one there would load the module
         if name in found or name.partition(".")[0] not in roots or name.rpartition(".")[0] in plain:
             continue
         try:
@@ -271,5 +270,40 @@ def _sources(module: str, roots: set[str]) -> dict[str, bytes]:
             elif isinstance(node, ast.ImportFrom):
                 origin = package.rsplit(".", node.level - 1)[0] + "." if node.level else ""
                 base = (origin + (node.module or "")).strip(".")
-                waiting += [*(f"{base}.{alias.name}" for alias in node.names), base]  # the last is the next one
+                waiting += [*(f"{base}.{alias.name}" for alias in node.names), base]  # `base` is looked at first
     return found
+
+
+@dataclass(frozen=True)
+class Flags:
+    """List the methods, what they need, and their parameters with defaults, bounds and units."""
+
+    method: tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME ...]")]] = ()
+    """Only these methods, or module:function of your own (default: all of the table)."""
+
+
+def main(arguments: list[str]) -> int:
+    """Print the list; return 0."""
+    given = tyro.cli(Flags, prog="run-benchmark methods", args=arguments)
+    sys.stdout.write("\n".join(described(name) for name in given.method or TABLE))
+    return 0
+
+
+def described(name: str) -> str:
+    """Return a line with a method's inputs, and one for each parameter."""
+    method = find(name)
+    known = parameters(name, resolve(method.target))
+    defaults = {key: _default(method.params[key]) for key in known}
+    widths = [max((len(t) for t in texts if len(t) <= WIDEST), default=0) for texts in (known, defaults.values())]
+    lines = [f"{name}: {method.inputs}"]
+    for key, parameter in known.items():
+        meaning = f"; {parameter.meaning}" if parameter.meaning else ""
+        lines.append(f"  {key:{widths[0]}}  {defaults[key]:{widths[1]}}  {parameter.expected}{meaning}")
+    return "\n".join(lines) + "\n"
+
+
+def _default(value: Any) -> str:
+    """Write a default as --set takes it; infinity is no limit."""
+    if value == float("inf"):
+        return "no limit"
+    return value or '""' if isinstance(value, str) else msgspec.json.encode(value).decode()
