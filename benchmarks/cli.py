@@ -1,6 +1,6 @@
-"""The commands `make-dataset` and `run-benchmark`: dispatch, and what the user's errors look like.
+"""The commands `make-dataset` and `run-benchmark`: they dispatch, and show a user's errors.
 
-A command is a module with `main(arguments)`. Where that module takes long to import, its package declares the flags
+A command is a module with `main(arguments)`. If that module is slow to import, its package declares the flags
 (`Flags` in its `__init__`), so that --help answers at once.
 """
 
@@ -62,16 +62,16 @@ def run_benchmark() -> int:
 
 
 def guarded(name: str, module: str, arguments: list[str], *, resumes: bool = True) -> int:
-    """Call `main(arguments) -> int` of a module; say the user's errors in one sentence, exit code 2.
+    """Call `main(arguments) -> int` of a module; a user's error is one sentence, exit code 2.
 
-    Ctrl-C ends with 130, and so does SIGTERM, by which schedulers stop a job; what was recorded until then
-    stays, and the same command goes on from it where it `resumes`. Other exceptions are ours and keep their traceback.
+    Ctrl-C ends with 130, and so does SIGTERM, by which schedulers stop a job; records stay,
+    and the same command continues from them if it `resumes`. Other exceptions are bugs and keep their traceback.
     """
     _write_anything()
     try:
         with interruptible():
             return _run(name, module, arguments)
-    except BrokenPipeError:  # the reader of a pipe, such as head, went away
+    except BrokenPipeError:  # the reader of a pipe, such as head, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (InputError, msgspec.ValidationError, msgspec.DecodeError) as error:
@@ -96,9 +96,9 @@ def _run(name: str, module: str, arguments: list[str]) -> int:
 
 
 def quietly(command: Callable[[list[str]], int], *arguments: str | Path) -> None:
-    """Run a command of ours without what it says; raise RuntimeError with that where it fails.
+    """Run a command without its output; raise RuntimeError with the output if it fails.
 
-    Raises KeyboardInterrupt where the command was interrupted and says so by its exit code.
+    Raises KeyboardInterrupt if the exit code says that the command was interrupted.
     """
     said = io.StringIO()
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
@@ -110,7 +110,7 @@ def quietly(command: Callable[[list[str]], int], *arguments: str | Path) -> None
 
 
 def _write_anything() -> None:
-    """Let the terminal's encoding end no command: what it lacks is written as an escape, which can be read."""
+    """Write characters that the terminal's encoding lacks as escapes, so that none ends the command."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

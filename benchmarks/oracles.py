@@ -44,7 +44,7 @@ def central_rays(geometry: Geometry, view: int | None = None) -> Rays:
 
 
 def slab_span(rays: Rays, half: tuple[float, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return where rays enter and leave what lies between planes at ±half of the first or of all axes from the end."""
+    """Return where rays enter and leave a slab or box: the space between planes at ±half along the last axes."""
     source, ray = (part[..., -len(half) :] for part in rays)
     ends = np.sort(np.stack([(sign * np.array(half) - source) / ray for sign in (-1, 1)]), axis=0)
     return ends[0].max(-1), ends[1].min(-1)
@@ -99,7 +99,7 @@ def poly_scene(n: int) -> Phantom:
 def measured_pixel(
     phantom: Phantom, scanner: Scanner, views: Sequence[int], *, finer: int = FINER, subrays: int = 1
 ) -> NDArray[np.float64]:
-    """Return P of every pixel as a detector has it: rays averaged in intensity, the whole fine spectrum.
+    """Return P of every pixel as a detector measures it: rays averaged in intensity, the whole fine spectrum.
 
     A pixel is `finer`² finer pixels of up to `subrays` rays each; 1 and 1 is the central ray alone. Chords are the
     tracer's closed forms, so the scene has to be analytic.

@@ -18,7 +18,7 @@ from distributed.scheduler import KilledWorker
 from ctsim.benchmarks.engine.process import TICK, Answers, Function, Lost, answered
 from ctsim.errors import InputError
 
-CONNECT = 10.0  # seconds that a scheduler has to answer
+CONNECT = 10.0  # seconds within which a scheduler must answer
 CERTIFICATES = ("distributed.comm.tls.ca-file", "distributed.comm.tls.client.cert")
 
 
@@ -31,7 +31,7 @@ class Cluster:
 
     def __init__(self, address: str) -> None:
         for name in ("distributed", "distributed.client"):
-            logging.getLogger(name).setLevel(logging.CRITICAL)  # our errors say what matters
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # our errors are enough
         self._address, reason = address, ""
         try:
             self._client: Any = distributed.Client(address, timeout=CONNECT)
@@ -41,7 +41,7 @@ class Cluster:
             if isinstance(error, TypeError) and address.startswith("tls://"):  # it would connect without a context
                 reason = f"needs certificates: expected {' and '.join(CERTIFICATES)} in Dask's configuration"
         if reason:
-            # the client that failed closes itself when it is collected; while another is made that waits for ever
+            # the failed client closes when it is collected; after another one is made, that close would wait for ever
             gc.collect()
             raise InputError(f"--scheduler {address}: {reason}")
 
@@ -49,7 +49,7 @@ class Cluster:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._client.close()  # jobs that nobody waits for do not begin
+        self._client.close()  # jobs that have not begun are cancelled
 
     def answers(self, function: Function, jobs: Sequence[Any]) -> Answers:
         """See `Jobs`. Raises InputError when the scheduler is gone."""
@@ -109,7 +109,7 @@ _ALONE = threading.Lock()
 def _alone(function: Function, job: Any) -> tuple[bool, Any]:
     """Be a Dask task: alone in its process, for neither kernels nor measurements share one.
 
-    An exception is returned: where Dask cannot pickle one, nobody hears of it and the client waits for ever.
+    An exception is returned, not raised: one that Dask cannot pickle would be lost, and the client would wait for ever.
     """
     with _ALONE:
         threads: int = distributed.get_worker().state.nthreads

@@ -1,4 +1,4 @@
-"""Where measurements are taken: processes, machine, threads, versions, commit; and what they took."""
+"""Where a measurement runs (machine, threads, versions, commit) and what it costs."""
 
 import contextlib
 import functools
@@ -34,7 +34,7 @@ class Host(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 def _line_of(file: str, key: str) -> str:
-    """Return what Linux says of a key in one of its files, "" on other systems."""
+    """Return the value of a key in one of Linux's files; "" on other systems."""
     with contextlib.suppress(OSError):
         for line in Path(file).read_text().splitlines():
             if line.startswith(key):
@@ -50,7 +50,7 @@ def threads() -> int:
 
 
 def use_threads(threads: int) -> None:
-    """Let the kernels and torch have at most so many threads, now or when they are loaded; loads neither."""
+    """Limit the threads of the kernels and of torch, now or when they are loaded; loads neither."""
     variables = at_most(threads)
     for name, variable in THREADS.items():
         if library := sys.modules.get(name):
@@ -98,13 +98,13 @@ def commit() -> str:
 
 
 def certain(commit: str) -> bool:
-    """Say whether a commit tells what code ran: it is known, and no file differed from it."""
+    """Whether the commit is known and the work tree was clean."""
     return commit != "unknown" and not commit.endswith("+changes")
 
 
 @dataclass(slots=True)
 class Usage:
-    """What a block of code took; filled when the block ends. Seconds and bytes."""
+    """The seconds and bytes that a block of code took; set when the block ends."""
 
     wall: float = 0.0
     cpu: float = 0.0
@@ -138,7 +138,7 @@ def measured() -> Iterator[Usage]:
 
 
 def machine() -> str:
-    """Return the processor and the threads of the kernels: what times depend on."""
+    """Return what times depend on: the processor and the threads of the kernels."""
     here = host()
     return f"{here.cpu}, {here.threads} threads"
 
@@ -163,14 +163,14 @@ def check_workers(workers: int, scheduler: str | None) -> None:
 
 
 def open_jobs(workers: int, scheduler: str | None) -> contextlib.AbstractContextManager[Jobs | None]:
-    """Return what --workers and --scheduler ask for; None where this process is to do all.
+    """Return the workers that --workers and --scheduler ask for; None for this process alone.
 
     Raises InputError as `check_workers` does, and for a scheduler that cannot be used.
     """
     check_workers(workers, scheduler)
     if scheduler is not None:
         try:
-            from ctsim.benchmarks.engine.dask import Cluster  # needs what only an extra installs
+            from ctsim.benchmarks.engine.dask import Cluster  # the package distributed, an extra
         except ImportError:
             raise InputError("--scheduler needs the package distributed: pip install 'ctsim[cluster]'") from None
         return Cluster(scheduler)

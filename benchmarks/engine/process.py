@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
 THREADS = {"numba": "NUMBA_NUM_THREADS", "torch": "OMP_NUM_THREADS"}  # a library and its variable
-TRIES = 3  # how often a job is started whose process dies
-TICK = 1.0  # seconds between two looks at jobs that run
-GRACE = 10.0  # seconds that a job has to write down where it stopped
+TRIES = 3  # how often a job is started if its process dies
+TICK = 1.0  # seconds between two checks of running jobs
+GRACE = 10.0  # seconds for an interrupted job to save its state
 
-# sys.path comes first: it says where the package is found
+# sys.path comes first: ctsim is found by it
 _BEGIN = """import sys
 from multiprocessing.connection import Connection
 pipe = Connection(int(sys.argv[1]))
@@ -56,7 +56,7 @@ def how_it_ended(exit_code: int) -> str:
 
 
 def at_most(threads: int) -> dict[str, str]:
-    """Return the variables that give libraries so many threads, or fewer where they are set to fewer."""
+    """Return the variables that limit the threads of libraries, or lower limits that are set already."""
     before = {v: os.environ.get(v, "").partition(",")[0] for v in THREADS.values()}
     return {v: str(min(threads, int(given)) if given.isdecimal() else threads) for v, given in before.items()}
 
@@ -132,7 +132,7 @@ class Process:
         """Start a call, whose answer `receive` takes; `pipe` is ready when there is one."""
         if self._popen is None:
             self._start()
-        with contextlib.suppress(OSError):  # the process is dead, which `receive` reports
+        with contextlib.suppress(OSError):  # the process is dead: `receive` reports it
             self.pipe.send((function, arguments))
 
     def receive(self) -> Any:
@@ -152,13 +152,13 @@ class Process:
         return answer
 
     def ask_to_end(self) -> None:
-        """Let an idle process clean up and end, and interrupt one that works, so that it can write down where."""
+        """Let an idle process end, and interrupt a busy one, which can then save its state."""
         if self._popen is not None:
             self._popen.terminate()
             self.pipe.close()
 
     def close(self, seconds: float = GRACE) -> None:
-        """End the process; it is killed where it needs more than `seconds`."""
+        """End the process; kill it after `seconds`."""
         if self._popen is not None:
             self.pipe.close()  # an idle process ends by itself
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -199,7 +199,7 @@ def serve(pipe: connection.Connection) -> None:
     threading.Thread(target=_follow_parent, args=(os.dup(0),), daemon=True).start()
     with open(os.devnull) as nothing:
         os.dup2(nothing.fileno(), 0)  # a job that asks the user gets no answer
-    with interruptible(), contextlib.suppress(EOFError, OSError, KeyboardInterrupt):  # a job notes where it stopped
+    with interruptible(), contextlib.suppress(EOFError, OSError, KeyboardInterrupt):  # a job can save its state
         while True:
             answer = answered(_called, pipe.recv_bytes())
             try:
@@ -234,7 +234,7 @@ def answered(function: Function, *arguments: Any) -> tuple[bool, Any]:
 
 
 def _can_travel(error: Exception) -> bool:
-    """Whether an exception can be pickled and made again, for which its own arguments may not suffice."""
+    """Whether an exception survives pickling; some cannot be built from their arguments."""
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:
@@ -245,7 +245,7 @@ def _can_travel(error: Exception) -> bool:
 def _follow_parent(pipe: int) -> None:
     """End this process, with what it has started, when its parent has ended."""
     os.read(pipe, 1)
-    os.killpg(0, signal.SIGTERM)  # this thread may not live to see that the others have ended
+    os.killpg(0, signal.SIGTERM)  # this thread may be killed before the others have ended
     time.sleep(GRACE)
     os.killpg(0, signal.SIGKILL)
 
@@ -258,7 +258,7 @@ class Lost:
 
 
 class Jobs(Protocol):
-    """What carries out several jobs at once."""
+    """Runs several jobs at once."""
 
     def answers(self, function: Function, jobs: Sequence[Any]) -> Answers:
         """Yield (number of a job, what `function(job)` returned or `Lost`) as jobs end, None when nothing happened.

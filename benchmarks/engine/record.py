@@ -1,4 +1,4 @@
-"""Tasks, what was found, and the records of both: one JSON line each, appended as they are measured.
+"""Tasks, their outcomes, and records of both: JSON lines, appended as tasks are measured.
 
 A record is on the disk before the next task begins; a line whose writing was interrupted is cut off by the next one.
 """
@@ -25,7 +25,7 @@ from ctsim.locks import locked
 log = logging.getLogger(__name__)
 
 OK = "ok"
-BROKEN = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)  # what a line that is no record raises
+BROKEN = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)  # raised by a line that is no record
 
 
 class Task(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -78,7 +78,7 @@ F = TypeVar("F", bound=Found)
 
 
 class Record(msgspec.Struct, Generic[F], frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A task and all that was found, and where, when and by which commit."""
+    """A task with its outcome: where, when and by which commit it was measured."""
 
     task: Task
     found: Annotated[tuple[F, ...], msgspec.Meta(min_length=1)]
@@ -93,7 +93,7 @@ class Record(msgspec.Struct, Generic[F], frozen=True, kw_only=True, forbid_unkno
 
     @property
     def status(self) -> str:
-        """How it ended: "ok", or as the first part that did not end well."""
+        """The status of the first part that did not end well, else "ok"."""
         for one in self.found:
             if one.status != OK:
                 return one.status
@@ -101,7 +101,7 @@ class Record(msgspec.Struct, Generic[F], frozen=True, kw_only=True, forbid_unkno
 
     @property
     def finished(self) -> bool:
-        """Whether every part ended well; what did not is measured again."""
+        """Whether every part ended well; otherwise the task is measured again."""
         return self.status == OK
 
     @property
@@ -115,7 +115,7 @@ R = TypeVar("R", bound=Record[Any])
 
 @contextlib.contextmanager
 def uncollected() -> Iterator[None]:
-    """Make no search for cycles within the block, or the function; reading and tabulating take a third less time."""
+    """Switch the garbage collector off within a block or function: reading and tables take a third less time."""
     before = gc.isenabled()
     gc.disable()
     try:
@@ -164,7 +164,7 @@ class Store(Generic[R]):
                 raise InputError(f"--collect {other}: there are no records, expected a folder with {self.path.name}")
         self.folder.mkdir(parents=True, exist_ok=True)
         counts: dict[Path, int] = {}
-        with locked(self.path) as handle:  # what another command appends meanwhile would be lost
+        with locked(self.path) as handle:  # otherwise records that another command appends meanwhile are lost
             self._end_last_line(handle)
             files = [list(self._of(self.path))]
             ended, known = _identities(self.read())
@@ -194,7 +194,7 @@ class Store(Generic[R]):
             self._warned.add(path)
 
     def _end_last_line(self, handle: int) -> None:
-        """Cut off what a command that was killed left of a line; end a record that only lacks the end of its line."""
+        """Remove the broken last line of a killed command; complete one that only lacks its line end."""
         size = os.fstat(handle).st_size
         if not size or os.pread(handle, 1, size - 1) == b"\n":
             return
@@ -296,7 +296,7 @@ def latest(records: Sequence[R]) -> list[R]:
 
 
 def done(records: Sequence[R], repeats: int = 1) -> Counter[str]:
-    """Count the records of each identity that ended well with at least so many timed runs."""
+    """Count the records of each identity that ended well with at least `repeats` timed runs."""
     return Counter(r.task.identity for r in records if r.finished and r.repeats >= repeats)
 
 
@@ -313,5 +313,5 @@ def provenance(records: Sequence[R]) -> str:
 
 
 def short(commit: str) -> str:
-    """Return the first digits of a commit, and whether files differed from it."""
+    """Return the first digits of a commit, with "+changes" where files differed from it."""
     return commit[:12] + "+changes" * commit.endswith("+changes")

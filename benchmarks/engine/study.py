@@ -26,7 +26,7 @@ from ctsim.durable import write_synced
 from ctsim.errors import InputError
 from ctsim.human import human_time
 
-SHARE = 0.1  # of the time that may go into tables while tasks are measured
+SHARE = 0.1  # share of the time for writing tables while tasks are measured
 
 Others = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="OTHER [OTHER ...]")]
 
@@ -68,14 +68,14 @@ R = TypeVar("R", bound=Record[Any])
 
 
 class Study(Generic[R, G]):
-    """What a command adds to the engine: its flags, its tasks, how one is measured, and its tables.
+    """A measuring command: its flags, its tasks, how a task is measured, and its tables.
 
-    `name` is the command's word, `file` the name of its records, `unit` what it calls a task. `kind` is what a task
-    finds, `record` the record of it. `work` names a function `work(task, given) -> Sequence[kind]` as
-    "module:function"; it is imported where it runs. `apart` says that tasks are measured in a process of their own
-    also without a time limit. With `rounds` every task is measured once a round, so that a drift of the machine meets
-    all alike; with `follows` the tables are written also while tasks are measured. `estimate` says in --dry-run what
-    the seconds leave out.
+    `name` is the command's word, `file` the name of its records, `unit` its word for a task. `kind` is the type of an
+    outcome, `record` the type of a record. `work` names a function `work(task, given) -> Sequence[kind]` as
+    "module:function"; it is imported where it runs. With `apart` every task has a process of its own, also without a
+    time limit. With `rounds` every task is measured once a round, so that all see the same drift of the machine. With
+    `follows` the tables are also written while tasks are measured. `estimate` says what the seconds of --dry-run leave
+    out.
     """
 
     name: ClassVar[str]
@@ -91,7 +91,7 @@ class Study(Generic[R, G]):
     flags: type[G]
 
     def check(self, given: G) -> None:
-        """Raise InputError for flags that do not go together; called before anything else."""
+        """Raise InputError for flags that exclude each other; called first."""
 
     def folder(self, given: G) -> Path:
         """Return the results folder."""
@@ -102,7 +102,7 @@ class Study(Generic[R, G]):
         return Store(self.folder(given), self.file, self.record, f"a record of run-benchmark {self.name}".rstrip())
 
     def prepare(self, given: G) -> None:
-        """Make what tasks depend on, such as data; called before `tasks`, and not with --dry-run."""
+        """Make data that tasks need; called before `tasks`, not with --dry-run."""
 
     def tasks(self, given: G) -> Sequence[Any]:
         """Return the tasks that the flags ask for, in the order of the table. Simulates and reconstructs nothing."""
@@ -113,11 +113,11 @@ class Study(Generic[R, G]):
         return getattr(given, "repeats", 1)
 
     def runs(self, task: Any, given: G) -> int:
-        """Return how many timed runs this task needs, 1 where it is not timed."""
+        """Return how many timed runs this task needs; 1 if it is not timed."""
         return self.repeats(given)
 
     def machine(self, given: G) -> str:
-        """Return what times depend on: the processor, threads, and who shares them."""
+        """Return what times depend on: the processor, its threads, and the number of tasks that share them."""
         shared = f", {given.workers} tasks at once" if given.workers > 1 else ""
         return host.machine() + (f", by {given.scheduler}" if given.scheduler else shared)
 
@@ -134,24 +134,24 @@ class Study(Generic[R, G]):
         return [t for n in rounds for t in tasks if known[t.identity] <= n or not host.certain(t.code)]
 
     def groups(self, left: Sequence[Any], records: Sequence[R]) -> Sequence[tuple[Any, ...]]:
-        """Part tasks into groups that one worker measures, in this order."""
+        """Split tasks into groups; one worker measures a group, in this order."""
         return [(task,) for task in left]
 
     def expected(self, task: Any, given: G) -> float | None:
-        """Return the seconds that a task takes which was never recorded, None where that is not known."""
+        """Return the expected seconds of a task without a record; None if unknown."""
         return None
 
     def took(self, record: R, given: G) -> float | None:
-        """Return the seconds that measuring a recorded task again takes: all its timed runs, the first one untimed."""
+        """Return the expected seconds of a recorded task: all its timed runs, and one untimed first."""
         once = sum(median(s) for one in record.found for s in one.seconds.values() if s)
         return once * (self.runs(record.task, given) + 1)
 
     def line(self, task: Any) -> tuple[str, str]:
-        """Return the line of --dry-run that a task counts in: a name and more."""
+        """Return the name and the rest of the line of --dry-run that counts this task."""
         return task.case, task.subject
 
     def title(self, task: Any) -> str:
-        """Return what people call a task."""
+        """Return a task's name for people."""
         return f"{task.case} {task.subject}".rstrip()
 
     def limit(self, task: Any, given: G) -> float | None:
@@ -175,7 +175,7 @@ class Study(Generic[R, G]):
         raise NotImplementedError
 
     def details(self, records: Sequence[R], given: G) -> list[Table]:
-        """Return the tables that stand in the file only, below the others."""
+        """Return further tables, for the file only."""
         return []
 
     def shown(self, records: Sequence[R]) -> list[R]:
@@ -197,7 +197,7 @@ class Study(Generic[R, G]):
         """Draw pictures into the results folder, once all tasks have ended."""
 
     def watched(self, say: Callable[[str], None]) -> contextlib.AbstractContextManager[None]:
-        """Call `say` with how far a task is that is measured in this process."""
+        """Call `say` with the progress of a task that is measured in this process."""
         return contextlib.nullcontext()
 
     def code(self, tasks: Sequence[Any], records: Sequence[R], given: G) -> int:
@@ -244,7 +244,7 @@ def _shown(study: Study[R, G], store: Store[R], given: G) -> list[R]:
 
 
 def _check(study: Study[Any, Any], given: Options) -> None:
-    """Raise InputError for flags that do not go together."""
+    """Raise InputError for flags that exclude each other."""
     if study.repeats(given) < 1:
         raise InputError(f"--repeats must be at least 1, got {study.repeats(given)}")
     check_limit(given.seconds)
@@ -266,7 +266,7 @@ def measure_all(study: Study[R, G], tasks: Sequence[Task], records: Sequence[R],
         sys.stderr.write(f"{n_all - len(left)} of {n_all} {study.unit}s are recorded already (--force)\n")
     failed, due = [], 0.0
     with open_jobs(given.workers, given.scheduler) as jobs:
-        store.folder.mkdir(parents=True, exist_ok=True)  # before anything is measured that could not be recorded
+        store.folder.mkdir(parents=True, exist_ok=True)  # so that nothing is measured that cannot be recorded
         with Bar(len(left), study.unit) as bar, study.watched(bar.note):
             try:
                 for record in _records(study, study.groups(left, records), given, jobs):
@@ -288,7 +288,7 @@ def measure_all(study: Study[R, G], tasks: Sequence[Task], records: Sequence[R],
 
 
 def _follow(study: Study[R, G], store: Store[R], given: G, *, draw: bool = False) -> None:
-    """Write the tables, and draw the pictures, where there is something to show."""
+    """Write the tables and draw the pictures, if there are records to show."""
     if shown := _shown(study, store, given):
         study.write(shown, given)
         if draw:
@@ -298,7 +298,7 @@ def _follow(study: Study[R, G], store: Store[R], given: G, *, draw: bool = False
 def _records(study: Study[R, G], groups: Sequence[tuple[Task, ...]], given: G, jobs: Jobs | None) -> Iterator[R]:
     """Measure groups of tasks here, or by `jobs` on several processes or a cluster; yield their records as they end.
 
-    What has failed is not tried again in a later round.
+    A task that failed is not tried again in a later round.
     """
     failed: set[str] = set()
     if jobs is None:
@@ -322,7 +322,7 @@ def _records(study: Study[R, G], groups: Sequence[tuple[Task, ...]], given: G, j
 
 
 def _rounds(groups: Sequence[tuple[Task, ...]]) -> list[list[tuple[Task, ...]]]:
-    """Part groups into rounds; in each a task is measured by one group only."""
+    """Split groups into rounds; within a round only one group measures a task."""
     rounds: dict[int, list[tuple[Task, ...]]] = {}
     times = Counter[str]()
     for group in groups:
@@ -333,11 +333,11 @@ def _rounds(groups: Sequence[tuple[Task, ...]]) -> list[list[tuple[Task, ...]]]:
 
 @contextlib.contextmanager
 def _measuring(study: Study[R, G], given: G) -> Iterator[Callable[[Task], R]]:
-    """Yield what measures a task and returns its record: here, or where study or limit ask for it in another process.
+    """Yield a function that measures a task and returns its record: here, or in another process (see `apart`).
 
-    That one remembers what is compiled. What it leaves behind where it is killed goes with its folder.
+    The other process serves all tasks, so kernels are compiled once. Its temporary files are removed at the end.
     """
-    host.commit()  # remembered: of the code that is loaded, not of what is committed meanwhile
+    host.commit()  # cached now: the commit of the loaded code, not of a later one
 
     def record(task: Task) -> R:
         limit = study.limit(task, given)
@@ -356,7 +356,7 @@ def _measuring(study: Study[R, G], given: G) -> Iterator[Callable[[Task], R]]:
 
 
 def record_of(study: Study[R, Any], task: Task, found: Sequence[Any]) -> R:
-    """Return the record of what was found, as of now and here."""
+    """Return the record of outcomes, as of now and here."""
     now = datetime.now(UTC).isoformat(timespec="seconds")
     return study.record(task=study.recorded(task), found=tuple(found), host=host.host(), commit=host.commit(), time=now)
 
@@ -366,10 +366,7 @@ _opened = contextlib.ExitStack()
 
 
 def _measure_group(study: Study[R, G], given: G, group: tuple[Task, ...]) -> list[R]:
-    """Be a worker: measure a group of tasks.
-
-    A worker of Dask lives on: what measured for another command is closed.
-    """
+    """Measure a group of tasks on a worker. A Dask worker outlives a command: the last one's process is closed."""
     who = type(study), given
     if who not in _measures:
         _opened.close()

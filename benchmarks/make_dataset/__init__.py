@@ -39,6 +39,6 @@ def main(argv: list[str]) -> int:
     """Run the command; return 0, 2 for an error of the user's or damaged data, 130 when interrupted."""
     given: Any = tyro.cli(Flags, prog="make-dataset", args=argv)
 
-    from ctsim.benchmarks.make_dataset import work  # kernels: --help does not wait for them
+    from ctsim.benchmarks.make_dataset import work  # loads the kernels, which --help does without
 
     return work.run(given)

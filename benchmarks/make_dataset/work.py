@@ -73,7 +73,7 @@ def _dry_run(scenes: tuple[Scene, ...], options: Flags) -> int:
 
 
 def _finished(scenes: tuple[Scene, ...], out: Path, force: bool) -> dict[str, Manifest]:
-    """Return the manifests of the scenes that are there and stay, by name; reads only."""
+    """Return the manifests of finished scenes that are kept, by name; reads only."""
     found = {} if force else {s.name: finished(out, s.name, scene_id(s)) for s in scenes}
     return {name: manifest for name, manifest in found.items() if manifest is not None}
 
@@ -83,7 +83,7 @@ def _complete(manifest: Manifest) -> str:
 
 
 def _of_other_code(scenes: tuple[Scene, ...], there: dict[str, Manifest], out: Path | None) -> list[str]:
-    """Say what other code of the simulator made: finished scenes, which stay, and unfinished ones, which do not."""
+    """Name scenes that other code of the simulator made: finished ones stay, unfinished ones start again."""
     code = source_hash()
     said = [other_code([m for m in there.values() if m.code != code], len(there))]
     left = unfinished(out) if out else {}
@@ -107,7 +107,7 @@ class SceneJob:
 def _make(scenes: tuple[Scene, ...], out: Path, options: Flags) -> int:
     source_hash()  # of the code that is loaded, even if its files change meanwhile
     recover(out)
-    # what is in the way shows before the first hour is spent, not after it
+    # obstacles show before the first hour of work, not after it
     there = _finished(scenes, out, options.force)
     for manifest in there.values():
         say(_complete(manifest))
@@ -116,7 +116,7 @@ def _make(scenes: tuple[Scene, ...], out: Path, options: Flags) -> int:
     if todo := [scene for scene in scenes if scene.name not in there]:
         _make_all(todo, out, options)
         there = _finished(scenes, out, force=False)
-        tidy(out, there.values())  # after workers that were killed when their scene was in place
+        tidy(out, there.values())  # left by workers that were killed after they had put their scene in place
     mend_index(out, list(there.values()), [scene.name for scene in scenes])
     return 0
 
@@ -124,7 +124,7 @@ def _make(scenes: tuple[Scene, ...], out: Path, options: Flags) -> int:
 def _make_all(scenes: list[Scene], out: Path, options: Flags) -> None:
     """Plan the scenes, then make them here or on workers."""
     with open_jobs(options.workers, options.scheduler) as pool:
-        plans = {scene.name: plan_scene(scene) for scene in scenes}  # all phantoms could be more than memory holds
+        plans = {scene.name: plan_scene(scene) for scene in scenes}  # all phantoms may not fit into memory
         for name, plan in plans.items():
             for note in plan.notes:
                 say(f"{name}: {note}")
@@ -160,12 +160,12 @@ def _watch(bar: Bar, name: str, title: str, views: Iterable[T], first: int, n_vi
 
 
 def say(text: str) -> None:
-    """Write a line for people, to stderr."""
+    """Write a line to stderr."""
     sys.stderr.write(text + "\n")
 
 
 def _make_apart(jobs: list[SceneJob], pool: Jobs) -> None:
-    """Make scenes on workers behind one progress bar, which follows the views that the workers noted as safe."""
+    """Make scenes on workers with one progress bar, which counts the views that workers have on disk."""
     views = [job.scene.resolve().geometry.n_views for job in jobs]
     left = set(range(len(jobs)))
     with Bar(sum(views), "view") as bar:
@@ -198,7 +198,7 @@ def do(job: SceneJob) -> None:
         except Busy as error:
             if not error.certain and waited >= PATIENCE:
                 raise
-        time.sleep(TICK)  # a worker that was thought lost may still be at it
+        time.sleep(TICK)  # a worker that was taken for lost may still make it
         waited += TICK
 
 

@@ -1,7 +1,7 @@
 """The protocol `artefact`: what the metal did, against the metal-free twin reconstructed by the same method.
 
-The difference of the two volumes is free of what the method does to every object (cupping of its own,
-texture, energy scale), so it needs no reference. Volumes are [z, y, x] in 1/mm, distances are mm.
+The difference of the two volumes holds nothing that the method does to every object (cupping, texture,
+energy scale), so it needs no reference. Volumes are [z, y, x] in 1/mm, distances are mm.
 """
 
 import csv
@@ -138,7 +138,7 @@ def homogeneous(labels: NDArray[Any], truth: Truth, names: tuple[str, ...]) -> t
 
 
 def _pieces(mask: Mask) -> NDArray[np.int32]:
-    """Give every piece of a mask a number from 1 on; what shares a face, edge or corner is one piece."""
+    """Label the pieces of a mask from 1 on; voxels that share a face, edge or corner are one piece."""
     pieces = np.zeros(mask.shape, np.int32)
     ndimage.label(mask, structure=_EVERY_WAY, output=pieces)
     return pieces
@@ -166,7 +166,7 @@ def _roi(mask: Mask, material: str, d_voxel: tuple[float, float, float]) -> Roi:
 def metal_lines(truth: Truth) -> tuple[tuple[NDArray[np.float64], ...], int, str]:
     """Return sample points between the centroids of every two pieces of metal, the pairs, and what was cut.
 
-    Points stand half the smallest voxel apart; those whose nearest voxel is not judged tissue are left out.
+    Points have a spacing of half the smallest voxel. A point whose nearest voxel is not judged tissue is left out.
     """
     pieces = _pieces(truth.metal)
     sizes = np.bincount(pieces.ravel())[1:]
@@ -191,7 +191,7 @@ def near_metal(truth: Truth) -> Mask:
     if truth.metal.any():
         box = box_around(truth.metal, [math.ceil(NEAR / d) + 1 for d in truth.d_voxel])
         distance = np.asarray(ndimage.distance_transform_edt(~truth.metal[box], sampling=truth.d_voxel))
-        near[box] = distance <= NEAR * (1 + 1e-9)  # a sum of voxel sizes may round either way
+        near[box] = distance <= NEAR * (1 + 1e-9)  # a sum of voxel sizes may be rounded up or down
     return near & truth.tissue
 
 
@@ -261,7 +261,7 @@ def line_mean(difference: NDArray[np.float64], points: NDArray[np.float64]) -> f
 
 
 def rms(numbers: list[float]) -> float | None:
-    """Return the root mean square; None of nothing."""
+    """Return the root mean square; None for an empty array."""
     return math.sqrt(sum(n * n for n in numbers) / len(numbers)) if numbers else None
 
 

@@ -17,7 +17,7 @@ from ctsim.store import StoredScan
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Twin:
-    """What a method made of the metal-free scan, [z, y, x] in 1/mm; where there is nothing, `reason` says why."""
+    """A method's volume of the metal-free scan, [z, y, x] in 1/mm; without one, `reason` says why."""
 
     values: NDArray[np.float32] | None = None
     reason: str = NO_TWIN
@@ -25,9 +25,9 @@ class Twin:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judge:
-    """What volumes of one scan are held against.
+    """The references and regions that volumes of one scan are scored with.
 
-    `absent` says that the metal of the scan's scene is on no voxel of the grid or in no view, "" where it is on both.
+    `absent` says that the scene's metal is on no voxel of the grid or in no view; "" if it is in both.
     """
 
     truth: Truth
@@ -45,9 +45,9 @@ class Judge:
     def scores(
         self, values: NDArray[Any], variant: str, twin: Twin, at_50kev: NDArray[Any] | None = None
     ) -> dict[str, Score]:
-        """Score a volume under every protocol; of the metal-free `variant` only what compares has a meaning.
+        """Score a volume under every protocol that applies to the `variant` of its scan, with or without metal.
 
-        `at_50kev` is what a method that knows energies makes of 50 keV.
+        `at_50kev` is the volume at 50 keV of a method that knows energies.
         """
         scores = evaluate(values, self.truth, at_50kev=at_50kev, anchor=variant != "metal")
         if variant == "metal":
@@ -61,7 +61,7 @@ class Judge:
 
 
 def _absent(stored: StoredScan, truth: Truth) -> str:
-    """Return a scan's notes on its metal; where an older version made it, what its mask says."""
+    """Return a scan's notes on its metal; a scan of an older version has none, so its mask decides."""
     if stored.info.notes or truth.metal.any() or not stored.info.metal:
         return "; ".join(stored.info.notes)
     return f"{NOT_ON_GRID}: the scan's mask is empty, though its scene holds {', '.join(stored.info.metal)}"

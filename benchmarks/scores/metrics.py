@@ -1,4 +1,4 @@
-"""Metrics between volumes: PSNR3D, SSIM3D and what a metal looks like after reconstruction.
+"""Metrics between volumes: PSNR3D, SSIM3D, and ratio, Dice and boundary of reconstructed metal.
 
 Volumes are [z, y, x] in 1/mm. The data range is always an argument, never taken from a dtype. A
 metric that does not exist (identical volumes, an empty region) is None, never infinity or NaN.
@@ -116,8 +116,8 @@ def ssim_along_axes(
 def ssim3d(values: Array, reference: Array, *, data_range: float, region: Mask | None = None) -> float:
     """Return the SSIM map averaged over `region` and over slices along z, y and x.
 
-    Outside the region the reconstruction is replaced by the reference before filtering, so that what
-    is not judged cannot leak in through the window. Same numbers as scikit-image's slice-wise map.
+    Outside the region the reconstruction is replaced by the reference before filtering, so that no other
+    voxel can leak in through the window. Same numbers as scikit-image's slice-wise map.
     """
     _check(values, reference, region, data_range)
     if region is None:

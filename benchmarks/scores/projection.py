@@ -30,7 +30,7 @@ MARGIN = 2
 """Pixels by which the metal's trace is dilated before rays count as outside it."""
 
 WIDE = 2.001
-"""Gaps this many times wider than the median were not scanned: there is no half-way in them."""
+"""A gap this many times wider than the median was not scanned, and has no half-way."""
 
 TARGETS = ("noise_free", "effective", "50kev")
 REGIONS = ("body", "outside", "trace")
@@ -54,8 +54,8 @@ class HeldOut:
 def half_way(geometry: Geometry) -> Geometry | str:
     """Return the geometry of at most 12 views half-way between the scan's, evenly chosen, or why there are none.
 
-    "Half-way" is between neighbours in angle, whatever the order of acquisition; angles that were seen
-    several times count once, and gaps that were not scanned have no half-way.
+    "Half-way" is between neighbouring angles, in any order of acquisition. An angle that was scanned several times
+    counts once, and a gap in the arc has no half-way.
     """
     if geometry.poses is not None:
         return "the scan's views are poses, not angles on a circle: there is no half-way between them"
@@ -124,9 +124,9 @@ def _simulated(scene: Any, geometry: Geometry, stored: StoredScan) -> HeldOut:
 def rmse_by_target(
     values: NDArray[Any], held: HeldOut, at_50kev: NDArray[Any] | None = None
 ) -> dict[str, float | None]:
-    """Return the RMSE of a volume's line integrals, "target/region", and of P each view's, "target/region:angle".
+    """Return the RMSE of a volume's line integrals, "target/region", and for P of each view, "target/region:angle".
 
-    Those at 50 keV are held against the volume `at_50kev` where there is one.
+    The target at 50 keV is compared with the volume `at_50kev`, if given.
     """
     found = _projected(values, held)
     own = {"50kev": found if at_50kev is None else _projected(at_50kev, held)}
@@ -151,9 +151,9 @@ def _root(squared: NDArray[np.float64]) -> float | None:
 
 
 def projection_score(values: NDArray[Any], held: HeldOut | str, at_50kev: NDArray[Any] | None = None) -> Score:
-    """Score a volume's line integrals, of 50 keV those of `at_50kev` where there is one.
+    """Score a volume's line integrals; at 50 keV those of the volume `at_50kev`, if given.
 
-    Where there are no held-out views the numbers are None and the note says why.
+    Without held-out views the numbers are None and the note says why.
     """
     if isinstance(held, str):
         names = [f"{target}/{region}" for target in TARGETS for region in REGIONS]
@@ -171,7 +171,7 @@ def projection_score(values: NDArray[Any], held: HeldOut | str, at_50kev: NDArra
 
 
 def with_floor(held: HeldOut | str, truth: Truth) -> HeldOut | str:
-    """Add to the note what the reference volumes themselves score: what voxels, and being linear, leave at best."""
+    """Add to the note the scores of the reference volumes: the error of voxels and of a linear model alone."""
     if isinstance(held, str):
         return held
     own = {"noise_free": "effective", "effective": "effective", "50kev": "50kev"}

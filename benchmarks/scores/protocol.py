@@ -1,7 +1,7 @@
 """The protocols: which region, which reference, which range, and the scores of a volume under each.
 
-A score is never given without its region, reference, alignment and data range: they stand beside
-the numbers in the record and in the caption of every table.
+A score always comes with its region, reference, alignment and data range: in the record with the
+numbers, and in the caption of every table.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ TISSUE = "inside the body dilated by 4 voxels, outside the metal dilated by 2"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Truth:
-    """What a volume is held against: two references and the regions, all [z, y, x].
+    """The truth that a volume is compared with: two references and the regions, all [z, y, x].
 
     `tissue` is the judged region of the protocols `tissue` and `aligned`; `judged` is the dilated body.
     """
@@ -153,9 +153,8 @@ def evaluate(
 ) -> dict[str, Score]:
     """Score a volume [z, y, x] in 1/mm under every protocol that applies.
 
-    What is held against 50 keV is `at_50kev` where the method knows it. `anchor` is for a scan taken without the metal:
-    only `tissue` and `aligned` have a meaning then. The volumes must be finite; the caller has given a volume that is
-    not its own status.
+    Protocols at 50 keV score `at_50kev`, if given. With `anchor`, for a scan without the metal, only `tissue` and
+    `aligned` apply. The volumes must be finite.
     """
     if values.shape != truth.metal.shape:
         raise InputError(f"the volume has shape {values.shape}, the reference {truth.metal.shape}")

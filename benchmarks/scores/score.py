@@ -1,6 +1,6 @@
 """What a score is, how tables show it, and what is derived from scores that are recorded.
 
-All of it is light: what computes scores (`.protocol`, `.artefact`, `.projection`) is loaded where volumes are judged.
+This module is light; `.protocol`, `.artefact` and `.projection` compute scores and are loaded only for that.
 """
 
 from collections.abc import Iterable
@@ -12,7 +12,7 @@ import msgspec
 from ctsim.benchmarks.engine.record import OK
 
 VERSION = 3
-"""Part of every run's identity: a change of the protocol's meaning counts it up.
+"""Part of every run's identity; raised when a protocol changes its meaning.
 
 1: tissue, aligned, paper, metal, cost. 2: every method runs on the metal-free twin too, for `artefact`.
 3: `projection`, and `rmse` of `artefact`. The version was not raised for `at_energy`: only new code has it, and code is
@@ -27,7 +27,7 @@ TWIN_ENDED = "the run on the metal-free twin ended as"
 
 
 class Score(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The scores under one protocol, with all that is needed to read them.
+    """The scores under one protocol, and how they were computed.
 
     `data_range` is 1/mm; `values` maps a metric to its number, or to None where it does not exist; `volume` says which
     of a method's volumes was scored.
@@ -53,9 +53,9 @@ class Score(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 def lacks_twin(scores: dict[str, Score]) -> bool:
-    """Say whether a volume was scored without its twin although there may be one, so that it is to be done again.
+    """Whether to score a volume again: it was scored without its twin, though there may be one.
 
-    A method that gave a reason to skip the twin would skip it again.
+    A method that skipped the twin for a reason would skip it again.
     """
     note = scores["artefact"].note if "artefact" in scores else ""
     return note == NOT_ASKED or (note.startswith(TWIN_ENDED) and not note.startswith(f"{TWIN_ENDED} skipped"))
@@ -134,9 +134,9 @@ ANCHORED = {
     "aligned_50kev": ("rmse", "ssim3d"),
     "artefact": ("roi_std", "cupping", "streak", "rmse", "rmse_near", "rmse_far"),
 }
-"""The metrics that have an anchored score; of `artefact` FDK's error without the metal is 0 by definition."""
+"""The metrics that have an anchored score. FDK's `artefact` error without the metal is 0 by definition."""
 COMPARED = {**ANCHORED, "tissue": ("psnr3d", *ANCHORED["tissue"])}
-"""The metrics that anything is derived of."""
+"""The metrics that gains or anchored scores are derived from."""
 
 Place = tuple[str, int, str, str, str, str]
 """Scene, seed, variant, method, protocol, metric."""
@@ -211,7 +211,7 @@ def _place(row: SeedValue, method: str, variant: str) -> Place:
 def _gains(
     row: SeedValue, values: dict[Place, float | None], bases: dict[str, str | None]
 ) -> list[tuple[str, str, float]]:
-    """Return the gain in tissue PSNR3D over FDK and NMAR, where those rows are there."""
+    """Return the gain in tissue PSNR3D over FDK and over NMAR, if they ran."""
     if row.metric != "psnr3d" or row.protocol != "tissue" or row.value is None:
         return []
     found = []
@@ -222,12 +222,12 @@ def _gains(
 
 
 def _anchors(row: SeedValue, values: dict[Place, float | None]) -> list[tuple[str, str, float]]:
-    """Return a metric's anchored score, where FDK ran on the scan and its twin."""
+    """Return a metric's anchored score, if FDK ran on the scan and its twin."""
     protocol, metric = row.protocol, row.metric
     if metric not in ANCHORED.get(protocol, ()) or row.value is None:
         return []
     worst = values.get(_place(row, FDK, "metal"))
-    # artefacts are differences from the twin, which differs from itself by nothing
+    # an artefact is a difference from the twin, so the twin's own is 0
     best = error(metric, 0.0) if protocol == "artefact" else values.get(_place(row, FDK, "metal_free"))
     if worst is None or best is None:
         return []

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ctsim.phantoms.scene import Scene
 
 STUDY_SUITES = ("pareto", "stress", "tune-settings")
-"""Suites of studies, which make-dataset does not know."""
+"""Suites of studies; make-dataset does not take them."""
 
 
 def load(suite: str) -> "tuple[Scene, ...]":
@@ -38,14 +38,14 @@ def load(suite: str) -> "tuple[Scene, ...]":
 
 
 def identity(scene: "Scene") -> str:
-    """Return the hash of a scene's recipe; for what only lists scenes, and need not load what builds them."""
+    """Return the hash of a scene's recipe; only a call loads the code that builds scenes."""
     from ctsim.phantoms.scene import scene_id
 
     return scene_id(scene)
 
 
 def bundled() -> "dict[str, Traversable]":
-    """Return the bundled suites by name, those of `STUDY_SUITES` apart."""
+    """Return the bundled suites by name, without `STUDY_SUITES`."""
     folder = resources.files("ctsim.benchmarks.suites")
     files = {entry.name.removesuffix(".toml"): entry for entry in folder.iterdir() if entry.name.endswith(".toml")}
     return {name: entry for name, entry in files.items() if name not in STUDY_SUITES}

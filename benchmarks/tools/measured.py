@@ -102,7 +102,7 @@ class Age:
 
     @property
     def state(self) -> str:
-        """The verdict in two words."""
+        """The result in one or two words."""
         if not self.date:
             return "commit unknown"
         return "other defaults" if self.settings else "other code" if self.changed else "fresh"
@@ -115,7 +115,7 @@ def commits_of(text: str) -> list[str]:
 
 
 def page_named(name: str) -> Page:
-    """Return a page's declaration. Raises InputError for a page that has none."""
+    """Return a page's declaration. Raises InputError for an unknown page."""
     if name not in PAGES:
         raise InputError(f"there is no measured page {name!r}: expected one of {', '.join(PAGES)}")
     return PAGES[name]
@@ -158,7 +158,7 @@ def recorded(results: Path) -> list[str]:
 def page_text(name: str, page: Page, table: str, commits: list[str]) -> str:
     """Return a page: title, how it was made, and the study's table as it is.
 
-    `commits` are those of the records, for a table that names none. Raises InputError where there are none either.
+    `commits`, of the records, are for a table that names none. Raises InputError if both are missing.
     """
     if not commits_of(table):
         if not commits:
@@ -173,7 +173,7 @@ def page_text(name: str, page: Page, table: str, commits: list[str]) -> str:
 def age_of(page: Path) -> Age:
     """Compare the sources of a page at its oldest commit with those at HEAD.
 
-    Raises InputError where a page has no declaration, so that none is forgotten.
+    Raises InputError for a page without a declaration, so that none is forgotten.
     """
     sources, commits = page_named(page.stem).sources, commits_of(page.read_text(encoding="utf-8"))
     root = Path(git(page.parent, "rev-parse", "--show-toplevel").strip())
@@ -192,7 +192,7 @@ def age_of(page: Path) -> Age:
 
 
 def _changed(root: Path, commit: str, sources: tuple[str, ...]) -> dict[str, bool]:
-    """Return the sources that compute something else, and whether they hold another value of a setting."""
+    """Return the sources whose code has changed, and whether a default in them has."""
     found = {}
     for line in git(root, "diff", "--name-status", "-M", commit, "HEAD").splitlines():
         status, *names = line.split("\t")
@@ -239,7 +239,7 @@ def _defaults(path: str, text: str) -> set[str]:
 
 
 def git(where: Path, *arguments: str) -> str:
-    """Return what git prints. Raises InputError with its words where it fails."""
+    """Return git's output. Raises InputError with its message if it fails."""
     command = ["git", "-C", str(where), *arguments]
     done = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", check=False)
     if done.returncode:
@@ -248,7 +248,7 @@ def git(where: Path, *arguments: str) -> str:
 
 
 def _tried(where: Path, *arguments: str) -> str:
-    """Return what git prints; nothing where it fails, as for a file that was not there."""
+    """Return git's output; "" if it fails, as for a file that did not exist."""
     with contextlib.suppress(InputError):
         return git(where, *arguments)
     return ""

@@ -95,7 +95,7 @@ def command(name: str, form: type) -> str:
 
 
 def _flag(item: dataclasses.Field[Any], hint: Any, said: str) -> tuple[str, str, str, str]:
-    """Return the row of one argument: how it is typed, its value, its default, what it means."""
+    """Return the row of one argument: name, value, default, meaning."""
     kind, marks = _stripped(hint)
     metavar = next((m.metavar for m in marks if getattr(m, "metavar", None)), None)
     if POSITIONAL in marks:
@@ -142,7 +142,7 @@ def method(name: str) -> str:
 
 
 def _scene_tables() -> list[str]:
-    """Return the sections of the tables of a scene file, recipes after the scene itself."""
+    """Return a section for each table of a scene file: the scene, the recipes, the others."""
     tables = _tables(Scene, "", {})
     links = {
         kind: f"table [{path}](#{path.replace('.', '').replace(' ', '-').lower()})" for kind, path in tables.items()
@@ -187,7 +187,7 @@ def _default(item: msgspec.structs.FieldInfo) -> str:
 
 
 def _recipes(links: dict[type, str]) -> list[str]:
-    """Return the section of what recipes share, and one for each with what it adds or changes."""
+    """Return a section of the keys that all recipes share, and one for each recipe with its own keys."""
     names = ", ".join(f"`{kind.__struct_config__.tag}`" for kind in BUILDERS)
     common = {item.name: item.default for item in msgspec.structs.fields(Recipe)}
     parts = [_section("phantom", Recipe, links) + f"\n\nThe key `recipe` is required. It is one of {names}."]
@@ -225,7 +225,7 @@ def _materials() -> str:
 
 
 def suite(name: str) -> str:
-    """Return what a suite's file says at its head, and its scenes."""
+    """Return the comment at the head of a suite's file, and its scenes."""
     lines = bundled()[name].read_text(encoding="utf-8").splitlines()
     said = " ".join(line.lstrip("# ") for line in itertools.takewhile(lambda line: line.startswith("#"), lines))
     rows = []
@@ -262,7 +262,7 @@ def described(thing: Any) -> str:
 
 
 def kind_name(kind: Any, links: Mapping[type, str] | None = None) -> str:
-    """Return a type in words; `links` holds Markdown for types that have a place of their own."""
+    """Return a type in words; `links` holds Markdown for types that have their own section."""
     links = links or {}
     if isinstance(kind, type) and kind in links:
         return links[kind]
@@ -318,7 +318,7 @@ def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Write the pages into the folder that is named; return 0."""
+    """Write the pages into a folder; return 0."""
     if len(arguments) != 1:
         raise InputError(f"expected one folder, as in {COMMAND}")
     folder = Path(arguments[0])

@@ -1,4 +1,4 @@
-"""What projecting splats costs, side by side in one process: `python -m ctsim.benchmarks.tools.splat_kernels OUT`.
+"""Time and error of ways to project splats, in one process: `python -m ctsim.benchmarks.tools.splat_kernels OUT`.
 
 Writes OUT/splat_kernels.md. Contenders take turns, seconds are medians over the rounds; errors are against the exact
 form on the same splats. Two cases: a view of the published methods (50 000 splats of σ = 2.5 pixels, 512²), and a

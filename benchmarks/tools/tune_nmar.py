@@ -2,7 +2,7 @@
 
     python -m ctsim.benchmarks.tools.tune_nmar DATA OUT [SCENE …]
 
-DATA is a dataset of scenes that stand in no table (`make-dataset tune DATA`), each with its metal-free twin. For
+DATA is a dataset of scenes that no table shows (`make-dataset tune DATA`), each with its metal-free twin. For
 every scene and dilation a line of OUT/nmar.csv holds the error of LIMAR and of NMAR with either prior (RMS difference
 from FDK of the twin in the tissue, HU), the misfits that `auto` judges by, its choice, and the regret: what the
 choice costs over the better prior. `nmar_twin` has a prior from the twin, as good as there can be. `mended` is FDK
