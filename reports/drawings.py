@@ -93,7 +93,7 @@ def _panel(axes: Axes) -> None:
 
 
 def artefact(scene: Path, volumes: list[Path], path: Path) -> None:
-    """Draw one slice of a scene through most metal: the reference and reconstructions named SCENE__METHOD.tif."""
+    """Draw the slice of a scene with the most metal: the reference and reconstructions named SCENE__METHOD.tif."""
     truth = truth_of(open_scan(scene))
     z = cut(truth.metal, truth.body)[0]
     reference = np.asarray(truth.references["effective"][z])
@@ -114,7 +114,7 @@ def artefact(scene: Path, volumes: list[Path], path: Path) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Draw what the command line asks for; raise InputError where it is not understood."""
+    """Draw what the command line asks for; raise InputError for other words."""
     match arguments:
         case ["geometry", path]:
             geometry(Path(path))

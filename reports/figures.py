@@ -1,4 +1,4 @@
-"""Figures of a results folder: how good each method is scene by scene, and what it costs.
+"""Figures of a results folder: each method's score by scene, and its run time.
 
 They are drawn from the records alone. A figure's text and axes are in one colour that `svg` turns into the page's.
 """
@@ -19,7 +19,7 @@ from ctsim.benchmarks.scores.score import COLUMNS
 from ctsim.benchmarks.studies.methods.records import RunRecord
 from ctsim.benchmarks.studies.methods.tables import summary
 
-INK = "#4d4d4e"  # no other part of a figure has it
+INK = "#4d4d4e"  # used by no other part of a figure
 COLOURS = ("#3b82c4", "#d9772b", "#2f9e77", "#b5579c", "#8a8a1f", "#c44e52")
 STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -119,7 +119,7 @@ def svg(figure: Figure, label: str) -> str:
 
 
 def drawn(records: Sequence[RunRecord]) -> Iterator[tuple[str, Figure]]:
-    """Yield (what it shows, figure) of all that can be drawn from the records."""
+    """Yield (title, figure) for each figure that the records allow."""
     found = (
         ("PSNR3D of the tissue, a dot a scene", quality(records)),
         ("SSIM3D of the tissue, a dot a scene", quality(records, metric="ssim3d")),

@@ -1,6 +1,6 @@
-"""What a results folder keeps of one scan: the truth, the windows to look through, and a volume a method.
+"""What a results folder keeps of one scan: the truth, the display windows, and a volume per method.
 
-Arrays are mapped; nothing is read before it is looked at.
+Arrays are memory-mapped and read on access.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,7 +23,7 @@ from ctsim.store import list_scans, open_scan
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kept:
-    """One method's record and its volume [z, y, x] in 1/mm; that at 50 keV of a method that knows energies."""
+    """One method's record and its volume [z, y, x] in 1/mm, and its volume at 50 keV if the method knows energies."""
 
     record: RunRecord
     values: NDArray[Any]
@@ -32,7 +32,7 @@ class Kept:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """A scan and what methods made of it. `look` holds the window's top and the error scale in 1/mm."""
+    """A scan and the methods' volumes of it. `look` holds the window's top and the error scale in 1/mm."""
 
     stored: Stored
     scene: str
@@ -74,7 +74,7 @@ def case_of(stored: Stored, records: Sequence[RunRecord], results: Path) -> Case
 
 
 def first_cases(data: Path, records: Sequence[RunRecord], results: Path) -> Iterator[Case]:
-    """Yield one case a scene, the first repetition of which a volume is kept; scenes without one are left out.
+    """Yield one case per scene: the first repetition with a kept volume; scenes without one are left out.
 
     Raises InputError where `data` holds none of the scans that `results` measured.
     """
@@ -95,7 +95,7 @@ def first_cases(data: Path, records: Sequence[RunRecord], results: Path) -> Iter
 
 
 def open_case(data: Path, results: Path, scene: str | None = None) -> Case:
-    """Open one scan by its name (None: the first of which a volume is kept).
+    """Open one scan by its name (None: the first with a kept volume).
 
     Raises InputError where there is no such scan or no volume of it is kept.
     """

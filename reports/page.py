@@ -1,7 +1,7 @@
 """One HTML file that needs nothing else: tables that sort, figures, and a slice slider for each scene.
 
-Its parts are written by the study of methods and `ctsim.reports.figures`; here they are put in their places. A
-policy in the file itself forbids it to load anything.
+The methods study and `ctsim.reports.figures` write its parts; this module puts them together. A policy in the
+file forbids it to load anything.
 """
 
 import html
@@ -36,13 +36,13 @@ TITLES = {
     "anchored": "Anchored scores and harm",
     "cost": "Cost",
 }
-_BOX = '<input type="checkbox" autocomplete="off"'  # a reloaded page starts again
+_BOX = '<input type="checkbox" autocomplete="off"'  # a reloaded page is as at first
 SIGNED_STOPS = 17  # of the error colours; the browser interpolates between them
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Content:
-    """What a page shows. `more` are further parts in HTML by title; `missing` says why there are no slices."""
+    """The content of a page. `more` holds further parts in HTML by title; `missing` says why there are no slices."""
 
     title: str
     provenance: str
@@ -82,7 +82,7 @@ def _asset(name: str) -> str:
 
 
 def _failures(records: Sequence[RunRecord]) -> dict[str, str]:
-    """Return the table of the runs that did not end well by its title, if there are any."""
+    """Return {title: table of the runs that did not end well}, empty if all did."""
     rows = [[r.run.scene, r.label, r.run.variant, r.status, r.reason] for r in latest(records) if r.status != OK]
     return {FAILURES: simple(("scene", "method", "variant", "status", "reason"), rows).html()} if rows else {}
 
@@ -102,7 +102,7 @@ def _figures(records: Sequence[RunRecord]) -> str:
 
 
 def _slices(scenes: list[str], cases: list[Case]) -> str:
-    """Return what all scenes share, then the scenes."""
+    """Return the controls that all scenes share, then the scenes."""
     labels = dict.fromkeys(kept.record.label for case in cases for kept in case.kept)
     radios = (("both", "volumes and errors"), ("volume", "volumes"), ("error", "errors"))
     show = "".join(
@@ -222,7 +222,7 @@ def _legend(title: str, colours: str, ends: Iterable[str]) -> str:
 
 
 def _colours() -> list[str]:
-    """Return the error colours from most negative to most positive: the panels' own."""
+    """Return the panels' error colours, from most negative to most positive."""
     signed = matplotlib.colormaps["RdBu_r"]
     return [matplotlib.colors.to_hex(signed(x)) for x in np.linspace(0, 1, SIGNED_STOPS)]
 

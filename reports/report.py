@@ -1,4 +1,4 @@
-"""`run-benchmark report RESULTS [DATA]`: what was measured, as one HTML file or as a page of documentation.
+"""`run-benchmark report RESULTS [DATA]`: results as one HTML file or as a page of documentation.
 
 Computes no score: tables come from the records, slices from the kept volumes and the dataset they were measured on.
 """
@@ -35,7 +35,7 @@ from ctsim.reports.kept import first_cases
 
 log = logging.getLogger(__name__)
 
-LIMIT = 20_000_000  # bytes of a page that is easily sent and opened
+LIMIT = 20_000_000  # bytes; such a page is easy to send and open
 IMAGES = 0.85  # share of it for slices
 
 STUDIES: tuple[tuple[type[Study[Any, Any]], dict[str, dict[str, Any]]], ...] = (
@@ -44,7 +44,7 @@ STUDIES: tuple[tuple[type[Study[Any, Any]], dict[str, dict[str, Any]]], ...] = (
     (Skipping, {"skipping": {}, "skipping, small grids": {"size": "small"}}),
     (Stress, {"stress": {}, "stress, small grids": {"short": True}}),
 )
-"""Studies whose records may lie in a results folder, too, with titles and the flags that choose what each shows."""
+"""Other studies whose records a results folder may hold, with titles and the flags that choose the rows."""
 
 
 def main(arguments: list[str]) -> int:
@@ -61,7 +61,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a file whole and say how large it is."""
+    """Write a file atomically and print its size."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as new:
         new.write_text(text, encoding="utf-8")
@@ -77,7 +77,7 @@ def read(results: Path) -> list[RunRecord]:
 
 
 def markdown_page(folders: list[Path], command: str) -> str:
-    """Return the tables of several results folders, a section each under the folder's name."""
+    """Return the tables of several results folders, one section per folder."""
     parts = [f"# Results\n\n{generated(command)} Do not edit: generate it again.\n"]
     for folder in folders:
         found = read(folder)
@@ -135,7 +135,7 @@ def html_page(results: Path, data: Path | None, command: str) -> str:
 
 
 def more(results: Path, found: Sequence[RunRecord]) -> dict[str, str]:
-    """Return what else lies in the results folder, as HTML by title: tables of other studies, other pages as text."""
+    """Return other files of the results folder as HTML by title: tables of other studies, other pages as text."""
     parts: dict[str, str] = {}
     shown = {"table.md"}
     for kind, parted in STUDIES:

@@ -1,4 +1,4 @@
-"""Show text and figures from a notebook, also where it runs as a plain script.
+"""Show text and figures from a notebook, or from a notebook that runs as a script.
 
 In Jupyter they appear below the cell. A script writes text to the terminal and figures as PNG into the folder that
 the environment variable CTSIM_FIGURES names, else `figures/`.
@@ -36,7 +36,7 @@ def figure(drawing: Figure, name: str) -> None:
 
 
 def slices(case: Case, name: str) -> None:
-    """Show a case's viewer; a script draws what it shows first."""
+    """Show a case's viewer; a script draws its first state."""
     if (display := _jupyter()) is not None:
         display.display(view.viewer(case))
     else:
@@ -49,7 +49,7 @@ def table(head: list[str], rows: list[list[str]]) -> None:
 
 
 def _jupyter() -> Any:
-    """Return IPython's display where a notebook's kernel runs this code, which then has loaded it; else None."""
+    """Return IPython's display if a notebook's kernel runs this code, which has then loaded it; else None."""
     ipython = sys.modules.get("IPython")
     shell = ipython.get_ipython() if ipython is not None else None
     return ipython.display if ipython is not None and hasattr(shell, "kernel") else None

@@ -1,7 +1,7 @@
-"""Slices for a page: 8 bits over the stated window, small enough to be carried in it.
+"""Slices for a page: 8 bits over the stated window, small enough to embed.
 
-Volumes run from 0 to the window's top, errors from minus to plus the error scale. PNG keeps every grey; WebP at half
-the size would take the noise away.
+Volumes run from 0 to the window's top, errors from minus to plus the error scale.
+PNG keeps every grey; WebP would halve the size and smooth the noise.
 """
 
 import base64
@@ -33,17 +33,17 @@ class Frame:
     columns: slice
 
     def cut(self, volume: NDArray[Any], z: int) -> NDArray[Any]:
-        """Return a slice as it is looked at: row 0 at the bottom."""
+        """Return a slice for display: row 0 at the bottom."""
         return np.asarray(volume[z, self.rows, self.columns])[::-1]
 
 
 def quantised(image: NDArray[Any], low: float, high: float) -> Image8:
-    """Return `image` as 0 … 255 over [low, high]; what lies outside is clipped."""
+    """Return `image` as 0 … 255 over [low, high]; values outside are clipped."""
     return np.rint(np.clip((image - low) / (high - low), 0, 1) * 255).astype(np.uint8)
 
 
 def frame_of(case: Case, most: int) -> Frame:
-    """Choose at most `most` slices through the body, at even steps, the one through the most metal among them."""
+    """Choose at most `most` evenly spaced slices through the body, and the slice through the most metal among them."""
     judged = case.truth.judged
     z, rows, columns = (np.flatnonzero(judged.any(axis=tuple(a for a in range(3) if a != axis))) for axis in range(3))
     step = math.ceil(z.size / max(most, 1))
@@ -62,7 +62,7 @@ def volume_image(case: Case, values: NDArray[Any], frame: Frame, z: int) -> Imag
 
 
 def error_image(case: Case, values: NDArray[Any], frame: Frame, z: int) -> Image8:
-    """Return a slice of a volume minus the reference over the error scale; 128 is none, also in the unjudged metal."""
+    """Return a slice of a volume minus the reference over the error scale; no error and the metal are 128."""
     error = np.where(case.truth.metal[z], 0, values[z] - case.reference[z])[None]
     inside = Frame(z=(0,), rows=frame.rows, columns=frame.columns)
     return quantised(inside.cut(error, 0), -case.look.error, case.look.error)

@@ -1,6 +1,6 @@
 """A slice viewer for notebooks: one slice, window and level for several methods and their errors.
 
-`images(case, state)` says what is shown; `viewer(case)` puts sliders around it and needs the extra `notebook`.
+`images(case, state)` returns the images; `viewer(case)` adds sliders and needs the extra `notebook`.
 """
 
 import io
@@ -26,7 +26,7 @@ REFERENCE = "reference"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class State:
-    """What is looked at: slice `index` normal to `axis`, level and width of the window, the errors' scale.
+    """The state of a viewer: slice `index` normal to `axis`, level and width of the window, the errors' scale.
 
     `level`, `width` and `error` are in the case's unit (`unit`). `methods` are labels, in the order shown.
     """
@@ -64,7 +64,7 @@ def unit(case: Case) -> str:
 
 
 def first_state(case: Case) -> State:
-    """Return what is shown first: all methods, the slice through the most metal, the windows of the panels."""
+    """Return the first state: all methods, the slice through the most metal, the windows of the panels."""
     low, high = (_in_unit(case, np.array(edge)).item() for edge in (0.0, case.look.top))
     return State(
         index=case.at[0],
@@ -78,7 +78,7 @@ def first_state(case: Case) -> State:
 def images(case: Case, state: State) -> list[Shown]:
     """Return the images of a state: the reference and the methods in one window, then the errors on one scale.
 
-    Errors are volume minus effective-spectrum reference. Raises InputError for a slice or a method that is not there.
+    Errors are volume minus effective-spectrum reference. Raises InputError for an unknown slice or method.
     """
     axis = AXES.index(state.axis)
     length = case.reference.shape[axis]
@@ -105,7 +105,7 @@ def images(case: Case, state: State) -> list[Shown]:
 
 
 def _scale(case: Case) -> float:
-    """Return what turns a difference in 1/mm into the case's unit."""
+    """Return the factor from a difference in 1/mm to the case's unit."""
     return 1.0 if case.look.water is None else 1000 / case.look.water
 
 
@@ -114,7 +114,7 @@ def _in_unit(case: Case, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def figure(case: Case, state: State) -> Figure:
-    """Draw the images of a state, volumes first, errors in rows of their own; metal outlined."""
+    """Draw the images of a state: rows of volumes, then rows of errors; metal outlined."""
     shown = images(case, state)
     n = len(state.methods)
     groups = [shown[: n + 1], shown[n + 1 :]] if len(shown) > n + 1 else [shown]
@@ -142,7 +142,7 @@ def figure(case: Case, state: State) -> Figure:
 
 
 def viewer(case: Case) -> "ipywidgets.VBox":
-    """Return the viewer, for a notebook's cell; all images follow its sliders together.
+    """Return the viewer for a notebook cell; its sliders move all images.
 
     Raises InputError where ipywidgets is not installed.
     """

@@ -12,8 +12,8 @@
 
 # %% [markdown]
 # # One volume, many scores
-# PSNR and SSIM are not numbers of a volume but of a volume and a convention. Here one kept volume is scored under the
-# protocol `tissue`, then with one thing changed at a time. The same table comes from `run-benchmark inspect`.
+# PSNR and SSIM depend on a convention as well as on the volume. Here one kept volume is scored under the protocol
+# `tissue`, then with one convention changed at a time. The same table comes from `run-benchmark inspect`.
 # Conventions with the reference of 50 keV score a method's own volume at 50 keV, if it has one, here and below.
 #
 # The folders are `data` and `results`, or what the environment variables `CTSIM_DATA` and `CTSIM_RESULTS` name.
@@ -67,8 +67,8 @@ show.figure(drawing, "metrics-conventions")
 
 # %% [markdown]
 # ## Does a convention change who wins?
-# The order of the methods by PSNR under each convention, best first. Where it differs, a ranking is a statement about
-# the convention as well.
+# The order of the methods by PSNR under each convention, best first. Where it differs, the ranking depends on the
+# convention.
 
 # %%
 rows = []

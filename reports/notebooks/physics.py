@@ -12,8 +12,8 @@
 
 # %% [markdown]
 # # The physics of one scene
-# The spectrum that a scan is made with, how it hardens, what the counts' noise is, and what the metal does to line
-# integrals and to a reconstruction. The scene is rebuilt from its `scene.toml`; nothing here is read from a table.
+# The spectrum of a scan, beam hardening, the noise of the counts, and the effect of metal on line integrals and on a
+# reconstruction. The scene is rebuilt from its `scene.toml`; nothing here is read from a table.
 #
 # The folder is `data`, or what the environment variable `CTSIM_DATA` names; the first scan in it is shown.
 
@@ -47,8 +47,8 @@ show.text(f"**{stored.name}**\n\n```\n{plan.text()}\n```")
 
 # %% [markdown]
 # ## Spectrum
-# What leaves the tube, what the detector makes of it, and what is left of that behind the scene's median water path.
-# The stems are the few energies that stand for all in the simulation.
+# The tube's spectrum, the spectrum that the detector measures, and the latter behind the scene's median water path.
+# The stems are the few energies of the simulation's quadrature.
 
 # %%
 fine = full_rule(plan.spectrum, scanner.detector)
@@ -72,8 +72,8 @@ show.figure(drawing, "physics-spectrum")
 
 # %% [markdown]
 # ## Hardening
-# P = −ln(I/I0) of a growing thickness bends away from the straight line of its first millimetres: soft photons go
-# first. What is left is harder, so that a millimetre more weighs less.
+# P = −ln(I/I0) of a growing thickness bends away from the straight line of its first millimetres: soft photons are
+# absorbed first. The rest is harder, so one more millimetre attenuates less.
 
 # %%
 metals = [m for m in stored.info.metal if m in plan.materials]
@@ -100,7 +100,7 @@ show.table(["material", "mm", "P", "mean energy left (keV)", "μ of one mm more 
 
 # %% [markdown]
 # ## Line integrals
-# Of a dozen views the one with most metal in it: without noise, as the counts say, and what the metal adds. Where
+# The view with the most metal of a dozen: without noise, from the counts, and the part that the metal adds. Where
 # hardly a photon comes through, the logarithm of the counts is mostly noise.
 
 # %%
@@ -125,7 +125,7 @@ show.figure(drawing, "physics-line-integrals")
 # %% [markdown]
 # ## Noise
 # The view is drawn 100 times with fresh streams. The relative signal's variance should be Σ w2·exp(−τ)/i0, plus the
-# electronics', plus a twelfth of a squared count for rounding. 100 draws know a standard deviation to
+# electronics', plus a twelfth of a squared count for rounding. 100 draws give a standard deviation to
 # 1/√(2·99) = 7 %, so single pixels scatter by that much around the line.
 
 # %%
@@ -150,8 +150,8 @@ show.text(f"Measured over predicted standard deviation, median of all pixels: {n
 
 # %% [markdown]
 # ## What the metal does
-# FDK of the scan and of its metal-free twin, and their difference: both saw the same noise streams, so that all of it
-# is the metal's doing.
+# FDK of the scan and of its metal-free twin, and their difference: both have the same noise streams, so the
+# difference comes from the metal alone.
 
 # %%
 if stored.metal_free is None:

@@ -32,8 +32,8 @@ if not records:
 
 # %% [markdown]
 # ## Scores
-# `tissue` is the primary protocol. The gains are over no correction (FDK) and over NMAR; an anchored score is 0 where
-# the metal might never have been there and 1 where it was left uncorrected.
+# `tissue` is the primary protocol. The gains are over no correction (FDK) and over NMAR; an anchored score is 0 for
+# FDK without the metal and 1 for FDK with it, uncorrected.
 
 # %%
 show.text(render(records, "md", ("tissue", "against", "anchored", "cost")))

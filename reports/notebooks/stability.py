@@ -13,7 +13,7 @@
 # %% [markdown]
 # # Numerical stability
 # How much is lost by computing in float32, and whether threads change a result. The stress suite (`run-benchmark
-# stress`) asks this of hard cases; here a small scan is enough to see how it is asked.
+# stress`) tests this on hard cases; here a small scan shows how.
 #
 # The folders are `data` and `results`, or what the environment variables `CTSIM_DATA` and `CTSIM_RESULTS` name.
 
@@ -85,8 +85,8 @@ show.text(f"⟨A x, y⟩ = {one:.9g}, ⟨x, Aᵀ y⟩ = {other:.9g}, relative di
 # %% [markdown]
 # ## The sum over energies
 # A pixel adds up a dozen exponentials in float32. Behind up to 100 mm of water and 10 mm of iron, the logarithm of the
-# sum is compared with float64. Photon noise at 1e5 photons is 3e-3 in P where nothing is in the way, and more behind
-# anything.
+# sum is compared with float64. Photon noise at 1e5 photons is 3e-3 in P on open detector, and more behind an
+# object.
 
 # %%
 names, most = ("water", "Fe"), (100.0, 10.0)
@@ -121,7 +121,7 @@ show.text(f"Threads {', '.join(map(str, volumes))}: {'bitwise equal' if same els
 # %% [markdown]
 # ## The stress suite
 # What `run-benchmark stress` recorded, if it was run into this results folder: the last record of each row, blue where
-# it ended as expected. What did not is named with what was found.
+# it ended as expected. Other rows are listed with their results.
 
 # %%
 rows = latest(Stress().store(Flags(results=RESULTS)).read())
