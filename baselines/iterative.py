@@ -45,7 +45,9 @@ class Iterations(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     iterations: Count = 10
     weights: Annotated[
         Weighting,
-        about("of rays: all alike, none in the trace of metal, or by photons", also=torch.Tensor),
+        about(
+            "of the rays: all 1, 0 in the metal's trace, or the share of photons that come through", also=torch.Tensor
+        ),
     ] = "none"
 
 

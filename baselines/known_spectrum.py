@@ -138,9 +138,9 @@ def water_precorrection(scan: Scan, settings: Known) -> Volume:
 class Ibhc(Known, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What is known, and of what the object is."""
 
-    iterations: Annotated[int, about("corrections after that of water", ge=1, le=50)] = 2
-    bone: Annotated[str, about("material of what is denser than water")] = "cortical_bone"
-    metal: Annotated[str, about("material of what the automatic mask finds; empty: metal is taken for bone")] = ""
+    iterations: Annotated[int, about("corrections after the water correction", ge=1, le=50)] = 2
+    bone: Annotated[str, about("material of voxels denser than water")] = "cortical_bone"
+    metal: Annotated[str, about("material in the automatic metal mask; empty: metal is treated as bone")] = ""
 
     def __post_init__(self) -> None:
         Known.__post_init__(self)

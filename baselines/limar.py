@@ -33,9 +33,9 @@ class Bridging(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     mask: Mask = "oracle"
     interpolation: Interpolation = "rows"
     insert: Insert = "fdk"
-    dilation: Annotated[Pixels | None, about("widens the trace; null: what the mask's edge leaves out", "pixels")] = (
-        None
-    )
+    dilation: Annotated[
+        Pixels | None, about("widens the trace; null: by the dark pixels at the mask's edge", "pixels")
+    ] = None
 
     def __post_init__(self) -> None:
         check_mask(self.mask)

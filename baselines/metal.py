@@ -25,7 +25,7 @@ SHARE, PLAIN = 0.5, 0.75  # at most this share of the mask may lie below three q
 THINNEST = 0.05  # length in metal, in voxels, from which a pixel belongs to the trace
 
 Mask = Annotated[str, about("where the metal is: oracle (the scan's own), auto (found), a TIFF or a .npy file")]
-Insert = Annotated[Literal["fdk", "mean", "none"], about("what is put back where the metal is")]
+Insert = Annotated[Literal["fdk", "mean", "none"], about("values that are put back into the metal")]
 INSERTS = names_of(Insert)
 
 

@@ -25,7 +25,7 @@ from ctsim.types import Scan, Status, Volume
 
 Normalisation = Annotated[
     Literal["offset", "additive", "ratio"],
-    about("how projections are made flat by the prior's before bridging"),
+    about("how the prior's projections flatten the measured ones before bridging"),
 ]
 Floor = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 
@@ -75,7 +75,7 @@ class Settings(Bridging, frozen=True, kw_only=True, forbid_unknown_fields=True):
     prior: Prior = "auto"
     normalisation: Normalisation = "offset"
     floor: Annotated[
-        Floor | None, about("what is added to, or least of, the divisor; null: 0.2, or 0.05 of a ratio", "of max q")
+        Floor | None, about("added to the divisor, or its least value; null: 0.2, or 0.05 for ratio", "of max q")
     ] = None
 
 

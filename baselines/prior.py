@@ -25,7 +25,7 @@ MARGIN = 0.95  # LIMAR's prior must fit better by this
 RING = 4  # width in pixels of the ring around the trace that the priors are judged on
 Prior = Annotated[
     Literal["auto", "fdk", "limar"],
-    about("volume that the tissue prior is made of; auto: limar where it fits the projections better"),
+    about("volume that the tissue prior is made from; auto: limar if it fits the projections better"),
 ]
 PRIORS = names_of(Prior)
 NO_BODY = "nothing stands out from air"

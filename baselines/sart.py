@@ -25,7 +25,9 @@ from ctsim.baselines.kernels.sart_cpu import move
 from ctsim.reconstruct.settings import about, keywords
 from ctsim.types import Scan, Volume
 
-Relaxation = Annotated[float, about("share of what rays lack that a step adds; converges below 2", gt=0, le=10)]
+Relaxation = Annotated[
+    float, about("share of the rays' residuals that a step corrects; converges below 2", gt=0, le=10)
+]
 Positivity = Annotated[bool, about("cut negative values to zero")]
 CACHE_BYTES = 1 << 30  # voxel sums of the subsets are kept up to this size, else computed on each visit
 
@@ -41,7 +43,7 @@ class OsSart(Sart, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As `Sart`, with the views in interleaved subsets."""
 
     relaxation: Relaxation = 1.0
-    subsets: Annotated[int, about("subsets of the views, at most one a view", ge=1, le=100_000)] = 20
+    subsets: Annotated[int, about("subsets of the views, at most one per view", ge=1, le=100_000)] = 20
 
 
 class Sirt(Sart, frozen=True, kw_only=True, forbid_unknown_fields=True):

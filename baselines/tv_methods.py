@@ -37,29 +37,31 @@ class FistaTv(Iterations, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """As `Iterations`, and how each denoises."""
 
     iterations: Count = 50
-    tv: Annotated[float, about("ripples that a step flattens", "of the scan's water", ge=0, le=1000)] = 0.0024
-    tv_iterations: Annotated[int, about("iterations of denoising in each", ge=1, le=10_000)] = 20
+    tv: Annotated[float, about("size of ripples that a step flattens", "of the scan's water", ge=0, le=1000)] = 0.0024
+    tv_iterations: Annotated[int, about("iterations of each denoising", ge=1, le=10_000)] = 20
     positivity: Positivity = True
 
 
 class Descent(Iterations, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """SART passes in turn with steps down TV."""
 
-    tv_steps: Annotated[int, about("steps down TV after a pass", ge=1, le=10_000)] = 20
-    alpha: Annotated[float, about("first step down TV", "of the first pass's change", gt=0, le=1000)] = 0.02
+    tv_steps: Annotated[int, about("steps down the gradient of total variation after a pass", ge=1, le=10_000)] = 20
+    alpha: Annotated[
+        float, about("first step down the gradient of total variation", "of the first pass's change", gt=0, le=1000)
+    ] = 0.02
 
 
 class AsdPocs(Descent, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As `Descent`."""
 
-    epsilon: Annotated[Share | None, about("relative residual to keep to; null: that of photon noise")] = None
+    epsilon: Annotated[Share | None, about("relative residual to reach; null: that of photon noise")] = None
 
 
 class AwPcsd(Descent, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As `Descent`."""
 
     delta: Annotated[
-        float, about("step between voxels from which an edge is spared", "of the scan's water", gt=0, le=1e6)
+        float, about("difference between voxels above which an edge is kept", "of the scan's water", gt=0, le=1e6)
     ] = 2.0
 
 

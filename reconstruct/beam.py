@@ -19,10 +19,10 @@ ROUNDED = 1e-6  # keV
 Given = Mapping[str, Any] | None
 TubeTable = Annotated[
     dict[str, Any] | None,
-    about("tube of a scene file, whole or in part; what is left out is the simulator's, kvp the scan's highest energy"),
+    about("tube as in a scene file; missing keys: the simulator's defaults, kvp: the scan's highest energy"),
 ]
 DetectorTable = Annotated[
-    dict[str, Any] | None, about("detector of a scene file, whole or in part; what is left out is the simulator's")
+    dict[str, Any] | None, about("detector as in a scene file; missing keys: the simulator's defaults")
 ]
 Kind = TypeVar("Kind", Tube, Detector)
 

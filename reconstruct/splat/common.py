@@ -10,7 +10,8 @@ from ctsim.reconstruct.settings import about
 
 Energy = Annotated[float, about("", "keV", gt=0, le=1000)]
 Seconds = Annotated[
-    float, about("the fit ends after these with what it has, those before an interruption included", "s", ge=0)
+    float,
+    about("time limit of the fit, which then returns its current volume; counts on after an interruption", "s", ge=0),
 ]
 
 
@@ -20,7 +21,9 @@ class Common(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     tube: TubeTable = None
     detector: DetectorTable = None
     seconds: Seconds = math.inf
-    checkpoints: Annotated[str, about("folder where an unfinished fit is kept each minute and goes on from")] = ""
+    checkpoints: Annotated[
+        str, about("folder for the state of an unfinished fit, saved each minute; the next run continues from it")
+    ] = ""
 
     def __post_init__(self) -> None:
         check_tables(self.tube, self.detector)

@@ -56,14 +56,16 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     scans whose open pixels are brighter than their open field for another reason.
     """
 
-    passes: Annotated[tuple[Passes, Passes] | None, about("over the views: each coarser level's, the finest's")] = None
-    tv: Annotated[float, about("threshold of denoising a hundred views", "of water", ge=0, le=1000)] = 0.025
-    fineness: Annotated[float, about("the finest grid over the volume's", ge=1, le=16)] = 1.5
+    passes: Annotated[tuple[Passes, Passes] | None, about("over the views: on each coarser level, on the finest")] = (
+        None
+    )
+    tv: Annotated[float, about("denoising threshold per 100 views", "of water", ge=0, le=1000)] = 0.025
+    fineness: Annotated[float, about("how much finer the finest grid is than the volume's", ge=1, le=16)] = 1.5
     exact: Annotated[bool, about("project splats by their exact line integrals, not by EWA")] = False
-    response: Annotated[Literal["tube", "known"], about("beam: assumed, or that of tube and detector")] = "tube"
+    response: Annotated[Literal["tube", "known"], about("beam: assumed, or known from tube and detector")] = "tube"
     filtration: Annotated[float, about("filtration behind the assumed tube", "mm Al", ge=FILTER[0], le=FILTER[2])] = 0.5
-    readout: Annotated[Energy | Literal["hardened"], about("where the volume is read")] = "hardened"
-    scatter: Annotated[Excess | None, about("what every reading holds of it; null: found", "of the open field")] = None
+    readout: Annotated[Energy | Literal["hardened"], about("energy at which the volume is read")] = "hardened"
+    scatter: Annotated[Excess | None, about("scatter in every reading; null: estimated", "of the open field")] = None
 
     def __post_init__(self) -> None:
         Common.__post_init__(self)

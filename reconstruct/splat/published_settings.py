@@ -30,7 +30,7 @@ START, ALONE = {"a": 0.075, "b": 0.0075}, 0.15  # of the FDK volume's values, of
 RATES = {"a": 0.01, "b": 0.1}  # learning rates of the densities
 VOXELS_A_SPLAT = 4  # at least, where splats are added
 MANY = 100_000_000
-Steps = Annotated[int, about("steps of Adam, of a view each", ge=1, le=MANY)]
+Steps = Annotated[int, about("steps of Adam, one view each", ge=1, le=MANY)]
 ScheduleSteps = Annotated[int, about("steps that the schedule is for", ge=1, le=MANY)]
 FormOfResponse = Annotated[ResponseName, about("form of the scanner's response")]
 EnergyBasis = Annotated[Basis, about("how attenuation depends on energy")]
@@ -51,16 +51,22 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     steps: Steps = 20_000
     schedule_steps: ScheduleSteps = 20_000
-    seed: Annotated[int, about("of the order of views and of the splats that start", ge=0, le=2**63 - 1)] = 0
+    seed: Annotated[int, about("of the order of views and of the first splats", ge=0, le=2**63 - 1)] = 0
     response: FormOfResponse = "paper"
     basis: EnergyBasis = "paper"
-    nodes: Annotated[Nodes | None, about("energies of the response; null: as many as its form has")] = None
-    theta: Annotated[tuple[float, ...] | None, about("start of the response's parameters; null: its form's")] = None
+    nodes: Annotated[Nodes | None, about("number of energies of the response; null: the form's default")] = None
+    theta: Annotated[
+        tuple[float, ...] | None, about("start of the response's parameters; null: the form's default")
+    ] = None
     learn_response: Annotated[bool, about("learn the response's parameters")] = True
     e_max: Annotated[Greatest | None, about("greatest energy; null: the scan's", "keV")] = None
-    readout: Annotated[Energy | Literal["hardened"] | None, about("where the volume is read; null: at Ē = 1")] = None
-    held_out: Annotated[int, about("views that are kept from the fit", ge=0, le=MANY)] = 0
-    patience: Annotated[int, about("passes without gain on them after which it ends", ge=1, le=MANY)] = 5
+    readout: Annotated[
+        Energy | Literal["hardened"] | None, about("energy at which the volume is read; null: at Ē = 1")
+    ] = None
+    held_out: Annotated[int, about("views that the fit does not use", ge=0, le=MANY)] = 0
+    patience: Annotated[
+        int, about("passes without gain on the held-out views after which the fit ends", ge=1, le=MANY)
+    ] = 5
     n_splats: Annotated[int, about("splats to start with, at most", ge=1, le=MANY)] = 50_000
     tv_share: TvShare = 0.0
     schedule: Annotated[Schedule, about("when and where splats are added, and how many at most")] = Schedule()
