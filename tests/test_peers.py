@@ -10,7 +10,7 @@ import pytest
 from ctsim.benchmarks import oracles
 from ctsim.benchmarks.engine import host
 from ctsim.benchmarks.engine.record import Record, Task
-from ctsim.benchmarks.studies.peers import cases, finding, poly, study, tables
+from ctsim.benchmarks.studies.peers import cases, finding, poly, study
 from ctsim.benchmarks.studies.peers.finding import OURS, RTK, XCIST, Measurement, Setup
 from ctsim.benchmarks.studies.peers.libraries import Rtk, Xcist
 from ctsim.errors import InputError
@@ -226,7 +226,7 @@ def test_verdicts_pair_the_runs_and_name_what_is_missed():
     # the machine slows down threefold in the second run; the paired ratio stays 0.25
     ours = measurement(OURS, (1.0, 3.0, 1.0), error=2e-3)
     theirs = measurement(RTK, (4.0, 12.0, 4.0), error=1e-3)
-    time, error = tables.verdicts("fdk", [ours, theirs])
+    time, error = study.verdicts("fdk", [ours, theirs])
     assert (time.value, time.met) == (0.25, True)
     assert (error.value, error.met) == (2.0, False)
 
@@ -234,14 +234,14 @@ def test_verdicts_pair_the_runs_and_name_what_is_missed():
 def test_each_quantity_is_compared_with_the_peer_that_is_best_in_it():
     ours = measurement(f"{OURS}, exact solids", (1.0, 1.0), error=1e-3)
     quick, close = measurement(RTK, (4.0, 4.0), error=1e-2), measurement(XCIST, (8.0, 8.0), error=4e-3)
-    found = tables.verdicts("poly", [ours, close, quick])
+    found = study.verdicts("poly", [ours, close, quick])
     assert [(v.quantity, v.peer, v.value, v.met) for v in found] == [
         ("time ratio", RTK, 0.25, False),
         ("error ratio", XCIST, 0.25, False),
     ]
     # a peer that failed is no peer
     failed = msgspec.structs.replace(quick, status="error")
-    assert {v.peer for v in tables.verdicts("poly", [ours, close, failed])} == {XCIST}
+    assert {v.peer for v in study.verdicts("poly", [ours, close, failed])} == {XCIST}
 
 
 def test_without_peers_only_our_own_limits_are_judged():
@@ -249,15 +249,15 @@ def test_without_peers_only_our_own_limits_are_judged():
     assert [(m.contender, m.skipped) for m in missing] == [(RTK, "absent"), (XCIST, "absent")]
     assert all("pip install" in m.reason for m in missing)
     ours = measurement(f"{OURS}, exact solids", (1.0,), error=1e-3, peak_bytes=4 * 10**8)
-    found = tables.verdicts("poly", [ours, *missing])
+    found = study.verdicts("poly", [ours, *missing])
     assert [(v.quantity, v.value, v.met) for v in found] == [("peak GB", 0.4, True)]
 
 
 def test_only_exact_solids_have_a_target_for_their_error():
     found = [measurement(f"{OURS}, {what}", error=1e-3) for what in ("exact solids", "voxels only")]
-    assert [(v.scene, v.value, v.met) for v in tables.verdicts("exact", found)] == [("s (exact solids)", 1e-3, False)]
+    assert [(v.scene, v.value, v.met) for v in study.verdicts("exact", found)] == [("s (exact solids)", 1e-3, False)]
     (paper,) = [measurement(OURS, (61.0,), peak_bytes=10**9)]
-    assert [(v.quantity, v.met) for v in tables.verdicts("paper", [paper])] == [("seconds", False), ("peak GB", True)]
+    assert [(v.quantity, v.met) for v in study.verdicts("paper", [paper])] == [("seconds", False), ("peak GB", True)]
 
 
 def stored(folder):
@@ -386,8 +386,8 @@ def test_tables_say_which_case_is_of_which_machine_and_peers():
         return Record(task=task, found=found, host=where, commit="a" * 40, time="2026-01-01T00:00:00+00:00")
 
     same = [record("fdk", "ours", **{RTK: "2.7"}), record("paths", "ours", **{RTK: "2.7"})]
-    assert tables.measured(same, "full").notes == [f"Installed peers: {RTK} 2.7."]
-    notes = tables.measured([*same, record("exact", "theirs")], "full").notes
+    assert study.measurement_table(same, "full").notes == [f"Installed peers: {RTK} 2.7."]
+    notes = study.measurement_table([*same, record("exact", "theirs")], "full").notes
     assert [note.partition(": ")[0] for note in notes] == ["fdk, paths", "exact"]
     assert "aaaaaaaaaaaa, ours" in notes[0] and "theirs" in notes[1] and notes[1].endswith("Installed peers: none.")
 
