@@ -30,7 +30,7 @@ from ctsim.benchmarks.studies.peers import cases as peer_cases
 from ctsim.benchmarks.studies.peers import finding as peer_finding
 from ctsim.benchmarks.studies.peers.study import Peers
 from ctsim.benchmarks.studies.skipping import simulator
-from ctsim.benchmarks.studies.skipping.pairs import Pair
+from ctsim.benchmarks.studies.skipping.simulator import Pair
 from ctsim.benchmarks.studies.skipping.study import Skipping
 from ctsim.benchmarks.studies.stress.study import Judged, Stress, StressRow
 

@@ -12,7 +12,7 @@ from ctsim.benchmarks.engine.record import Record, latest
 from ctsim.benchmarks.studies.skipping import methods as skipping_methods
 from ctsim.benchmarks.studies.skipping import simulator as skipping_cases
 from ctsim.benchmarks.studies.skipping import study as skipping
-from ctsim.benchmarks.studies.skipping.pairs import Bench, Pair, largest
+from ctsim.benchmarks.studies.skipping.simulator import Bench, Pair, largest
 from ctsim.benchmarks.studies.skipping.study import Skip
 from ctsim.bricks import MIXED
 from ctsim.phantoms.scene import build

@@ -1,4 +1,4 @@
-"""What `run-benchmark skipping` measures of reconstruction methods and commands, beside the simulator's cases."""
+"""What `run-benchmark skipping` measures of reconstruction methods and commands; `simulator` has the other cases."""
 
 import functools
 import tempfile
@@ -23,7 +23,7 @@ from ctsim.benchmarks.studies.methods import study as cli_run
 from ctsim.benchmarks.studies.methods.attempt import scan_for
 from ctsim.benchmarks.studies.methods.volumes import read_volume
 from ctsim.benchmarks.studies.skipping import simulator
-from ctsim.benchmarks.studies.skipping.pairs import Bench, Cases, Pair, largest
+from ctsim.benchmarks.studies.skipping.simulator import Bench, Cases, Pair, largest
 from ctsim.benchmarks.studies.skipping.study import Flags, Skip
 from ctsim.phantoms.scene import scene_to_toml
 from ctsim.reconstruct.fdk import fdk_stream
@@ -33,12 +33,12 @@ from ctsim.store import StoredScan, open_scan
 from ctsim.types import Scan
 
 HOW = "rows"
-# float32 sums in the same order, of rows read at places that were worked out from another centre
+# float32 sums in the same order, of rows read at places computed from another centre
 MOVED, MOVED_AT = 1e-5, "tests/test_fdk.py"
 
 
 def made(setup: Bench, *flags: str) -> StoredScan:
-    """Make the thorax' scan in the setup's folder unless it is there, and open it."""
+    """Open the thorax' scan in the setup's folder; make it if it is missing."""
     scene = setup.scene()
     recipe = setup.folder / "scene.toml"
     recipe.write_text(scene_to_toml(scene), encoding="utf-8")
@@ -47,9 +47,9 @@ def made(setup: Bench, *flags: str) -> StoredScan:
 
 
 def everything(trace: Trace, choice: Choice | None = None) -> torch.Tensor:
-    """Bridge all projections, as NMAR does where a prior is chosen and as LIMAR else; reconstruct them from nothing.
+    """Fill the trace in all projections, with a prior as NMAR, else as LIMAR; reconstruct the whole volume.
 
-    The prior is projected on every row of every view. Returns [z, y, x] in 1/mm.
+    The prior is projected onto every row of every view. Returns [z, y, x] in 1/mm.
     """
     filled = Filled()
 
@@ -67,7 +67,7 @@ def everything(trace: Trace, choice: Choice | None = None) -> torch.Tensor:
 
 
 def begun(scan: Scan) -> tuple[torch.Tensor, Trace]:
-    """Return the volume of FDK, and the metal's trace."""
+    """Return FDK's volume and the metal trace."""
     first = fdk(scan).values
     return first, Trace(find_metal(scan, first.numpy(), "oracle"), scan)
 
@@ -81,7 +81,7 @@ def chosen(trace: Trace, scan: Scan, first: torch.Tensor) -> Choice:
 
 
 def without_metal_check(scan: Scan, name: str) -> torch.Tensor:
-    """Correct a scan as LIMAR or NMAR would, did they not look whether there is metal."""
+    """Correct a scan as LIMAR or NMAR would without first looking for metal."""
     first, trace = begun(scan)
     return everything(trace, chosen(trace, scan, first) if name == "nmar" else None)
 
@@ -90,7 +90,7 @@ def without_metal_check(scan: Scan, name: str) -> torch.Tensor:
 
 
 def metal_free(setup: Bench) -> Iterator[Pair]:
-    """Yield LIMAR and NMAR on the twin, where they stop after FDK, and all they would do for an empty trace."""
+    """Yield LIMAR and NMAR on the twin, where they stop after FDK, and the full correction of an empty trace."""
     stored = made(setup)
     for name in ("limar", "nmar"):
         method = find(name)
@@ -106,9 +106,9 @@ def metal_free(setup: Bench) -> Iterator[Pair]:
 
 
 def rows(setup: Bench) -> Iterator[Pair]:
-    """Yield LIMAR and NMAR reconstructing what they change, and reconstructing all of it again.
+    """Yield LIMAR and NMAR reconstructing only what they change, and the whole volume.
 
-    FDK, the trace and the prior, which both ways need, are prepared.
+    FDK, the trace and the prior, which both ways need, are made before.
     """
     stored = made(setup)
     scan = scan_for(find("limar"), stored, "metal")
@@ -134,7 +134,7 @@ def rows(setup: Bench) -> Iterator[Pair]:
 
 
 def stored_scan(setup: Bench) -> Iterator[Pair]:
-    """Yield make-dataset where the scan is there, and made again."""
+    """Yield make-dataset of a scan that exists, and of the scan made again."""
     stored = made(setup)
     names = sorted(name.removesuffix(".tif") for name in stored.files if name.endswith(".tif"))
 
@@ -152,7 +152,7 @@ def stored_scan(setup: Bench) -> Iterator[Pair]:
 
 
 def recorded_run(setup: Bench) -> Iterator[Pair]:
-    """Yield run-benchmark where the run is recorded, and run again; both render the tables and pictures."""
+    """Yield run-benchmark of a recorded run, and of the run repeated; both write tables and pictures."""
     name = made(setup).name
     results = setup.folder / "results"
 
@@ -180,5 +180,5 @@ def measure(task: Task, given: Flags) -> list[Skip]:
 
 @functools.cache
 def _folder() -> Path:
-    """Return a folder that all cases of this process share, so that a scan is made once."""
-    return Path(tempfile.mkdtemp(prefix="ctsim-skipping-"))  # goes with the process's own TMPDIR
+    """Return a folder that this process's cases share, so that a scan is made once."""
+    return Path(tempfile.mkdtemp(prefix="ctsim-skipping-"))  # removed with the process's own TMPDIR

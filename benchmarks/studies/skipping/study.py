@@ -1,4 +1,4 @@
-"""`run-benchmark skipping RESULTS`: what is left out, the time that saves, and how far the results differ."""
+"""`run-benchmark skipping RESULTS`: what ctsim leaves out, the time this saves, and the difference of the results."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from ctsim.benchmarks.engine import host, study
 from ctsim.benchmarks.engine.record import OK, Found, Record, Task
 from ctsim.benchmarks.engine.table import Table, simple
 
-CORE = "core"  # the size that says something about speed
+CORE = "core"  # the size to measure speed at
 Case = Literal[
     "materials", "bricks", "rays", "energies", "edges", "refining", "scatter", "twin",
     "truth", "metal-free", "rows", "scan", "record",
@@ -24,10 +24,10 @@ SECONDS: dict[str, float] = {
 
 
 class Skip(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One skip: seconds "skipping" and "whole", run by run in pairs, and the largest difference of the result.
+    """One skip: seconds "skipping" and "whole", run by run in pairs, and the largest difference of the results.
 
-    `difference` is in what `unit` says, None where it is not finite; `limit` is what `stated` allows it, None where
-    the two are meant to differ.
+    `difference` is in `unit`, None where it is not finite; `limit` is the largest allowed, as `stated` says, None where
+    the results are meant to differ.
     """
 
     scene: str = ""
@@ -47,16 +47,16 @@ class Skip(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     @property
     def gain(self) -> float:
-        """Median over pairs of neighbouring runs of the time without the skip over that with it."""
+        """Time without the skip over time with it: the median over pairs of neighbouring runs."""
         return median(b / a for a, b in zip(self.seconds["skipping"], self.seconds["whole"], strict=True))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Flags(study.Flags):
-    """Measure everything that is left out: the time with and without it, and the largest difference of the result.
+    """Measure each thing that ctsim leaves out: the time with and without it, and the largest difference in the result.
 
-    Exit code 1 where a difference exceeds what is stated of it or a case did not end. The machine should have nothing
-    else to do.
+    Exit code 1 where a difference exceeds its stated limit or a case did not end. Run nothing else on the machine
+    meanwhile.
     """
 
     case: Annotated[tyro.conf.UseAppendAction[tuple[Case, ...]], tyro.conf.arg(metavar="CASE")] = ()
@@ -86,11 +86,11 @@ class Skipping(study.Study[Record[Skip], Flags]):
         ]
 
     def shows(self, task: Task, given: Flags) -> bool:
-        """Whether a task is of the size that was asked for."""
+        """Whether a task has the size asked for."""
         return task.part == given.size
 
     def expected(self, task: Task, given: Flags) -> float | None:
-        """Return the seconds measured once at size core."""
+        """Return the seconds at size core, from `SECONDS`."""
         return SECONDS[task.case] * (given.repeats + 1) if given.size == CORE else None
 
     def tables(self, records: Sequence[Record[Skip]], given: Flags) -> list[Table]:
@@ -127,5 +127,5 @@ def _difference(f: Skip) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the command; 0 if every difference is within what is stated, 1 if one is not or was not measured."""
+    """Run the command; 0 if every difference is within its limit, 1 if one is not or was not measured."""
     return study.main(Skipping(), arguments)
