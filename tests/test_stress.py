@@ -16,8 +16,8 @@ from ctsim.baselines.known_spectrum import Beam
 from ctsim.benchmarks.engine import study as engine
 from ctsim.benchmarks.methods import TABLE, find
 from ctsim.benchmarks.oracles import upright_chord
+from ctsim.benchmarks.studies.stress import kernels, study, worker
 from ctsim.benchmarks.studies.stress import methods as stress_methods
-from ctsim.benchmarks.studies.stress import simulator, study, worker
 from ctsim.benchmarks.studies.stress.scans import Findings, carry_out, example, few_views, lengths
 from ctsim.benchmarks.studies.stress.suite import Machine, Rod, Scene, load
 from ctsim.errors import InputError
@@ -73,7 +73,7 @@ def test_a_case_is_the_same_for_all_its_subjects():
     assert {case for case, subject in ROWS if subject == "simulator"} == {
         *(name for name, scene in scenes.items() if scene.simulated), "flat-solids", "float64", "threads",
     }  # fmt: skip
-    assert {*simulator.CHECKS} == {*study.CHECKS} < {*scenes}
+    assert {*kernels.CHECKS} == {*study.CHECKS} < {*scenes}
     no_scenes = {name for name, row in ROWS.items() if row.scene is None and row.method is None}
     assert no_scenes == {*worker.PROGRAMS} == {(c, subject) for subject, own in study.PROGRAMS.items() for c, *_ in own}
 

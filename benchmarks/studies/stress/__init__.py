@@ -1,4 +1,4 @@
-"""`run-benchmark stress`: numerical stress, and the flags of that command."""
+"""`run-benchmark stress`: numerical stress. The flags of the command."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +13,11 @@ from ctsim.benchmarks.engine.study import Options
 class Flags(Options):
     """Put simulator, methods and splat kernels under numerical stress; exit code 1 if anything is not as expected.
 
-    A row fails where it misses its oracle, is not finite, raises, warns, crashes or does not end.
+    A row fails if it misses its expected value, is not finite, raises, warns, crashes or does not end.
     """
 
     results: tyro.conf.Positional[Path]
-    """The folder for stress.jsonl and stress.md; made if it is not there."""
+    """The folder for stress.jsonl and stress.md; created if missing."""
     short: tyro.conf.FlagCreatePairsOff[bool] = False
     """Small grids; every case, in about two minutes on two cores."""
     case: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()

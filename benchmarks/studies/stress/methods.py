@@ -1,12 +1,11 @@
-"""Stress rows of the reconstruction methods: every scene of a suite by every method, variants of `splat` included.
+"""Stress rows of the reconstruction methods: every method, variants of `splat` included, on every scene of a suite.
 
-A volume must have the grid's shape, finite values, and status ok (any other needs a sentence, and where no reading is
-above the pedestal it must be another). Its values stay within
-π·(dso/(dso − r))²·max|P|/pitch, the closed-form bound of FDK: views weigh 2π in all, the ramp's absolute values sum to
-1/(2 pitch) and backprojection weighs by the square, r from the axis; a voxel that an iterative method fits to a ray
-that crosses half of it stays below that, too. Where the data determine the object, the RMSE over the body, away from
-metal, must not exceed 0.7 of an empty volume's, unless the result says what is wrong (its `limitation`). Where a scan
-has another form of exactly the same content, the same method must give the same volume of it.
+A volume must have the grid's shape, finite values, and status ok or a stated reason; where no reading is above the
+pedestal, the status must not be ok. Its values stay within π·(dso/(dso − r))²·max|P|/pitch, the closed-form bound of
+FDK at radius r: the views' weights sum to 2π, the ramp's absolute values to 1/(2 pitch), and backprojection weighs by
+the square. A voxel that an iterative method fits to a ray through half of it stays below this, too. Where the data
+determine the object, the RMSE over the body, away from metal, must not exceed 0.7 of an empty volume's, unless the
+result states its `limitation`. Of two forms of a scan with the same content a method must give the same volume.
 """
 
 import dataclasses
@@ -33,7 +32,7 @@ from ctsim.types import Scan, Status, Volume
 
 
 def bound(scan: Scan) -> float:
-    """Return the greatest value (1/mm) that a volume of a scan may have, as the module's docstring says."""
+    """Return the greatest value (1/mm) that a volume of a scan may have; the module's docstring derives it."""
     g = scan.geometry
     radius = min(ray_weights(g).radius, math.hypot(*g.s_voxel[1:]) / 2)
     pitch = min(g.d_detector[1] * g.dso / g.dsd, *g.d_voxel)
@@ -67,7 +66,7 @@ def on_scene(name: str, settings: dict[str, Any], scene: Scene, side: int, found
 
 
 def _volume(method: Method, scan: Scan) -> Volume:
-    """Run a method, with the true mask only where it declares to be given it."""
+    """Run a method; only one that declares the true mask gets it."""
     return method.reconstruct(scan if method.mask == "oracle" else dataclasses.replace(scan, metal=None))
 
 
@@ -111,7 +110,7 @@ def fdk_in_float64(p: NDArray[np.float64], of: Geometry) -> NDArray[np.float64]:
 
 
 def chain(side: int, found: Findings) -> None:
-    """Compare the volumes of both chains; P may differ by the simulator's limit, the volume by that through FDK."""
+    """Compare the volumes of both chains; the limit is the simulator's |ΔP|, carried through FDK."""
     scanner = Machine(noise=Noise(model="none")).resolve(side)
     stacks, volumes = scans.simulated(USUAL.phantom(), scanner, Truth(twin=False))
     scan = scans.scan_from(stacks, volumes, scanner)

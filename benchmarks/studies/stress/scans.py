@@ -1,6 +1,6 @@
-"""What the rows of the stress suite share: what they found, simulated scans and their closed forms, threads.
+"""What the rows of the stress suite share: findings, simulated scans, and closed forms of them.
 
-A row fails where a number exceeds its limit and where anything is raised or warned of.
+A row fails where a number exceeds its limit, and where anything raises or warns.
 """
 
 import dataclasses
@@ -33,14 +33,14 @@ from ctsim.simulate import flat_image, simulate_views, truth_volumes
 from ctsim.spectrum import spectrum
 from ctsim.types import Phantom, Scan, Scanner
 
-FEW = 6  # views of the simulator's rows where the scene has as many as its grid asks for
+FEW = 6  # views of simulator rows, unless the scene states a number
 USUAL = Scene(name="usual", what="usual")
 Stacks = Mapping[str, NDArray[Any]]
 
 
 @dataclass(slots=True)
 class Findings:
-    """What a row found, in words; `wrong` is what is not as expected."""
+    """What a row found, in words: as expected in `said`, not as expected in `wrong`."""
 
     said: list[str] = field(default_factory=list)
     wrong: list[str] = field(default_factory=list)
@@ -49,11 +49,11 @@ class Findings:
         return "; ".join([*(f"NOT EXPECTED: {words}" for words in self.wrong), *self.said])
 
     def say(self, words: str, *, holds: bool = True) -> None:
-        """Note something that was found, and whether it was expected."""
+        """Note a finding, and whether it was expected."""
         (self.said if holds else self.wrong).append(words)
 
     def at_most(self, what: str, value: float, limit: float) -> None:
-        """Note a number that must not exceed its limit; one that is not a number does."""
+        """Note a number that must not exceed its limit; NaN exceeds it."""
         holds = bool(value <= limit)
         self.say(f"{what} {value:.2g}" + ("" if holds else f", limit {limit:.2g}"), holds=holds)
 
@@ -63,12 +63,12 @@ class Findings:
             self.say(f"{int((~fine).sum())} of {fine.size} values of {what} are not finite", holds=False)
 
     def same(self, what: str, one: NDArray[Any], other: NDArray[Any]) -> None:
-        """Note whether two arrays are equal to the last bit."""
+        """Note whether two arrays are bitwise equal."""
         equal = one.shape == other.shape and np.array_equal(one, other)
         self.say(f"{what} {'equal to the last bit' if equal else 'differ'}", holds=equal)
 
     def same_on_threads(self, what: str, call: Callable[[], NDArray[Any]]) -> NDArray[Any]:
-        """Note whether `call` gives the same bits on 1, 2 and all threads of numba's; return those of 1."""
+        """Note whether `call` gives the same bits on 1, 2 and all numba threads; return the array of 1."""
         most = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]
         before, found = numba.get_num_threads(), {}
         try:
@@ -82,7 +82,7 @@ class Findings:
         return found[1]
 
     def refused(self, words: str, call: Callable[[], object]) -> None:
-        """Note whether `call` raises an InputError whose sentence holds `words`."""
+        """Note whether `call` raises an InputError that contains `words`."""
         try:
             call()
         except InputError as error:
@@ -92,7 +92,7 @@ class Findings:
 
 
 def carry_out(run: Callable[[Findings], None]) -> tuple[Findings, float]:
-    """Return what `run` finds and the seconds it took; exceptions and warnings, also numpy's, are not expected."""
+    """Return the findings and seconds of `run`; an exception or a warning, numpy's included, is a wrong finding."""
     found, began = Findings(), time.perf_counter()
     with warnings.catch_warnings(record=True) as caught, np.errstate(divide="warn", over="warn", invalid="warn"):
         warnings.simplefilter("always")
@@ -110,10 +110,10 @@ def carry_out(run: Callable[[Findings], None]) -> tuple[Findings, float]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Example:
-    """A scan as a method gets it, with the true metal mask, and what it is judged by.
+    """A scan as a method gets it, with the true metal mask, and the truth it is judged by.
 
-    `reference` [z, y, x] is the effective attenuation in 1/mm; errors are taken over `region`, voxels a voxel or more
-    inside the body and more than two from metal, in the field of view.
+    `reference` [z, y, x] is the effective attenuation in 1/mm; errors are taken over `region`: the field of
+    view inside the body, without its outermost voxel and two voxels around metal.
     """
 
     scan: Scan
@@ -121,14 +121,14 @@ class Example:
     region: NDArray[np.bool_]
 
     def error(self, values: NDArray[np.float32]) -> float:
-        """Return the RMSE over that of an empty volume; 0 where there is no region."""
+        """Return the RMSE relative to an empty volume's; 0 for an empty region."""
         if not self.region.any():
             return 0.0
         return relative(values[self.region], self.reference[self.region].astype(np.float64))
 
 
 def changed(given: Example, change: AnyChange) -> Example:
-    """Return an example with other counts, or with another geometry said of the same ones."""
+    """Return an example with other counts, or with the same counts under another geometry."""
     g, counts, factor = given.scan.geometry, given.scan.counts, 1.0
     match change:
         case suite.Twice():
@@ -167,7 +167,7 @@ def simulated(
 
 
 def scan_from(stacks: Stacks, volumes: Stacks, scanner: Scanner) -> Scan:
-    """Return what `simulated` gave as a method gets it."""
+    """Return the output of `simulated` as a method gets it."""
     return Scan(
         geometry=scanner.geometry,
         counts=torch.from_numpy(stacks["counts"]),
@@ -180,9 +180,9 @@ def scan_from(stacks: Stacks, volumes: Stacks, scanner: Scanner) -> Scan:
 
 
 def example(scene: Scene, side: int, change: AnyChange | None = None) -> Example:
-    """Return a scene's scan for methods on side³ voxels, sub-rays and noise included, changed as the scene says.
+    """Return a scene's scan for methods on side³ voxels, with sub-rays and noise, and the scene's change made.
 
-    `change` is another change of the same scan instead.
+    `change` replaces the scene's change.
     """
     bare = Scene(name="", what="", rods=scene.rods, block=scene.block, scanner=scene.scanner)
     return changed(_example(bare, side), change or scene.change)
@@ -190,7 +190,7 @@ def example(scene: Scene, side: int, change: AnyChange | None = None) -> Example
 
 @functools.lru_cache(maxsize=4)
 def _example(scene: Scene, side: int) -> Example:
-    """Simulate a scan that all methods share."""
+    """Simulate a scan, which all methods share."""
     scanner = scene.scanner.resolve(side)
     stacks, volumes = simulated(scene.phantom(), scanner, Truth(twin=False), subrays=34)
     reference, metal = volumes["reference_effective"], volumes["metal"] != 0
@@ -202,7 +202,7 @@ def _example(scene: Scene, side: int) -> Example:
 
 
 def few_views(scene: Scene, side: int) -> Scanner:
-    """Return the scanner of a scene for the simulator's rows; a number of views that the scene states stays."""
+    """Return a scene's scanner for simulator rows: `FEW` views, unless the scene states a number."""
     of = scene.scanner.geometry
     if not isinstance(of.n_views, int):
         of = msgspec.structs.replace(of, n_views=FEW)
@@ -213,7 +213,7 @@ def few_views(scene: Scene, side: int) -> Scanner:
 
 
 def usual(side: int, **geometry: Any) -> tuple[Phantom, Scanner]:
-    """Return water with a rod of bone and one of titanium, on a circle that differs from the usual one as given."""
+    """Return water with a rod of bone and one of titanium, and a scanner whose circle has `geometry` changed."""
     return USUAL.phantom(), Machine(geometry=suite.Circle(**geometry)).resolve(side)
 
 
@@ -230,10 +230,10 @@ def lengths(scene: Scene, of: Geometry) -> dict[str, NDArray[np.float64]]:
     found = {rod.material: np.zeros(of.shape) for rod in scene.all_rods}
     spans = [upright_span(rays, rod.solid()) for rod in scene.all_rods]
     ends = np.sort(np.concatenate(spans), axis=0)
-    for low, high in pairwise(ends):  # nothing changes along a ray between two ends
+    for low, high in pairwise(ends):  # between two ends one rod owns the ray
         middle, owner = (low + high) / 2, np.full(of.shape, -1)
         for k, (enter, leave) in enumerate(spans):
-            owner[(enter < middle) & (middle < leave)] = k  # a later rod takes the place of an earlier one
+            owner[(enter < middle) & (middle < leave)] = k  # a later rod replaces an earlier one
         for k, rod in enumerate(scene.all_rods):
             found[rod.material] += np.where(owner == k, high - low, 0.0)
     return found

@@ -1,4 +1,4 @@
-"""`run-benchmark stress OUT`: what is hard on the numbers, each case with an expected outcome.
+"""`run-benchmark stress RESULTS`: numerical stress, each case with an expected outcome.
 
 Listing the rows simulates and reconstructs nothing.
 """
@@ -21,17 +21,17 @@ from ctsim.errors import InputError
 from ctsim.human import human_choice
 from ctsim.quadrature import P_MAX
 
-SIMULATOR, SPLAT_KERNELS = "simulator", "splat kernels"  # subjects that are no methods
-# seconds of a row on one idle core, short and full, from runs on a busy machine
+SIMULATOR, SPLAT_KERNELS = "simulator", "splat kernels"  # subjects other than methods
+# of a row, short and full, for one idle core; derived from runs on a busy machine
 SECONDS = {SIMULATOR: (0.3, 0.6), SPLAT_KERNELS: (0.1, 0.1)}
 SECONDS_OF_METHOD = (0.2, 0.5)
-STEPS = 100  # of the published methods, whose own 20000 are hours; they add splats from the 500th on
+STEPS = 100  # of the published methods, whose default of 20000 takes hours; they add splats from step 500
 VARIANTS: dict[str, tuple[dict[str, Any], ...]] = {
     "splat": ({}, {"response": "known"}),
     "splat-paper": ({"steps": STEPS},),
     "splat-r2": ({"steps": STEPS},),
 }
-"""Parameters with which a method runs where those are not its defaults alone."""
+"""Parameter sets of methods that do not run with their defaults only."""
 
 CLOSED_FORM = f"|ΔP| ≤ {suite.P_SURE:g} of the float64 closed form where P ≤ {P_MAX:g}, finite beyond"
 MASS = f"mass on the grid within {suite.MASS:g}"
@@ -43,10 +43,10 @@ CHECKS = {
     "duplicate-views": "equal views have equal bits",
     "450kvp": "the bundled table refuses by name",
 }
-"""What is expected of the simulator beside the closed form, by scene."""
+"""Further expectations of the simulator, by scene."""
 
 ODD = "finite, and the other splats keep their bits"
-FLAT, NARROW, THREADS = "solids of no thickness", "float32 beside float64", "1, 2 and all threads"
+FLAT, NARROW, THREADS = "solids of no thickness", "float32 against float64", "1, 2 and all threads"
 PEAK = f"within {suite.PROJECTED:g} of float64's peak"
 BITS = "equal to the last bit"
 PROGRAMS = {
@@ -68,13 +68,13 @@ PROGRAMS = {
     ),
     "fdk": (("float64", NARROW, f"closed-form P and FDK in float64 as far off as |ΔP| ≤ {suite.P_SURE:g} allows"),),
 }
-"""Case, what it is and what is expected, of rows that are no scene; what judges them is in `worker`."""
+"""Rows without a scene: case, what it is, what is expected. `worker` has the functions that judge them."""
 
 
 class StressRow(NamedTuple):
     """One row: a scene, a method (name and settings), both or neither.
 
-    `subject` is SIMULATOR, SPLAT_KERNELS or a method's label. `code` hashes scene and sources, which decide the result.
+    `subject` is SIMULATOR, SPLAT_KERNELS or a method's label. `code` hashes the scene and the sources.
     """
 
     case: str
@@ -88,18 +88,18 @@ class StressRow(NamedTuple):
 
 @functools.lru_cache
 def catalogue(path: Path | None = None, methods: tuple[str, ...] = ()) -> dict[tuple[str, str], StressRow]:
-    """Return all rows by (case, subject), those of methods on the scenes of a file; only those of `methods` if named.
+    """Return all rows by (case, subject), or only those of `methods`. Methods run on the scenes of the file at `path`.
 
-    Raises InputError for a file that is wrong and a method that does not exist.
+    Raises InputError for an invalid file and an unknown method.
     """
     chosen = [*_of_methods(load(path), methods)]
-    own = [] if methods else [*_of_simulator(), *_programs(SPLAT_KERNELS, "splats")]
+    own = [] if methods else [*_of_simulator(), *_programs(SPLAT_KERNELS, "kernels")]
     chain = [*_programs("fdk", "methods")] if "fdk" in (methods or TABLE) else []
     return {(row.case, row.subject): row for row in (*own, *chain, *chosen)}
 
 
 def subjects(names: Sequence[str] = ()) -> list[tuple[str, dict[str, Any]]]:
-    """Return the methods of these names, by default of the table, each with the parameters of its variants."""
+    """Return the named methods, by default all of the table, each with its parameter sets."""
     return [(name, given) for name in dict.fromkeys(names or TABLE) for given in VARIANTS.get(name, ({},))]
 
 
@@ -121,13 +121,13 @@ def _of_simulator() -> Iterator[StressRow]:
     for scene in load():
         if scene.simulated:
             words = (CLOSED_FORM, MASS if scene.lone else "", CHECKS.get(scene.name, ""))
-            expected, code = "; ".join(filter(None, words)), _code("simulator") + scene.digest
+            expected, code = "; ".join(filter(None, words)), _code("kernels") + scene.digest
             yield StressRow(scene.name, SIMULATOR, scene.what, expected, code, scene=scene)
-    yield from _programs(SIMULATOR, "simulator")
+    yield from _programs(SIMULATOR, "kernels")
 
 
 def _of_methods(scenes: Sequence[Scene], names: Sequence[str]) -> Iterator[StressRow]:
-    """Yield every scene by every method, scene by scene, so that methods share scans."""
+    """Yield all methods on each scene in turn, so that they share its scan."""
     methods = [(method, label(*method), _code("methods") + _code_of(method[0])) for method in subjects(names)]
     for scene in scenes:
         for method, named, code in methods if scene.methods else ():
@@ -138,7 +138,7 @@ def _of_methods(scenes: Sequence[Scene], names: Sequence[str]) -> Iterator[Stres
 
 
 def _code_of(name: str) -> str:
-    """Hash a method's sources; those of the table are not loaded for it."""
+    """Hash a method's sources; methods of the table are not imported."""
     return code_version(TABLE[name][0].partition(":")[0]) if name in TABLE else find(name).code
 
 
@@ -158,18 +158,18 @@ def _expected(name: str, scene: Scene) -> str:
 
 
 class Judged(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How a row ended: `found` says in words what was found; the seconds are those of "row"."""
+    """How a row ended: `found` says it in words; `seconds` has its time under "row"."""
 
     found: str = ""
 
     @property
     def words(self) -> str:
-        """What was found, or how the row ended that found nothing."""
+        """The finding, or how the row ended without one."""
         return self.found or f"NOT EXPECTED: {self.reason}"
 
     @property
     def took(self) -> float:
-        """The seconds that it took, 0 where it did not end."""
+        """The seconds of the row, 0 if it did not end."""
         return sum(self.seconds.get("row", ()))
 
 
@@ -178,7 +178,7 @@ class StressRecord(Record[Judged], frozen=True, kw_only=True, forbid_unknown_fie
 
     @property
     def finished(self) -> bool:
-        """Always true: that a row crashes or does not end is a finding, too, and the last one counts."""
+        """Always true: a crash or a timeout is a finding too, and the last one counts."""
         return True
 
 
@@ -193,14 +193,14 @@ class Stress(study.Study[Record[Judged], Flags]):
     estimate = "on one idle core, without compiling (a minute)"
 
     def __init__(self) -> None:
-        self.threads = host.threads()  # a row has them; the process can have two, to compare them with one
+        self.threads = host.threads()  # of a row; its process has at least two, to compare with one
 
     def environment(self, given: Flags) -> Mapping[str, str]:
-        """Let the process have two threads at least."""
+        """Allow the process at least two threads."""
         return {"NUMBA_NUM_THREADS": str(max(2, self.threads))}
 
     def measure(self, task: Task, given: Flags) -> Sequence[Judged]:
-        """Judge a row on the threads that there are."""
+        """Judge a row on the available threads."""
         return super().measure(msgspec.structs.replace(task, hints={"threads": self.threads}), given)
 
     def rows(self, given: Flags) -> dict[tuple[str, str], StressRow]:
@@ -208,7 +208,7 @@ class Stress(study.Study[Record[Judged], Flags]):
         return catalogue(given.suite, given.method)
 
     def check(self, given: Flags) -> None:
-        """Refuse names of cases that are none."""
+        """Refuse unknown cases."""
         known = list(dict.fromkeys(case for case, _ in self.rows(given)))
         for name in given.case:
             if name not in known:
@@ -227,17 +227,17 @@ class Stress(study.Study[Record[Judged], Flags]):
         ]  # fmt: skip
 
     def shows(self, task: Task, given: Flags) -> bool:
-        """Whether a row is among those that were asked for."""
+        """Whether a row was asked for."""
         asked = not given.case or task.case in given.case
         return asked and task.part == part(given) and (task.case, task.subject) in self.rows(given)
 
     def pending(self, tasks: Sequence[Task], records: Sequence[Record[Judged]], given: Flags) -> list[Task]:
-        """Return the rows that were not as expected when they last ran, or never ran."""
+        """Return the rows that never ran, or were not as expected when they last ran."""
         last = {} if given.force else {r.task.identity: r.found[0].ok for r in records}
         return [task for task in tasks if not last.get(task.identity)]
 
     def expected(self, task: Task, given: Flags) -> float:
-        """Return the seconds that rows of a subject take."""
+        """Return the usual seconds of the subject's rows."""
         return SECONDS.get(task.subject, SECONDS_OF_METHOD)[0 if given.short else 1]
 
     def took(self, record: Record[Judged], given: Flags) -> float | None:
@@ -245,11 +245,11 @@ class Stress(study.Study[Record[Judged], Flags]):
         return record.found[0].took or None
 
     def line(self, task: Task) -> tuple[str, str]:
-        """Return a line for each case."""
+        """Return the case and what it is."""
         return task.case, task.hints["what"]
 
     def tables(self, records: Sequence[Record[Judged]], given: Flags) -> list[Table]:
-        """Return what is not as expected, the cases, and every row."""
+        """Return three tables: what is not as expected, the cases, all rows."""
         side = records[0].task.settings["side"]
         caption = f"{side} voxels a side; {_how_many(records)}; {_seconds(records):.0f} s in all."
         rows = [
@@ -265,7 +265,7 @@ class Stress(study.Study[Record[Judged], Flags]):
         ]
 
     def write(self, records: Sequence[Record[Judged]], given: Flags) -> str:
-        """Write the tables; return what is not as expected. Warns of rows that other sources gave."""
+        """Write the tables; return what is not as expected. Warns of rows from other sources."""
         super().write(records, given)
         shown, path = latest(records), self.folder(given) / f"{self.file}.md"
         here = {task.identity for task in self.tasks(given)}
@@ -277,12 +277,12 @@ class Stress(study.Study[Record[Judged], Flags]):
 
 
 def part(given: Flags) -> str:
-    """Return the name of the grids' size."""
+    """Return the name of the grid size."""
     return "short" if given.short else "full"
 
 
 def by_case(records: Sequence[Record[Judged]], caption: str = "") -> Table:
-    """Return a table of the cases, with how many of their rows are as expected."""
+    """Return a table of the cases: how many rows each has, and how many are as expected."""
     cases: dict[str, list[Record[Judged]]] = {}
     for record in records:
         cases.setdefault(record.task.case, []).append(record)

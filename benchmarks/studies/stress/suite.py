@@ -1,7 +1,7 @@
-"""Scenes that are hard on the numbers, as a TOML file says them: `benchmarks/suites/stress.toml`, or one of the user's.
+"""Scenes of numerical stress, read from `benchmarks/suites/stress.toml` or a file of the user's; limits of errors.
 
-Simulator and methods take the same scenes. `docs/how-to/test-stability.md` lists the keys. Lengths mm. The limits of
-what is found on them stand here too. Simulates nothing.
+The simulator and the methods take the same scenes. `docs/how-to/test-stability.md` lists the keys. Lengths are in mm.
+Simulates nothing.
 """
 
 import hashlib
@@ -27,40 +27,42 @@ from ctsim.spectrum import Tube
 from ctsim.types import Phantom, Scanner
 
 FULL, SHORT = 24, 16  # voxels along a side
-P_SURE = 1.2e-4  # |ΔP|: 1e-4 of the energies where P ≤ 14.6, a tenth more between the paths tried, float32's 1e-5
-CLAMP = 81.0  # of P: exponents end at 80, and the weight of one node
+P_SURE = (
+    1.2e-4  # |ΔP| where P ≤ 14.6: 1e-4 by the energy rule, a tenth more between the lengths it tried, 1e-5 by float32
+)
+CLAMP = 81.0  # of P: exponents end at 80; 1 more for the weight of one node
 MASS = 0.01  # of a rod on the grid: 1/250 of every voxel that its surface crosses, of 216 cm³ for its 94 at worst
 FLOAT32 = 2e-5  # |ΔP|: exp is good to 4e-7·max(1, P/4) and so are the sums; lengths of 50 mm to 8e-6 mm, by 0.5/mm
 NEAR = 0.7  # of an empty volume's error
 SAME = 1e-3  # of the greatest value: float32
 SAME_BY_DESCENT = 0.03
-BOUNDS = {"ibhc": 10.0}  # adds to P what its own volume says of hardening, streaks included
+BOUNDS = {"ibhc": 10.0}  # it adds to P the hardening computed from its own volume, streaks included
 PROJECTED, VOXELISED, RESPONDED = 1e-5, 1e-5, 2e-6  # splats: of the peak, of the greatest voxel, of the response
 
 SPLATS = ("splat", "splat-paper", "splat-r2")
 GROUPS: dict[str, tuple[str, ...]] = {
     "by-mask": ("limar", "nmar", "bhc-poly"),
-    # their steps are of one length whatever the gradient of TV, in flat regions rounding
+    # their steps have one length for any gradient of TV, also where that is rounding in a flat region
     "descent": ("asd-pocs", "awpcsd"),
-    "ordered": ("sart", "os-sart", "asd-pocs", "awpcsd", *SPLATS),  # a view that comes twice moves them twice
-    "sampled": ("bhc-poly",),  # fits in 64 views, other ones where there are twice as many
-    "physical": (*SPLATS, "ibhc"),  # take materials from tables in 1/mm
+    "ordered": ("sart", "os-sart", "asd-pocs", "awpcsd", *SPLATS),  # a repeated view updates them twice
+    "sampled": ("bhc-poly",),  # fits in 64 views, other ones where the scan has twice the views
+    "physical": (*SPLATS, "ibhc"),  # take materials from tables in 1/mm, so lengths must be true
 }
-"""Methods that have something in common, by the names that a scene's `unlike` may give."""
+"""Groups of methods that a scene's `unlike` may name."""
 
 METALS = ("Ti", "Fe", "Sn", "W", "Au")
-TAKEN = ("threads", "float64")  # names of cases of methods that are no scenes
+TAKEN = ("threads", "float64")  # cases of methods without a scene
 AIR = np.zeros((2, 2, 2), np.uint8)
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 def same_of(method: str) -> float:
-    """Return how far two forms of one scan may be from each other, of the greatest value."""
+    """Return how much a method's volumes of two forms of one scan may differ, relative to the greatest value."""
     return SAME_BY_DESCENT if method in GROUPS["descent"] else SAME
 
 
 class OfSide(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A count that grows with the grid: so many times its side, rounded down, and so many more."""
+    """A count that grows with the grid: floor(`times` · side) + `plus`."""
 
     times: Positive = 1.0
     plus: int = 0
@@ -70,7 +72,7 @@ Number = Count | OfSide
 
 
 class Circle(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A circular scan and its grid, for every side of grids; a desktop scanner whose pixels cover the cube.
+    """A circular scan and its grid, for any grid side; by default a desktop scanner whose detector covers the cube.
 
     Tuples are (z, y, x) or (v, u), as in `Geometry`. `field_mm` is the edge of the reconstructed cube, `detector_mm`
     the detector's extent. Views lie at start + arc·(k/n)^crowding.
@@ -94,7 +96,7 @@ class Circle(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             self.resolve(side)
 
     def resolve(self, side: int) -> Geometry:
-        """Return the geometry on grids of so many voxels a side; raises InputError where there is none."""
+        """Return the geometry for a grid of `side` voxels along an axis; raises InputError if that is impossible."""
         n_views, *rest = (_count(n, side) for n in (self.n_views, *self.n_voxel, *self.n_detector))
         if min(n_views, *rest) < 1:
             raise InputError(f"counts must be at least 1, got {rest[:3]} voxels, {rest[3:]} pixels and {n_views} views")
@@ -118,7 +120,7 @@ def _count(n: Number, side: int) -> int:
 
 
 class Rod(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An upright rod through (x, y) = `at`; whether it is `metal` is known of a few elements, and said of others."""
+    """An upright rod through (x, y) = `at`. `metal` need not be given for the elements in `METALS`."""
 
     material: str
     radius: float
@@ -131,7 +133,7 @@ class Rod(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         self.solid()
 
     def solid(self) -> Solid:
-        """Return the rod as it is simulated."""
+        """Return the rod as a solid."""
         metal = self.material in METALS if self.metal is None else self.metal
         size = (self.radius, self.height)
         return cylinder(f"{self.material} at {self.at}", self.material, size, centre=(*self.at, 0.0), metal=metal)
@@ -151,7 +153,7 @@ def in_air(*solids: Solid) -> Phantom:
 
 
 class Block(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A centred cube of water in voxels, of so many times its density where that is given."""
+    """A centred cube of water in voxels; `density` is relative to water's."""
 
     edge: float
     density: float | None = None
@@ -160,14 +162,14 @@ class Block(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         self.phantom()
 
     def phantom(self) -> Phantom:
-        """Return the block as it is simulated, with a map of its density or without one."""
+        """Return the block as a phantom, with a density map if `density` is given."""
         labels, d = np.ones((8, 8, 8), np.uint8), self.edge / 8
         density = None if self.density is None else np.full(labels.shape, self.density, np.float32)
         return Phantom(labels=labels, materials=("air", "water"), d_voxel=(d, d, d), density=density)
 
 
 class Machine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The scanner: that of `ctsim.types`, with a geometry for every side of grids."""
+    """The scanner of `ctsim.types`, with a geometry for any grid side."""
 
     geometry: Circle = Circle()
     tube: Tube = Tube()
@@ -180,17 +182,17 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         self.resolve(FULL)
 
     def resolve(self, side: int) -> Scanner:
-        """Return the scanner for grids of so many voxels a side."""
+        """Return the scanner for a grid of `side` voxels along an axis."""
         parts = {name: getattr(self, name) for name in self.__struct_fields__ if name != "geometry"}
         return Scanner(geometry=self.geometry.resolve(side), **parts)
 
 
 class Change(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag=str.lower):
-    """What `scans.changed` does to a simulated scan, by its name."""
+    """A change that `scans.changed` makes to a simulated scan."""
 
 
 class Unchanged(Change, frozen=True):
-    """The scan as it was simulated."""
+    """The scan as simulated."""
 
 
 class Twice(Change, frozen=True):
@@ -198,7 +200,7 @@ class Twice(Change, frozen=True):
 
 
 class Filled(Change, frozen=True, kw_only=True):
-    """One reading everywhere, in counts."""
+    """The same reading everywhere, in counts."""
 
     value: Annotated[int, msgspec.Meta(ge=0, le=65535)]
 
@@ -208,13 +210,13 @@ class Rounded(Change, frozen=True):
 
 
 class Turned(Change, frozen=True, kw_only=True):
-    """The same counts, said to begin so many degrees further on."""
+    """The same counts, with a start angle that is `deg` larger."""
 
     deg: float
 
 
 class Magnified(Change, frozen=True, kw_only=True):
-    """The counts as those of a machine and an object of such a size that voxels have this edge along x, in mm."""
+    """The same counts, with scanner and object scaled so that a voxel's edge along x is `voxel_mm`."""
 
     voxel_mm: Positive
 
@@ -223,11 +225,11 @@ AnyChange = Unchanged | Twice | Filled | Rounded | Turned | Magnified
 
 
 class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A scan that is hard on the numbers: rods in air, by default the usual ones, or a block.
+    """A scan of numerical stress: rods in air, by default the usual ones, or a block.
 
-    `near` says whether the data determine the object, `methods` whether methods run on it or the simulator alone.
-    `like` is how the simulated scan must be changed to give the same volume as the scene's own `change` of it, but for
-    a factor in length; methods that need not are `unlike`.
+    `near`: whether the data determine the object. `methods`: whether methods run on it, not the simulator only.
+    `like`: another change of the simulated scan, of which methods must give the same volume as of `change`, up to a
+    factor in length. `unlike`: methods or groups that need not.
     """
 
     name: str
@@ -252,18 +254,18 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     @property
     def all_rods(self) -> tuple[Rod, ...]:
-        """The rods, later ones in place of earlier ones."""
+        """The rods; later ones replace earlier ones where they overlap."""
         if self.block is not None:
             return ()
         return tuple(RODS[rod] if isinstance(rod, str) else rod for rod in self.rods or RODS.values())
 
     def phantom(self) -> Phantom:
-        """Return what is scanned."""
+        """Return the phantom."""
         return in_air(*(rod.solid() for rod in self.all_rods)) if self.block is None else self.block.phantom()
 
     @property
     def lone(self) -> Rod | None:
-        """The rod where there is one only and the grid holds all of it, so that its mass on the grid is known."""
+        """The only rod, if the grid holds all of it, so that its mass on the grid is known; else None."""
         if len(self.all_rods) != 1:
             return None
         (rod,), of = self.all_rods, self.scanner.geometry
@@ -272,11 +274,11 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     @property
     def simulated(self) -> bool:
-        """Whether the simulator can make the scan itself, not only one that is then changed."""
+        """Whether the simulator makes the scan without a later change of the counts or of the stated geometry."""
         return isinstance(self.change, Unchanged | Twice)
 
     def has_other(self, method: str) -> bool:
-        """Say whether a method must give the same volume of the other form."""
+        """Whether a method must give the same volume of the other form, `like`."""
         return self.like is not None and not any(method in GROUPS.get(name, (name,)) for name in self.unlike)
 
     @property
@@ -286,12 +288,12 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     @property
     def digest(self) -> str:
-        """A hash of what the scene says."""
+        """A hash of the scene's keys."""
         return hashlib.sha256(msgspec.json.encode(self)).hexdigest()[:16]
 
 
 def load(path: Path | None = None) -> tuple[Scene, ...]:
-    """Read a file of scenes, by default the bundled one; raises InputError with file, key and what was expected."""
+    """Read a file of scenes, by default the bundled one; raises InputError with file, key and expectation."""
     if path is not None:
         return scenes_of(read_toml(path), Scene, str(path))
     with resources.as_file(resources.files("ctsim.benchmarks.suites") / "stress.toml") as bundled:

@@ -1,4 +1,4 @@
-"""Carry out a row of the stress suite, in a process of its own: a hang or a crash costs one row."""
+"""Judge one row of the stress suite. It has a process of its own, so that a hang or a crash costs one row."""
 
 import functools
 from collections.abc import Callable
@@ -6,26 +6,26 @@ from collections.abc import Callable
 import numba
 
 from ctsim.benchmarks.engine.record import Task
-from ctsim.benchmarks.studies.stress import Flags, methods, simulator, splats
+from ctsim.benchmarks.studies.stress import Flags, kernels, methods
 from ctsim.benchmarks.studies.stress.scans import Findings, carry_out
 from ctsim.benchmarks.studies.stress.study import SIMULATOR, SPLAT_KERNELS, Judged, StressRow, catalogue
 
 PROGRAMS: dict[tuple[str, str], Callable[[int, Findings], None]] = {
-    ("flat-solids", SIMULATOR): simulator.flat_solids,
-    ("float64", SIMULATOR): simulator.beside_float64,
-    ("threads", SIMULATOR): simulator.same_bits,
-    ("needles", SPLAT_KERNELS): splats.needles,
-    ("sub-pixel", SPLAT_KERNELS): splats.sub_pixel,
-    ("behind-source", SPLAT_KERNELS): splats.behind,
-    ("outside", SPLAT_KERNELS): splats.outside,
-    ("empty-set", SPLAT_KERNELS): splats.empty,
-    ("nan-seed", SPLAT_KERNELS): splats.not_finite,
-    ("opaque", SPLAT_KERNELS): splats.opaque,
-    ("float64", SPLAT_KERNELS): splats.beside_float64,
-    ("threads", SPLAT_KERNELS): splats.same_bits,
+    ("flat-solids", SIMULATOR): kernels.flat_solids,
+    ("float64", SIMULATOR): kernels.raytrace_in_float64,
+    ("threads", SIMULATOR): kernels.counts_on_threads,
+    ("needles", SPLAT_KERNELS): kernels.needles,
+    ("sub-pixel", SPLAT_KERNELS): kernels.sub_pixel,
+    ("behind-source", SPLAT_KERNELS): kernels.behind,
+    ("outside", SPLAT_KERNELS): kernels.outside,
+    ("empty-set", SPLAT_KERNELS): kernels.empty,
+    ("nan-seed", SPLAT_KERNELS): kernels.not_finite,
+    ("opaque", SPLAT_KERNELS): kernels.opaque,
+    ("float64", SPLAT_KERNELS): kernels.splats_in_float64,
+    ("threads", SPLAT_KERNELS): kernels.splats_on_threads,
     ("float64", "fdk"): methods.chain,
 }
-"""What judges the rows that are no scene, by (case, subject)."""
+"""The functions that judge rows without a scene, by (case, subject)."""
 
 
 def run(row: StressRow, side: int, found: Findings) -> None:
@@ -34,7 +34,7 @@ def run(row: StressRow, side: int, found: Findings) -> None:
         if row.scene is None:
             PROGRAMS[row.case, row.subject](side, found)
         else:
-            simulator.on_scene(row.scene, side, found)
+            kernels.on_scene(row.scene, side, found)
     elif row.scene is None:
         methods.on_any_threads(*row.method, side, found)
     else:
@@ -42,7 +42,7 @@ def run(row: StressRow, side: int, found: Findings) -> None:
 
 
 def judge(task: Task, given: Flags) -> list[Judged]:
-    """Judge a row on as many threads as the task says."""
+    """Judge a row on the task's number of threads."""
     numba.set_num_threads(task.hints["threads"])
     row = catalogue(given.suite, given.method)[task.case, task.subject]
     found, seconds = carry_out(functools.partial(run, row, task.settings["side"]))
