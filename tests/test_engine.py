@@ -21,7 +21,7 @@ from test_record import places
 
 from ctsim.benchmarks import cli
 from ctsim.benchmarks.engine import host, study
-from ctsim.benchmarks.studies.methods import estimates
+from ctsim.benchmarks.studies.methods import run as methods_run
 from ctsim.benchmarks.studies.pareto import figure
 from ctsim.benchmarks.studies.pareto import finding as pareto_finding
 from ctsim.benchmarks.studies.pareto import measure as pareto_measure
@@ -89,7 +89,7 @@ def timed_in_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Pareto, "apart", False)
     monkeypatch.setattr(Pareto, "prepare", lambda self, given: None)
     monkeypatch.setattr(pareto_measure, "measure", lambda task, given: [run])
-    monkeypatch.setattr(estimates, "fdk_seconds", lambda geometry: 1.0)
+    monkeypatch.setattr(methods_run, "fdk_seconds", lambda geometry: 1.0)
     monkeypatch.setattr(figure, "save", lambda points, path: None)
     monkeypatch.setattr(host, "use_threads", lambda threads: None)  # those of this process are not ours to set
 

@@ -10,10 +10,10 @@ from test_run import double
 from test_tables import record
 
 from ctsim.benchmarks.methods import TABLE, Method, find
-from ctsim.benchmarks.studies.methods import estimates, plan, records, study, tables
-from ctsim.benchmarks.studies.methods.estimates import FDKS, fdk_seconds, in_fdks
+from ctsim.benchmarks.studies.methods import plan, records, run, study, tables
 from ctsim.benchmarks.studies.methods.plan import Costs, ordered
 from ctsim.benchmarks.studies.methods.records import RunTask
+from ctsim.benchmarks.studies.methods.run import FDKS, fdk_seconds, in_fdks
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.splat.course import PASSES
@@ -135,10 +135,10 @@ def test_where_a_pass_is_long_splat_is_guessed_with_fewer():
 
 
 def test_a_method_that_has_so_many_seconds_is_guessed_to_take_no_more(monkeypatch):
-    monkeypatch.setattr(estimates, "fdk_seconds", lambda geometry: 100.0)
+    monkeypatch.setattr(run, "fdk_seconds", lambda geometry: 100.0)
     stored = SimpleNamespace(geometry=CIRCLE)
     told, free = (SimpleNamespace(method=find("splat", given), stored=stored) for given in ({"seconds": 9.0}, {}))
-    assert estimates.estimated(told) == 9.0 < estimates.estimated(free)
+    assert run.estimated(told) == 9.0 < run.estimated(free)
 
 
 def test_every_method_of_the_table_has_a_guess_and_others_have_none():
@@ -148,7 +148,7 @@ def test_every_method_of_the_table_has_a_guess_and_others_have_none():
 
 def test_fdk_s_time_is_that_of_a_small_scan_times_what_is_more_of_it(monkeypatch):
     seen = []
-    monkeypatch.setattr(estimates, "fdk", lambda scan: seen.append(scan.geometry))
+    monkeypatch.setattr(run, "fdk", lambda scan: seen.append(scan.geometry))
     fdk_seconds.cache_clear()
     assert fdk_seconds(CIRCLE) > 0
     assert [(g.n_voxel, g.n_views) for g in seen] == [((64, 64, 64), 64)] * 2

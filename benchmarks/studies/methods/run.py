@@ -1,18 +1,22 @@
-"""Run methods over stored scans and score what they return.
+"""Run methods over stored scans, score what they return, and estimate how long a run will take.
 
-A method that fails is a result with a status and a reason; the next command tries it again. What it writes into its
-scan or sets in its process no other run sees. With --isolate a run has a process of its own: its peak memory is its
-own, a crash or a time limit ends only it.
+A method that fails gives a result with a status and a reason; the next command tries it again. What it writes into its
+scan or sets in its process does not reach other runs. With --isolate a run has a process of its own: its peak memory is
+measured alone, and a crash or a time limit ends only that run.
 """
 
 import dataclasses
 import functools
+import math
 import signal
+import time
 
 import msgspec
+import torch
 
 from ctsim.benchmarks.engine.process import Process, Stopped
 from ctsim.benchmarks.engine.record import OK
+from ctsim.benchmarks.methods import Method
 from ctsim.benchmarks.scores.judge import Judge, Twin
 from ctsim.benchmarks.scores.score import NO_TWIN, NOT_ASKED, TWIN_ENDED
 from ctsim.benchmarks.studies.methods.attempt import SCORED, Outcome, describe, run_here, scan_for, skip, warm_up
@@ -27,12 +31,17 @@ from ctsim.benchmarks.studies.methods.volumes import (
     volume_name,
     write_intermediates,
 )
+from ctsim.geometry import Geometry
+from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.splat.course import PASSES, affordable
+from ctsim.reconstruct.splat.fast import finer
+from ctsim.types import Scan
 
-LATE = 120.0  # seconds that a method which was told its limit has beyond it
+LATE = 120.0  # further seconds for a method that gets its time limit as a parameter
 
 
 def measure(task: RunTask, given: Flags, job: Job | None = None) -> list[Result]:
-    """Run a task and score it; `job` holds its scan and method where they are known.
+    """Run a task and score it; `job` has its scan and method if they are open already.
 
     Raises InputError where this process has another version of its inputs.
     """
@@ -41,12 +50,12 @@ def measure(task: RunTask, given: Flags, job: Job | None = None) -> list[Result]
 
 @functools.lru_cache(maxsize=1)
 def _runner(given: Flags) -> "Runner":
-    """Return this process's runner, which knows from earlier tasks what is compiled."""
+    """Return this process's runner, which remembers what is compiled."""
     return Runner(given)
 
 
 class Runner:
-    """Runs jobs in this process and remembers what the next needs: compiled methods, a scan's truth, its twin."""
+    """Runs jobs in this process; remembers the compiled methods, the scan's truth, and its twin's volume."""
 
     def __init__(self, given: Flags) -> None:
         self._given, self._results = given, given.results
@@ -57,7 +66,7 @@ class Runner:
     def run(self, job: Job) -> Result:
         """Run and score a job, and keep its volume."""
         if self._judge is None or self._judge[0] != job.stored.content_hash:
-            self._judge = self._twin = None  # let go of the last scan's masks first
+            self._judge = self._twin = None  # frees the last scan's masks first
             self._judge = (job.stored.content_hash, Judge.of(job.stored))
         outcome = self._outcome(job)
         if job.variant == METAL:
@@ -66,11 +75,11 @@ class Runner:
         else:
             pair, self._twin = Twin(), (job, outcome)
         result = self._scored(job, outcome, self._judge[1], pair)
-        outcome.at_50kev = None  # a twin waits for its scan's run, which asks for the volume that was returned alone
+        outcome.at_50kev = None  # a twin is kept for its scan's run, which needs its main volume only
         return result
 
     def _outcome(self, job: Job) -> Outcome:
-        """Run a job here or, where that is asked for, in a process of its own."""
+        """Run a job in this process or, with --isolate, in its own."""
         stored, method, given = job.stored, job.method, self._given
         outcome = skip(method, stored, job.variant)
         if outcome is None and (given.isolate or given.seconds is not None):
@@ -79,7 +88,7 @@ class Runner:
                 limit += LATE
             return _isolated(job, limit)
         if outcome is None:
-            # also before the twin: without metal a method may take another way, and not be compiled
+            # with metal also for the twin: without metal a method may skip code that then is not compiled
             scan = scan_for(method, stored, METAL)
             key = (method.label, str(scan.counts.dtype))
             if key not in self._warm:
@@ -89,7 +98,7 @@ class Runner:
         return outcome
 
     def _pair(self, job: Job) -> Twin:
-        """Return what the same method with the same parameters made of the metal-free scan, or why nothing."""
+        """Return the volume of the metal-free scan by the same method and parameters, or why there is none."""
         if job.stored.metal_free is None:
             return Twin(reason=NO_TWIN)
         if not self._given.anchor:
@@ -144,10 +153,86 @@ def _isolated(job: Job, seconds: float | None) -> Outcome:
 
 
 def _alone(task: RunTask) -> Outcome:
-    """Be the process of an isolated run."""
+    """Run a job in the process that was started for it."""
     job = job_of(task)
     warm = warm_up(job.method, scan_for(job.method, job.stored, METAL))
     outcome = run_here(job.stored, job.variant, job.method, warm)
     if outcome.cost is not None:
         outcome.cost = msgspec.structs.replace(outcome.cost, isolated=True)
     return outcome
+
+
+# --- estimates ----------------------------------------------------------------------------------------
+
+FDKS = {
+    "fdk": 1.0,
+    "limar": 2.0,
+    "nmar": 4.4,
+    "bhc-poly": 6.8,
+    "water-precorrection": 1.7,
+    "ibhc": 2.7,
+    "sart": 3.0,
+    "os-sart": 2.3,
+    "sirt": 1.5,
+    "cgls": 1.3,
+    "fista-tv": 1.5,
+    "asd-pocs": 2.3,
+    "awpcsd": 3.7,
+    "splat": 2.9,
+    "splat-paper": 0.49,
+    "splat-r2": 1.27,
+}
+"""Time in units of FDK's, per iteration or step where a method has them, measured on lung-Fe of `quick`.
+
+For `splat`: of a pass over a grid of the same number of voxels, on `core`.
+"""
+UNKNOWN = 5.0  # for a method that is not in the table
+AMOUNTS = ("iterations", "steps")
+PIXEL = 30  # voxels that are backprojected in the time of the logarithm and the filter of a pixel
+SMALL = 64  # at most this many voxels along an axis, and views, of the scan that FDK is timed on
+
+
+def in_fdks(method: Method, geometry: Geometry) -> float | None:
+    """Estimate a run's time in units of FDK's; None for an unknown method or an invalid count."""
+    name, params = method.name, method.params
+    try:
+        if name == "splat":
+            fine = finer(geometry, params["fineness"])
+            coarse, finest = params["passes"] or (PASSES[0], min(PASSES[1], affordable(fine)))
+            passes = finest + coarse / 15  # Σ 16⁻ⁿ: a coarser grid has an eighth of the voxels and half of the views
+            return FDKS[name] * passes * math.prod(fine.n_voxel) / math.prod(geometry.n_voxel)
+        count = next((params[key] for key in AMOUNTS if params.get(key) is not None), 1.0)
+        return FDKS[name] * float(count)
+    except (KeyError, IndexError, TypeError, ValueError):  # the method itself reports a wrong parameter
+        return None
+
+
+@functools.cache
+def fdk_seconds(geometry: Geometry) -> float:
+    """Estimate FDK's seconds from a blank scan of fewer voxels and views, timed after a run that compiles."""
+    small = msgspec.structs.replace(
+        geometry,
+        n_voxel=tuple(min(n, SMALL) for n in geometry.n_voxel),
+        n_views=min(geometry.n_views, SMALL),
+        angles_deg=None,
+        poses=None,  # FDK takes none; dso and dsd are enough
+    )
+    blank = Scan(geometry=small, counts=torch.ones(small.shape), flat=torch.ones(small.n_detector))
+    fdk(blank)
+    start = time.perf_counter()
+    fdk(blank)
+    seconds = time.perf_counter() - start
+    return seconds * _work(geometry) / _work(small)
+
+
+def _work(geometry: Geometry) -> int:
+    return geometry.n_views * (math.prod(geometry.n_voxel) + PIXEL * math.prod(geometry.n_detector))
+
+
+def estimated(job: Job) -> float | None:
+    """Estimate a run's seconds from FDK's time on this machine; None for a method of the user's."""
+    geometry = job.stored.geometry
+    fdks = in_fdks(job.method, geometry)
+    given = job.method.params.get("seconds")
+    limit = given if isinstance(given, int | float) else math.inf
+    return None if fdks is None else min(fdks * fdk_seconds(geometry), limit)

@@ -27,17 +27,18 @@ from ctsim.sources import source_hash
 from ctsim.store import StoredScan, list_scans, open_scan
 
 log = logging.getLogger(__name__)
+RUN = "ctsim.benchmarks.studies.methods.run"  # by name: it loads torch
 DEFAULT = ("fdk", "limar", "nmar", "splat")
-FEW = 20  # scenes, all of which a message names
+FEW = 20  # scenes that a warning names
 
 
 @dataclass(frozen=True, kw_only=True)
 class Flags(study.Options):
     """Run reconstruction methods over a dataset, score them, and write tables and pictures.
 
-    What RESULTS already holds is not run again, unless the data, the method's parameters or its code have changed or
-    the run failed. A method with a parameter `seconds`, as splat, is told the time limit and ends with what it has by
-    then, at most 120 s late; other methods, their start included, end with the status timeout.
+    A run that RESULTS already holds is not repeated, unless it failed or the data, the method's parameters or its code
+    have changed. A method with a parameter `seconds`, such as splat, gets the time limit and returns what it has by
+    then, at most 120 s late; other methods are stopped at the limit, start included, with the status timeout.
     """
 
     data: tyro.conf.Positional[Path]
@@ -65,7 +66,7 @@ class Methods(study.Study[RunRecord, Flags]):
 
     name, file, unit = "", FILE, "run"
     kind, record, flags = Result, RunRecord, Flags
-    work = "ctsim.benchmarks.studies.methods.run:measure"
+    work = f"{RUN}:measure"
     follows = True
     estimate = "without warm-up and scoring"
 
@@ -77,36 +78,36 @@ class Methods(study.Study[RunRecord, Flags]):
         return Methods, ()  # a worker opens scans itself
 
     def tasks(self, given: Flags) -> list[RunTask]:
-        """List all methods on the scans that were asked for, each on the metal-free twin first."""
+        """List all methods on the chosen scans, each on the metal-free twin first."""
         self._jobs = {job.task.identity: job for job in self.jobs(given)}
         return [job.task for job in self._jobs.values()]
 
     def jobs(self, given: Flags) -> list[plan.Job]:
-        """List the runs with their scans and methods; warn of what scans note of themselves."""
+        """List the runs with their scans and methods; log the scans' notes as warnings."""
         chosen, scans = _methods(given), _scans(given)
         names = frozenset(given.scene or (s.name for s in scans))
         _warn([s for s in scans if s.name in names])
         return [job for job in plan.jobs(scans, chosen, anchor=given.anchor) if job.stored.name in names]
 
     def pending(self, tasks: Sequence[RunTask], records: Sequence[RunRecord], given: Flags) -> list[RunTask]:
-        """Return the runs that have no record; of a twin also its volume is wanted."""
+        """Return the runs without a record, and twins without a kept volume."""
         self._costs = plan.Costs(records)
         return list(tasks if given.force else plan.pending(tasks, records, given.results))
 
     def groups(self, left: Sequence[RunTask], records: Sequence[RunRecord]) -> list[tuple[RunTask, ...]]:
-        """Run the cheapest method on all scans first; a scan after its twin, by which it is judged."""
+        """Run the cheapest method on all scans first; a scan after its twin, which its scores need."""
         return list(plan.ordered(left, plan.Costs(records)))
 
     def measure(self, task: RunTask, given: Flags) -> Sequence[Result]:
-        """Run a task in this process, on the scan that was opened for it or, on a worker, on one opened here."""
+        """Run a task in this process, on the scan opened for it; a worker opens its own."""
         return pkgutil.resolve_name(self.work)(task, given, self._jobs.get(task.identity))
 
     def limit(self, task: RunTask, given: Flags) -> float | None:
-        """Return no limit: a run has its own process, and a method that is told its seconds has some more to end."""
+        """Return None: runs stop their own processes, and a method that knows its limit gets time to end."""
         return None
 
     def recorded(self, task: RunTask) -> RunTask:
-        """Leave out where this machine has the scan."""
+        """Leave out the scan's path on this machine."""
         return msgspec.structs.replace(task, hints={})
 
     def took(self, record: RunRecord, given: Flags) -> float | None:
@@ -114,9 +115,9 @@ class Methods(study.Study[RunRecord, Flags]):
         return None if record.cost is None else record.cost.wall
 
     def expected(self, task: RunTask, given: Flags) -> float | None:
-        """Return the median of the method's runs, else a guess from FDK's time on this machine."""
+        """Return the median of the method's runs, else an estimate from FDK's time on this machine."""
         known = self._costs.method(task.subject)
-        return _estimated(task) if known is None else known
+        return pkgutil.resolve_name(f"{RUN}:estimated")(plan.job_of(task)) if known is None else known
 
     def title(self, task: RunTask) -> str:
         """Return the method and the scan."""
@@ -124,7 +125,7 @@ class Methods(study.Study[RunRecord, Flags]):
 
     @contextlib.contextmanager
     def watched(self, say: Callable[[str], None]) -> Iterator[None]:
-        """Tell how far the fit is that runs in this process, where a method tells."""
+        """Show the progress of methods that report it."""
 
         def told(now: Progress) -> None:
             say(f"now {now.share:.0%}, loss {now.loss:.3g}, {now.remaining:.0f} s to go")
@@ -154,19 +155,13 @@ def main(arguments: list[str]) -> int:
     return study.main(Methods(), arguments)
 
 
-def _estimated(task: RunTask) -> float | None:
-    from ctsim.benchmarks.studies.methods import estimates  # times FDK, with torch
-
-    return estimates.estimated(plan.job_of(task))
-
-
 def _methods(given: Flags) -> list[methods.Method]:
     names = tuple(dict.fromkeys(given.method)) or DEFAULT
     return methods.chosen(names, given.set, given.seconds)
 
 
 def _scans(given: Flags) -> list[StoredScan]:
-    """Open the dataset's scans, in its order; check those of --scene, and warn of several simulators."""
+    """Open the dataset's scans, in its order; check --scene, and warn of scans by different code."""
     scans: list[StoredScan] = [open_scan(folder) for folder in list_scans(given.data)]
     if not scans:
         raise InputError(f"{given.data}: the dataset has no scenes")
@@ -179,7 +174,7 @@ def _scans(given: Flags) -> list[StoredScan]:
 
 
 def _warn(scans: Sequence[StoredScan]) -> None:
-    """Say what scans note of themselves, each note once with the scans that share it."""
+    """Log each note of the scans once, with the scans that have it."""
     found: dict[str, list[str]] = {}
     for stored in scans:
         for note in stored.info.notes:
@@ -190,7 +185,7 @@ def _warn(scans: Sequence[StoredScan]) -> None:
 
 
 def _warn_of_other_code(data: Path, names: frozenset[str]) -> None:
-    """Say where the scans that one table compares were made by different code, or by other code than this."""
+    """Warn where scans were made by different code, or by other code than this."""
     lines = [line for line in read_index(data).values() if line.name in names]
     other = [line for line in lines if line.code != source_hash()]
     if text := mixture((line.name, line.code) for line in lines) or other_code(other, len(lines)):

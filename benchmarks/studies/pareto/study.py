@@ -19,7 +19,7 @@ from ctsim.benchmarks.engine.table import Table
 from ctsim.benchmarks.engine.terminal import Bar
 from ctsim.benchmarks.methods import code_version, find
 from ctsim.benchmarks.scores import score
-from ctsim.benchmarks.studies.methods import estimates
+from ctsim.benchmarks.studies.methods import run
 from ctsim.benchmarks.studies.pareto import Flags, figure, suite, tables
 from ctsim.benchmarks.studies.pareto.finding import Part, Timed, TimedRun, points
 from ctsim.benchmarks.studies.pareto.suite import Choice, Effort
@@ -102,12 +102,12 @@ class Pareto(study.Study[Record[TimedRun], Flags]):
             return RAY * asked.simulator.side**2 * asked.simulator.views
         (scene,) = suites.select(suites.load(asked.dataset.suite), (task.case,), ())
         effort, geometry = msgspec.convert(task.settings, Effort), scene.resolve().geometry
-        fdks = estimates.in_fdks(find(effort.method, effort.changes), geometry) or estimates.UNKNOWN
-        return fdks * estimates.fdk_seconds(geometry)
+        fdks = run.in_fdks(find(effort.method, effort.changes), geometry) or run.UNKNOWN
+        return fdks * run.fdk_seconds(geometry)
 
     def took(self, record: Record[TimedRun], given: Flags) -> float:
         """Return the seconds of a run, which ended with its last mark."""
-        return max((mark.seconds for run in record.found for mark in run.marks), default=0.0)
+        return max((mark.seconds for found in record.found for mark in found.marks), default=0.0)
 
     def line(self, task: Task) -> tuple[str, str]:
         """Return a scene and a curve."""

@@ -65,9 +65,8 @@ def on_scene(scene: Scene, side: int, found: Findings) -> None:
     found.say(f"P to {exact.max():.3g}")
     if not seen.all():
         low, high = float(p[~seen].min()), float(p[~seen].max())
-        found.say(
-            f"P beyond {P_MAX:g} within {low:.3g} … {high:.3g}", holds=low >= P_MAX - P_SURE and high <= suite.CLAMP
-        )
+        holds = low >= P_MAX - P_SURE and high <= suite.CLAMP
+        found.say(f"P beyond {P_MAX:g} within {low:.3g} … {high:.3g}", holds=holds)
     if (rod := scene.lone) is not None:
         there = float(volumes["reference_50kev"].sum(dtype=np.float64) * np.prod(scanner.geometry.d_voxel))
         mu = float(attenuation(rod.material, np.array([REFERENCE_KEV]))[0])

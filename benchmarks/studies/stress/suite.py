@@ -27,9 +27,7 @@ from ctsim.spectrum import Tube
 from ctsim.types import Phantom, Scanner
 
 FULL, SHORT = 24, 16  # voxels along a side
-P_SURE = (
-    1.2e-4  # |ΔP| where P ≤ 14.6: 1e-4 by the energy rule, a tenth more between the lengths it tried, 1e-5 by float32
-)
+P_SURE = 1.2e-4  # |ΔP| where P ≤ 14.6: the energies' 1e-4, a tenth more between the lengths tried, float32's 1e-5
 CLAMP = 81.0  # of P: exponents end at 80; 1 more for the weight of one node
 MASS = 0.01  # of a rod on the grid: 1/250 of every voxel that its surface crosses, of 216 cm³ for its 94 at worst
 FLOAT32 = 2e-5  # |ΔP|: exp is good to 4e-7·max(1, P/4) and so are the sums; lengths of 50 mm to 8e-6 mm, by 0.5/mm
