@@ -22,9 +22,9 @@ from test_record import places
 from ctsim.benchmarks import cli
 from ctsim.benchmarks.engine import host, study
 from ctsim.benchmarks.studies.methods import run as methods_run
-from ctsim.benchmarks.studies.pareto import figure
 from ctsim.benchmarks.studies.pareto import finding as pareto_finding
 from ctsim.benchmarks.studies.pareto import measure as pareto_measure
+from ctsim.benchmarks.studies.pareto import results as pareto_results
 from ctsim.benchmarks.studies.pareto.study import Pareto
 from ctsim.benchmarks.studies.peers import cases as peer_cases
 from ctsim.benchmarks.studies.peers import finding as peer_finding
@@ -90,7 +90,7 @@ def timed_in_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Pareto, "prepare", lambda self, given: None)
     monkeypatch.setattr(pareto_measure, "measure", lambda task, given: [run])
     monkeypatch.setattr(methods_run, "fdk_seconds", lambda geometry: 1.0)
-    monkeypatch.setattr(figure, "save", lambda points, path: None)
+    monkeypatch.setattr(pareto_results, "save_figure", lambda points, path: None)
     monkeypatch.setattr(host, "use_threads", lambda threads: None)  # those of this process are not ours to set
 
 

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from ctsim.benchmarks.engine.host import host
 from ctsim.benchmarks.engine.record import Task
-from ctsim.benchmarks.studies.pareto import figure as pareto_figure
-from ctsim.benchmarks.studies.pareto import tables as pareto_tables
+from ctsim.benchmarks.studies.pareto import results
 from ctsim.benchmarks.studies.pareto.finding import (
     Mark,
     Point,
@@ -180,7 +179,7 @@ def test_a_table_shows_the_newest_code_on_the_last_machine(tmp_path):
 def test_only_what_never_ended_well_is_a_failure(tmp_path):
     bad, good = task("bad"), task("good")
     found = [timed(bad, status="error", reason="so"), timed(good, status="error"), timed(good, ("good", 1, 1))]
-    assert pareto_tables.summary(shown(found, tmp_path))[-1].csv().splitlines()[1:] == ["fdk,bad,error,so"]
+    assert results.summary(shown(found, tmp_path))[-1].csv().splitlines()[1:] == ["fdk,bad,error,so"]
     assert "not measured" not in said(found[1:], tmp_path)
 
 
@@ -203,8 +202,8 @@ def said(records, tmp_path):
 def test_a_protocol_that_was_not_asked_for_has_no_column(tmp_path):
     for scores, shown_there in (({}, False), ({"aligned": 31.5}, True)):
         marks = (Mark(label="a", seconds=1.0, values={"rmse": 0.5, "psnr3d": 30.0, **scores}),)
-        tables = pareto_tables.every_point([record(task(), TimedRun(marks=marks))])
-        tables += pareto_tables.summary([record(task(), TimedRun(marks=marks))])
+        tables = results.every_point([record(task(), TimedRun(marks=marks))])
+        tables += results.summary([record(task(), TimedRun(marks=marks))])
         assert [("| aligned (dB) |" in t.markdown(), "| 31.50 |" in t.markdown()) for t in tables[:2]] == [
             (shown_there, shown_there)
         ] * 2
@@ -223,8 +222,8 @@ def simulated(*rows):
 def verdicts(*rows):
     """The verdicts on such defaults."""
     found = simulated(*rows)
-    assert pareto_figure.draw(points(found)).axes
-    notes = [note for table in pareto_tables.summary(found) for note in table.notes if note.startswith("Default")]
+    assert results.figure(points(found)).axes
+    notes = [note for table in results.summary(found) for note in table.notes if note.startswith("Default")]
     return [re.fullmatch("Default x, .: in relative RMS of P (.*); in all errors at once (.*).", s) for s in notes]
 
 

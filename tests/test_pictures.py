@@ -20,7 +20,7 @@ from ctsim.benchmarks.scores.protocol import truth_of
 from ctsim.benchmarks.studies.methods import panels
 from ctsim.benchmarks.studies.methods.panels import PanelRow, draw
 from ctsim.benchmarks.studies.methods.volumes import write_volume
-from ctsim.benchmarks.studies.pareto import figure as pareto_figure
+from ctsim.benchmarks.studies.pareto import results
 from ctsim.benchmarks.studies.pareto.finding import points
 from ctsim.reports import figures, view
 
@@ -111,7 +111,7 @@ def test_figures_of_the_report_draw_the_very_text(text):
 @pytest.mark.parametrize("text", TEXTS)
 def test_the_figure_of_pareto_draws_the_very_text(text):
     found = [timed(task(case=f"s {text}", curve=text), ("1", 1.0, 2.0), ("2", 2.0, 1.0))]
-    shown = text_of(pareto_figure.draw(points(found)))
+    shown = text_of(results.figure(points(found)))
     assert f"s {text}" in shown and f"\n{text}\n" in shown
 
 

@@ -1,4 +1,4 @@
-"""`run-benchmark pareto`: run time against error. The flags are here, since what measures takes long to import."""
+"""`run-benchmark pareto`: run time against error. The flags are here: the study takes long to import."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,18 +12,19 @@ from ctsim.benchmarks.studies.pareto.finding import Part
 
 @dataclass(frozen=True, kw_only=True)
 class Flags(Shared):
-    """Measure error against run time: the simulator over its choices, every method over its own effort.
+    """Measure error against run time: the simulator over its settings, every method over its effort.
 
-    Runs are measured again where code, data, machine or threads have changed. The machine should have nothing else to
-    do.
+    Runs are measured again where code, data, machine or threads have changed. Run nothing else on the machine
+    meanwhile.
     """
 
     part: Annotated[tuple[Part, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="PART")] = ()
     """Only this part, simulator or methods (default: both)."""
     scene: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME")] = ()
-    """Only this scene; may be given several times. The simulator has rods, methods those of the dataset (lung-Fe)."""
+    """Only this scene; may be given several times. The simulator has the scene rods, methods have the dataset's
+    (lung-Fe)."""
     suite: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """What to measure: a TOML file with tables of your own over those of benchmarks/suites/pareto.toml."""
+    """What to measure: a TOML file whose tables replace those of benchmarks/suites/pareto.toml."""
     method: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME")] = ()
     """Only this method, or module:function of your own; may be given several times (default: all of --suite)."""
     repeats: int = 3
@@ -33,5 +34,5 @@ class Flags(Shared):
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """The parts that are asked for."""
+        """The parts asked for."""
         return self.part or get_args(Part)

@@ -1,4 +1,4 @@
-"""What `run-benchmark pareto` finds: marks of timed runs, the points that their medians make, and their front."""
+"""Results of `run-benchmark pareto`: marks of timed runs, the points of their medians, and the Pareto front."""
 
 import functools
 import math
@@ -13,12 +13,12 @@ from ctsim.benchmarks.engine.record import OK, Found, Record, Task
 
 Part = Literal["simulator", "methods"]
 LOWER: dict[str, tuple[str, ...]] = {"simulator": ("rms", "worst", "off_edges"), "methods": ("rmse",)}
-"""The values of a part's marks that fronts can be drawn in, the main one first: smaller is better."""
+"""The errors of each part that a front can be drawn in, the main one first. Smaller is better."""
 NEAR = 0.05
-"""A share by which errors may differ and hardly matter: 0.4 dB."""
+"""A relative difference of errors that hardly matters: 0.4 dB."""
 ROUNDING = 1e-12  # of products of logarithms, which are below 100
 FEWEST = 5
-"""Runs of which the range is an interval of 94 %; all of five lie below five others by chance once in 252 times."""
+"""With five runs the range is a 94 % interval of the median; five lie below five others by chance in 1 of 252."""
 T = TypeVar("T")
 
 
@@ -32,14 +32,14 @@ class Mark(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class TimedRun(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One timed run; `warm_up` are the seconds of the call before it that compiled, if there was one."""
+    """One timed run; `warm_up` has the seconds of the compiling call before it, if there was one."""
 
     marks: tuple[Mark, ...] = ()
     warm_up: float | None = None
 
 
 class Timed(Record[TimedRun], frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The record of a run, which has all that a point needs."""
+    """The record of a run, checked to have what a point needs."""
 
     def __post_init__(self) -> None:
         texts, errors = [self.task.settings.get(key) for key in ("group", "curve", "label")], LOWER.get(self.task.part)
@@ -52,9 +52,9 @@ class Timed(Record[TimedRun], frozen=True, kw_only=True, forbid_unknown_fields=T
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """A task at one of its marks: the seconds of all rounds, and the errors, which do not differ between rounds.
+    """A task at one of its marks: the seconds of all rounds, and the errors, which are the same in every round.
 
-    Points of a `group` may be compared; a `curve` is a method, or a kind of choice of the simulator.
+    Points of one `group` are comparable; a `curve` is a method, or one kind of setting of the simulator.
     """
 
     task: Task
@@ -68,7 +68,7 @@ class Point:
 
     @functools.cached_property
     def pair(self) -> tuple[float, float]:
-        """Median seconds and error."""
+        """Median seconds and main error."""
         return median(self.seconds), self.values[LOWER[self.part][0]]
 
     def costs(self, errors: Sequence[str]) -> tuple[float, ...]:
@@ -95,7 +95,7 @@ def points(records: Sequence[Record[TimedRun]]) -> list[Point]:
 
 
 def parted(values: Iterable[T], key: Callable[[T], Any]) -> dict[Any, list[T]]:
-    """Part values by a key, in the order of first appearance."""
+    """Group values by a key, in the order of first appearance."""
     found: dict[Any, list[T]] = {}
     for value in values:
         found.setdefault(key(value), []).append(value)
@@ -103,21 +103,21 @@ def parted(values: Iterable[T], key: Callable[[T], Any]) -> dict[Any, list[T]]:
 
 
 def groups(every: Sequence[Point]) -> list[list[Point]]:
-    """Part the points into comparable ones: of one part, scene and group."""
+    """Group the comparable points: of one part, scene and group."""
     return list(parted(every, lambda p: (p.part, p.task.case, p.group)).values())
 
 
 def rivals(of: Sequence[Point], p: Point, errors: Sequence[str]) -> list[Point]:
-    """Return the points that beat one: no slower and no worse in any of these errors, and better in one of all."""
+    """Return the points that dominate `p`: no worse in time and these errors, and better in at least one."""
     mine = p.costs(errors)
     costs = [(q, q.costs(errors)) for q in of]
     return [q for q, its in costs if its != mine and all(a <= b for a, b in zip(its, mine, strict=True))]
 
 
 def front(of: Sequence[Point], error: str | None = None) -> list[Point]:
-    """Return the points that no other beats in an error, by default the main one; fastest first.
+    """Return the points that no other dominates in time and an error, by default the main one; fastest first.
 
-    Of equal points all are on the front.
+    Equal points are all on the front.
     """
     errors = [error or LOWER[of[0].part][0]]
     return sorted((p for p in of if not rivals(of, p, errors)), key=lambda p: p.costs(errors))
@@ -126,29 +126,29 @@ def front(of: Sequence[Point], error: str | None = None) -> list[Point]:
 def knee(of: Sequence[Point]) -> Point | None:
     """Return the point of the front that lies farthest below the chord between its ends, in log-log.
 
-    Scaling either axis moves no point past another, so no normalisation enters. None where no point lies below
-    the chord, as for fewer than three, or one is without error.
+    Scaling an axis changes no order, so nothing is normalised. None where no point lies below the chord, as for
+    fewer than three points, or where an error is 0.
     """
     on = front(of)
     if min(p.pair[1] for p in on) <= 0:
         return None
     x, y = ([math.log(p.pair[axis]) for p in on] for axis in (0, 1))
-    # twice the area of the triangle with the chord: distance times the chord's length, positive below it
+    # twice the area of the point's triangle with the chord: its distance times a constant, positive below
     below = [(x[-1] - x[0]) * (y[0] - v) - (x[0] - u) * (y[-1] - y[0]) for u, v in zip(x, y, strict=True)]
     return on[below.index(max(below))] if max(below) > ROUNDING else None
 
 
 def faster(a: Sequence[float], b: Sequence[float]) -> bool:
-    """Return whether runs of `a` seconds are faster than those of `b` beyond the spread of both.
+    """Whether runs of `a` seconds are faster than runs of `b` by more than the spread of both.
 
-    The 95 % intervals of their medians do not meet: between order statistics, for any distribution. Fewer than
-    `FEWEST` runs tell nothing.
+    True where the 95 % intervals of the medians, between order statistics, do not overlap; holds for any distribution.
+    False for fewer than `FEWEST` runs.
     """
     return min(len(a), len(b)) >= FEWEST and _interval(a)[1] < _interval(b)[0]
 
 
 def _interval(runs: Sequence[float]) -> tuple[float, float]:
-    n, at, below = len(runs), 0, 1  # below: of 2ⁿ equally likely cases, those with at most `at` runs under the median
+    n, at, below = len(runs), 0, 1  # below: how many of 2ⁿ equally likely cases have at most `at` runs under the median
     while below < 0.025 * 2**n:
         at += 1
         below += math.comb(n, at)
@@ -164,10 +164,10 @@ def enough(of: Sequence[Point]) -> Point:
 
 
 def recommended(of: Sequence[Point]) -> Point:
-    """Return the setting to take: of methods the fastest near the least error of all.
+    """Return the recommended setting: of methods the fastest point near the least error.
 
-    Of the simulator's choices it is the knee of the default's own curve, if there is one: its error falls on and on,
-    and what other curves differ in shows in another error.
+    Of the simulator it is the knee of the default's curve, if there is one: along that curve the error keeps falling,
+    and other curves differ in another error.
     """
     if of[0].part == "methods":
         return enough(of)

@@ -1,7 +1,7 @@
-"""Timed runs of `run-benchmark pareto`, in the process that takes them all: of the simulator, and of methods.
+"""Timed runs of `run-benchmark pareto`, of the simulator and of methods, all in one process.
 
-What runs share stays in that process: compiled kernels, the opened scene, the reference. In a process that replaces it
-they are made again before the next run's clock starts.
+The process keeps what runs share: compiled kernels, the opened scene, the reference. A process that replaces it makes
+them again before the next run's clock starts.
 """
 
 import contextlib
@@ -38,8 +38,8 @@ from ctsim.types import Phantom, Scanner, Status
 
 CHECKED = 2  # views that are compared with the reference
 FINER, FINEST = 16, 64
-"""Of the reference: finer pixels along a side of a pixel, and rays in each."""
-CALM = 1e-4  # |ΔP| of the central ray alone, below which a pixel has no edge
+"""Of the reference: finer pixels along the side of a pixel, and rays in each of them."""
+CALM = 1e-4  # a pixel has no edge where |ΔP| of the central ray alone is smaller
 USUALLY = Choice(curve=EXACT, label="default")
 _WARM: set[tuple[Hashable, ...]] = set()
 
@@ -52,12 +52,12 @@ def measure(task: Task, given: Flags) -> list[TimedRun]:
         of = (asked.simulator.side, asked.simulator.views)
         return [timed(SimulatorBench, of, msgspec.convert(task.settings, Choice), task.case)]
     of = (given.results / "data" / task.case, asked.dataset.aligned)
-    # other values of a parameter may take other kernels
+    # other parameter values may need other kernels
     return [timed(MethodBench, of, msgspec.convert(task.settings, Effort), task.subject)]
 
 
 def timed(make: Callable[..., Any], of: tuple[Hashable, ...], choice: Any, kind: str) -> TimedRun:
-    """Time a choice on the bench that `make(*of)` returns, after a warm-up if it is the first of its kind there."""
+    """Time a choice on the bench `make(*of)`, after a warm-up if it is the first of its `kind` there."""
     first, key = None, (make, *of, kind)
     try:
         bench = _bench(make, of)
@@ -70,7 +70,7 @@ def timed(make: Callable[..., Any], of: tuple[Hashable, ...], choice: Any, kind:
         return TimedRun(ok=False, status=status, reason=describe(error), warm_up=first)
 
 
-@functools.lru_cache(maxsize=1)  # a scene's tasks come one after the other
+@functools.lru_cache(maxsize=1)  # a scene's tasks follow each other
 def _bench(make: Callable[..., Any], of: tuple[Hashable, ...]) -> Any:
     return make(*of)
 
@@ -81,10 +81,10 @@ def _bench(make: Callable[..., Any], of: tuple[Hashable, ...]) -> Any:
 class SimulatorBench:
     """The simulator's scene, its reference, and what is prepared for each choice; `side` is of detector and grid.
 
-    The scene is analytic: a water cylinder with a bone rod and two iron rods. The reference has the finest of every
-    choice: closed-form chords, 16² finer pixels a pixel of up to 64 rays each averaged in intensity, and the whole fine
-    spectrum. Errors are those of P = −ln(signal/open) without noise in a few views. The scatter levels have a group of
-    their own, where the reference has level 1's signal added: a constant, whose own error is not known here.
+    The scene is analytic: a water cylinder with a bone rod and two iron rods. The reference has closed-form chords, 16²
+    finer pixels per pixel with up to 64 rays each, averaged in intensity, and the whole fine spectrum. Errors are of
+    P = −ln(signal/open) without noise in a few views. The scatter levels form their own group: there the reference has
+    level 1's constant signal added, so that the error of that constant does not show.
     """
 
     def __init__(self, side: int, views: int) -> None:
@@ -95,7 +95,7 @@ class SimulatorBench:
         self._plans: dict[Choice, tuple[Plan, Phantom, Scanner]] = {}
 
     def warm_up(self, _: Choice) -> float:
-        """Run the defaults, so that compiling and the reference are not timed with a choice; return the seconds."""
+        """Run the defaults, so that no timed run compiles or makes the reference; return the seconds."""
         return sum(mark.seconds for mark in self.run(USUALLY).marks)
 
     def run(self, choice: Choice) -> TimedRun:
@@ -113,7 +113,7 @@ class SimulatorBench:
     def errors(self, p: NDArray[np.float32], scatter: float = 0.0) -> dict[str, float]:
         """Compare P of the checked views with the reference, to which `scatter` (S/I0) is added.
 
-        `rms` is relative, `worst` and `off_edges` are the greatest |ΔP|, the latter where a pixel has no edge.
+        `rms` is relative; `worst` is the greatest |ΔP|, `off_edges` the greatest in pixels without an edge.
         """
         exact, calm = self.reference
         exact = -np.log(np.exp(-exact) + scatter)
@@ -122,7 +122,7 @@ class SimulatorBench:
 
     @functools.cached_property
     def reference(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """P of the checked views, and where the central ray alone says the same."""
+        """P of the checked views, and the pixels where the central ray alone gives the same."""
         exact, central = (
             measured_pixel(self.phantom, self.scanner, self.checked, finer=finer, subrays=rays)
             for finer, rays in ((FINER, FINEST), (1, 1))
@@ -130,7 +130,7 @@ class SimulatorBench:
         return exact, np.abs(central - exact) < CALM
 
     def _plan(self, choice: Choice) -> tuple[Plan, Phantom, Scanner]:
-        """Plan a choice, once; no clock runs yet. The body (and with `metal` all) is labels where there is a `grid`."""
+        """Plan a choice once, untimed. With a `grid` the body, and with `metal` the metal too, are voxels."""
         if choice not in self._plans:
             scanner, phantom = msgspec.structs.replace(self.scanner, scatter=Scatter(level=choice.level)), self.phantom
             if choice.grid is not None:
@@ -148,10 +148,10 @@ class SimulatorBench:
 class MethodBench:
     """A stored scene, on which every method of the table is timed over its own effort and scored under `tissue`.
 
-    Iterative methods run once, past their default iterations, and are scored as they pass each of the stops (`watch`);
-    the clock stands still meanwhile. A run of k iterations takes what it took to get there, and what the method took
-    after its last: its closing residual. Methods whose effort is not a count of iterations that can be watched run once
-    for each value; methods without any are single points.
+    Iterative methods run once, past their default iterations, and are scored at each stop (`watch`) with the clock
+    stopped. The time of k iterations is the time to reach them plus the time the method takes after its last iteration,
+    such as for its closing residual. Methods without watchable iterations run once for each value of their effort;
+    methods without effort are single points.
     """
 
     def __init__(self, folder: Path, aligned: bool = False) -> None:
@@ -160,11 +160,11 @@ class MethodBench:
 
     @functools.cached_property
     def truth(self) -> Truth:
-        """What volumes are compared with."""
+        """The truth that volumes are compared with."""
         return truth_of(self.stored)
 
     def warm_up(self, effort: Effort) -> float:
-        """Run the method on a few views and slices, so that compiling is not timed; return its seconds."""
+        """Run the method on a few views and slices, so that no timed run compiles; return the seconds."""
         method = find(effort.method, effort.changes)
         return warm_up(method, scan_for(method, self.stored, "metal"))
 
@@ -179,7 +179,7 @@ class MethodBench:
         end, around, count = self.values(outcome.values), outcome.cost.wall - marks.watched, len(marks.seen)
         if not count:
             return TimedRun(marks=(Mark(label=effort.label, seconds=around, values=end, default=effort.default),))
-        # the volume that is returned may be finished, such as by a last cut at 0
+        # the method may change its volume after the last iteration, such as cut it at 0
         marks.seen[-1] = marks.seen[-1][0], end
         default = min(usual or count, count) if effort.default else None
         passed = [
@@ -192,7 +192,7 @@ class MethodBench:
     def values(self, volume: NDArray[np.float32]) -> dict[str, float]:
         """Return RMSE (1/mm) and PSNR3D (dB) of `tissue`, and PSNR3D of `aligned` where it is asked for.
 
-        There are none of a volume with values that are not finite.
+        Empty for a volume with values that are not finite.
         """
         truth = self.truth
         if not np.isfinite(volume).all():
@@ -208,8 +208,8 @@ class MethodBench:
 class Marks:
     """Watches a method: scores its volume at the stops.
 
-    `seen` are the method's own seconds after each iteration, without those of scoring, and the scores at a stop;
-    `watched` are all from the start of its clock until its last iteration had been seen.
+    `seen` has the method's seconds after each iteration, scoring excluded, and the scores at a stop. `watched` has the
+    seconds from the start of its clock to the end of the last scoring.
     """
 
     score: Callable[[NDArray[np.float32]], dict[str, float]]
@@ -219,7 +219,7 @@ class Marks:
     watched: float = 0.0
 
     def __call__(self, _view_updates: int, seconds: float, volume: torch.Tensor) -> None:
-        """Take note of an iteration that ended `seconds` after the method's clock was started."""
+        """Note an iteration that ended at `seconds` of the method's clock."""
         if not self.seen:
             self.began = time.perf_counter() - seconds
         self.seen.append((seconds, self.score(volume.numpy()) if len(self.seen) + 1 in self.stops else {}))

@@ -1,8 +1,8 @@
-"""`run-benchmark pareto RESULTS`: error against run time, of the simulator's choices and of every method's effort.
+"""`run-benchmark pareto RESULTS`: error against run time, over the simulator's settings and every method's effort.
 
-Every timed run is a record. Tasks are timed in turns, once each a round, so that a drift of the machine meets all
-alike; times are medians over the rounds. The tables and the figure show the points, their Pareto front and its knee.
-All runs share one process, which is replaced where a run exceeds its time limit.
+Every timed run is a record. Each round times every task once, so that a drift of the machine affects all tasks alike;
+times are medians over the rounds. The tables and the figure show the points, their Pareto front and its knee. All runs
+share one process, which is replaced where a run exceeds its time limit.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ from ctsim.benchmarks.engine.terminal import Bar
 from ctsim.benchmarks.methods import code_version, find
 from ctsim.benchmarks.scores import score
 from ctsim.benchmarks.studies.methods import run
-from ctsim.benchmarks.studies.pareto import Flags, figure, suite, tables
+from ctsim.benchmarks.studies.pareto import Flags, results, suite
 from ctsim.benchmarks.studies.pareto.finding import Part, Timed, TimedRun, points
 from ctsim.benchmarks.studies.pareto.suite import Choice, Effort
 from ctsim.errors import InputError
@@ -32,8 +32,8 @@ from ctsim.phantoms.scene import Scene, scene_id
 
 RODS = "rods"
 T = TypeVar("T")
-VERSION = 2  # of what is measured
-RAY = 6.2e-7  # seconds of the simulator for a pixel of a view by default, on two cores (docs/measured/pareto.md)
+VERSION = 2  # of the measurement
+RAY = 6.2e-7  # seconds per pixel and view of the simulator's defaults, on two cores (docs/measured/pareto.md)
 
 
 class Pareto(study.Study[Record[TimedRun], Flags]):
@@ -47,20 +47,20 @@ class Pareto(study.Study[Record[TimedRun], Flags]):
     estimate = "without compiling, planning and the reference"
 
     def check(self, given: Flags) -> None:
-        """Require threads, and let the kernels have them."""
+        """Require at least one thread; set the kernels' threads."""
         if given.threads < 1:
             raise InputError(f"--threads must be at least 1, got {given.threads}")
         host.use_threads(given.threads)
 
     def prepare(self, given: Flags) -> None:
-        """Make the scans that are missing, if all that is asked for is there."""
+        """Make the missing scans, after checking scenes and methods."""
         data, scenes = given.results / "data", scenes_of(given)
         for scene in scenes if efforts_of(given) else ():
             if not is_complete(data, scene.name, scene_id(scene)):
                 make_scene(scene, data, watch=functools.partial(_watched, scene.name))
 
     def tasks(self, given: Flags) -> list[Task]:
-        """Return a task for each choice of the simulator, and for each run of a method on each scene."""
+        """Return a task for each setting of the simulator, and for each run of a method on each scene."""
         asked, scenes, runs = suite.load(given.suite), scenes_of(given), efforts_of(given)
         size = f"{asked.simulator.side}² pixels, {asked.simulator.views} views"
         simulated = "simulator" in given.parts and (not given.scene or RODS in given.scene)
@@ -92,11 +92,11 @@ class Pareto(study.Study[Record[TimedRun], Flags]):
         return task.version == VERSION
 
     def pending(self, tasks: Sequence[Task], records: Sequence[Record[TimedRun]], given: Flags) -> list[Task]:
-        """Return the runs that are not recorded: all rounds of a scene before the next one's, which is opened once."""
+        """Return the runs without a record, scene by scene, so that each scene is opened once."""
         return sorted(super().pending(tasks, records, given), key=lambda task: task.place[:1])
 
     def expected(self, task: Task, given: Flags) -> float:
-        """Return about how many seconds a run takes: of a method from an FDK timed here, of the simulator as usual."""
+        """Estimate a run's seconds: of a method from FDK's time on this machine, of the simulator from `RAY`."""
         asked = suite.load(given.suite)
         if task.part == "simulator":
             return RAY * asked.simulator.side**2 * asked.simulator.views
@@ -106,7 +106,7 @@ class Pareto(study.Study[Record[TimedRun], Flags]):
         return fdks * run.fdk_seconds(geometry)
 
     def took(self, record: Record[TimedRun], given: Flags) -> float:
-        """Return the seconds of a run, which ended with its last mark."""
+        """Return the seconds of a run: those of its last mark."""
         return max((mark.seconds for found in record.found for mark in found.marks), default=0.0)
 
     def line(self, task: Task) -> tuple[str, str]:
@@ -115,14 +115,14 @@ class Pareto(study.Study[Record[TimedRun], Flags]):
 
     def tables(self, records: Sequence[Record[TimedRun]], given: Flags) -> list[Table]:
         """Return the fronts, the defaults and each curve's knee."""
-        return tables.summary(records)
+        return results.summary(records)
 
     def details(self, records: Sequence[Record[TimedRun]], given: Flags) -> list[Table]:
         """Return every point."""
-        return tables.every_point(records)
+        return results.every_point(records)
 
     def code(self, tasks: Sequence[Task], records: Sequence[Record[TimedRun]], given: Flags) -> int:
-        """Return the exit code: 1 if a run that was asked for failed, 0 with --table."""
+        """Return 1 if a run that was asked for failed, else 0; always 0 with --table."""
         return super().code(tasks, records, given) if tasks else 0
 
     def write(self, records: Sequence[Record[TimedRun]], given: Flags) -> str:
@@ -130,19 +130,19 @@ class Pareto(study.Study[Record[TimedRun], Flags]):
         text = super().write(records, given)
         if drawn := points(self.shown(records)):
             picture = given.results / "pareto.png"
-            figure.save(drawn, picture)
+            results.save_figure(drawn, picture)
             text += f"Figure: {picture}\n"
         return text
 
 
 def _watched(name: str, views: Iterable[T], first: int, n_views: int) -> Iterator[T]:
-    """Yield the views of a scan that is made, with a bar."""
+    """Yield the views of a scan, with a progress bar."""
     with Bar(n_views, "view", first) as bar:
         yield from bar.over(views, name)
 
 
 def scenes_of(given: Flags) -> list[Scene]:
-    """Return the scenes that methods are to run on. Raises InputError for one that there is not."""
+    """Return the scenes for the methods. Raises InputError for an unknown scene."""
     dataset = suite.load(given.suite).dataset
     with _where(f"{given.suite}: dataset.suite: "):
         scenes = {scene.name: scene for scene in suites.load(dataset.suite)}
@@ -160,7 +160,7 @@ def scenes_of(given: Flags) -> list[Scene]:
 
 
 def efforts_of(given: Flags) -> list[Effort]:
-    """Return the runs of methods on a scene. Raises InputError for a method or a parameter that there is not."""
+    """Return the runs of methods on a scene. Raises InputError for an unknown method or parameter."""
     asked, runs = suite.load(given.suite), []
     for name in given.method or [listed.name for listed in asked.method]:
         with _where(f"{given.suite}: " if given.suite and asked.listed(name) else ""):
@@ -170,7 +170,7 @@ def efforts_of(given: Flags) -> list[Effort]:
 
 @contextlib.contextmanager
 def _where(text: str) -> Iterator[None]:
-    """Say in an InputError first where that is."""
+    """Put `text`, the place of the fault, before the message of an InputError."""
     try:
         yield
     except InputError as error:

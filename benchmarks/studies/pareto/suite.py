@@ -1,7 +1,7 @@
-"""What `run-benchmark pareto` measures: `benchmarks/suites/pareto.toml`, or tables of your own over it.
+"""What `run-benchmark pareto` measures: `benchmarks/suites/pareto.toml`, or a file whose tables replace its tables.
 
-`efforts` and `choices` make runs of it. Each is the settings of a task, so that a worker needs nothing else. Points are
-compared within a `group` and make curves.
+`efforts` and `choices` list the runs. A run is the whole settings of a task, so a worker needs no file. Points of one
+`group` are compared; within it they form curves.
 """
 
 from importlib import resources
@@ -16,7 +16,7 @@ from ctsim.phantoms.suites import decode, parse_toml, read_toml
 from ctsim.settings import Simulation, Subrays, Tolerance
 
 NAME = "pareto.toml"
-USUAL = 1.0  # label voxels along an axis for each pixel along one; the bundled suites have 0.5 to 1.2
+USUAL = 1.0  # label voxels per pixel along an axis; the bundled suites have 0.5 to 1.2
 EXACT, BODY, VOXELS, SCATTER = "exact solids", "body in voxels, metal exact", "all in voxels", "scatter"
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Level = Literal[0, 1]  # of scatter
@@ -24,9 +24,9 @@ HIGHEST = max(get_args(Level))
 
 
 class Dataset(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The suite of scenes that methods are measured on, by name or path; `scenes` if not all of them.
+    """The suite of scenes for the methods, by name or path; `scenes` (empty: all) names the scenes to use.
 
-    With `aligned` volumes are scored under that protocol, too.
+    With `aligned` volumes are also scored under that protocol.
     """
 
     suite: str
@@ -35,14 +35,14 @@ class Dataset(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class Iterations(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """After how many iterations a method is scored, and how many times its default it goes."""
+    """The iterations after which a method is scored, and the multiple of its default at which it ends."""
 
     stops: Annotated[tuple[Count, ...], msgspec.Meta(min_length=1)]
     times: Count
 
 
 class More(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One more run of a method, with the parameters in `set`: a curve of its own."""
+    """A further run of a method, with the parameters in `set` and its own curve."""
 
     curve: str
     label: str
@@ -50,9 +50,9 @@ class More(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class Listed(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A method and its effort: values of a parameter, or how many times its default iterations; and further runs.
+    """A method and its effort: values of a parameter, or a multiple of its default iterations; and further runs.
 
-    With `default` off there are the further runs alone.
+    With `default` off there are only the further runs.
     """
 
     name: str
@@ -72,7 +72,7 @@ class Listed(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class Choices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How the simulator's scene is simulated; `grids` are label voxels along an axis for a pixel along one."""
+    """The settings of the simulator to measure; `grids` are label voxels per pixel along an axis."""
 
     side: Annotated[int, msgspec.Meta(ge=16)]  # on fewer pixels all are at edges
     views: Annotated[int, msgspec.Meta(ge=2)]
@@ -96,12 +96,12 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise InputError(f"method: two curves are called {twice[0]!r}; expected names that differ")
 
     def listed(self, name: str) -> Listed | None:
-        """Return what the file says of a method, None where it does not name it."""
+        """Return the file's entry of a method, None if there is none."""
         return next((m for m in self.method if m.name == name), None)
 
 
 def load(path: Path | None) -> Suite:
-    """Read the tables of a file, each that it leaves out from the bundled one; only the latter for None.
+    """Read a suite; tables that the file at `path` leaves out, or all for None, come from the bundled file.
 
     Raises InputError naming the file, the key and what was expected.
     """
@@ -116,10 +116,10 @@ def load(path: Path | None) -> Suite:
 
 
 class Effort(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One run of a method: `changes` of its parameters, all `params`, and what the run and its curve are called.
+    """One run of a method: `changes` of its parameters, all `params`, and the names of the run and its curve.
 
-    A run that is `watched` has a mark at each of the `stops`, if the method shows its volume. With `default` the run,
-    or one mark of it if it is watched, is what the method does by default.
+    A `watched` run has a mark at each of the `stops`, if the method shows its volume. With `default` the run, or one of
+    its marks, is the method's default.
     """
 
     group: str
@@ -134,7 +134,7 @@ class Effort(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class Choice(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One way to simulate the scene; `grid` (None: analytic) and `metal` say what is turned into voxels."""
+    """One way to simulate the scene. `grid`: label voxels per pixel, None for analytic; `metal`: metal too."""
 
     group: str = EXACT
     curve: str
@@ -147,9 +147,9 @@ class Choice(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 def efforts(suite: Suite, name: str) -> list[Effort]:
-    """List the runs of a method as the suite says, or by its iterations, if it has them, where it is not listed.
+    """List the runs of a method: as in the suite or, if not listed there, by its iterations, if it has any.
 
-    Raises InputError for a method or a parameter that there is not.
+    Raises InputError for an unknown method or parameter.
     """
     usual, listed, stops = find(name), suite.listed(name) or Listed(name=name), suite.iterations.stops
 
@@ -180,7 +180,7 @@ def _words(value: Any) -> str:
 
 
 def choices(asked: Choices) -> list[Choice]:
-    """List every choice that is asked for: tolerances with sub-rays, voxels instead of solids, and scatter levels."""
+    """List the settings to measure: tolerances with sub-rays, voxels instead of solids, and scatter levels."""
     usual = Simulation()
     found = [
         Choice(
@@ -194,7 +194,7 @@ def choices(asked: Choices) -> list[Choice]:
     ]
     whole = Simulation(skip=False)
     found.append(Choice(curve="nothing skipped", label=f"{usual.subrays} sub-rays", simulation=whole))
-    # whether there is a closed form is the scene's matter, so voxels do not rival solids
+    # a scene has a closed form or not, so voxels have their own group and do not compete with solids
     found += [
         Choice(
             group="voxels",
@@ -207,14 +207,14 @@ def choices(asked: Choices) -> list[Choice]:
         for curve, metal in ((BODY, False), (VOXELS, True))
         for labels, grid in _grids(asked).items()
     ]
-    # whether there is scatter is the scanner's matter: here there is, and then the highest level is what is computed
+    # the scanner decides about scatter; here there is some, and its best model is the highest level
     return found + [
         Choice(group=SCATTER, curve=SCATTER, label=f"level {k}", level=k, default=k == HIGHEST) for k in asked.levels
     ]
 
 
 def _grids(asked: Choices) -> dict[int, float]:
-    """Return the grids by their number of labels; of those with the same number the default, or else the first."""
+    """Return the grids by their number of labels; of equal numbers the default grid, else the first."""
     grids = (*reversed(asked.grids), *(grid for grid in asked.grids if grid == USUAL))
     return dict(sorted({round(grid * asked.side): grid for grid in grids}.items()))
 
