@@ -1,8 +1,8 @@
-"""`run-benchmark ablation DATA RESULTS`: what each part of the published splat method is worth.
+"""`run-benchmark ablation DATA RESULTS`: what each part of the published splat method contributes.
 
 The rows are those of the paper's tables whose suite is "ablation" (`benchmarks/studies/paper/tables.toml`): ordinary
-methods with parameters, so that records, resuming and time limits are those of `run-benchmark`. A run that several rows
-share is run once. Steps are a tenth of the published; so the rows compare with each other, not with a full run.
+methods with parameters, so records, resuming and time limits work as in `run-benchmark`. A run that several rows share
+is run once. Steps are a tenth of the published number, so rows compare with each other, not with a full run.
 """
 
 import statistics
@@ -31,20 +31,20 @@ from ctsim.human import human_time
 from ctsim.store import list_scans, open_scan
 
 NAME = "ablation.md"
-# CPU seconds of a step of each method on this suite, which ends with 65 536 splats, and its share of the warm-up, which
-# takes as many steps on 8 views: 0.046 + 0.015 and 0.10 + 0.03, on one core of a busy AMD EPYC.
+# CPU seconds per step of each method on this suite, which ends with 65 536 splats. They include the warm-up, which
+# takes the same number of steps on 8 views: 0.046 + 0.015 and 0.10 + 0.03, on one core of a busy AMD EPYC.
 SECONDS = {"splat-paper": 0.06, "splat-r2": 0.13}
 
 
 @dataclass(frozen=True)
 class Flags:
-    """Take the published splat method apart on the suite `ablation`, and print the paper's tables of it.
+    """Run the paper's ablations of its splat method on the suite `ablation`, and print the paper's tables of them.
 
-    Scans that are missing are made; what RESULTS already holds is not run again.
+    Missing scans are made; runs that RESULTS already holds are not repeated.
     """
 
     data: tyro.conf.Positional[Path]
-    """The data folder; scans that are missing are made."""
+    """The data folder; missing scans are made."""
     results: tyro.conf.Positional[Path]
     """The folder for records, tables and volumes."""
     table: Annotated[tyro.conf.UseAppendAction[tuple[int, ...]], tyro.conf.arg(metavar="N")] = ()
@@ -52,7 +52,7 @@ class Flags:
     seconds: float | None = None
     """Time limit of one run, its start included; each run then has a process of its own."""
     workers: int = 1
-    """Do so many runs at once, each with its share of the cores: these are too small to gain much by threads."""
+    """Number of runs at once, each with its share of the cores: runs this small gain little from threads."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the rows and what they will cost; run nothing."""
 
@@ -73,7 +73,7 @@ class Ablation(Methods):
         self._chosen, self._rates = methods_of(listed), rates
 
     def jobs(self, given: RunFlags) -> list[plan.Job]:
-        """List the runs scene by scene; those of scenes that are not in the data folder are left out."""
+        """List the runs scene by scene, without scenes that are not in the data folder."""
         folders = {folder.name: folder for folder in list_scans(given.data)} if given.data.is_dir() else {}
         found: list[plan.Job] = []
         for scene in dict.fromkeys(scene for scene, _ in self._listed):
@@ -122,7 +122,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _planned(study: Ablation, listed: Sequence[Variant], known: Sequence[RunRecord], given: RunFlags) -> str:
-    """Return the runs that are left with the rows that show them, those last whose scans are to be made first."""
+    """Return the runs left to do with the rows that show them; runs whose scans are missing come last."""
     tasks = study.tasks(given)
     there = {task.settings.scene for task in tasks}
     missing = [v for v in listed if v.scene not in there]
@@ -136,9 +136,9 @@ def _planned(study: Ablation, listed: Sequence[Variant], known: Sequence[RunReco
 
 
 def variants(numbers: tuple[int, ...] = ()) -> list[Variant]:
-    """Return the runs of the numbered tables, of all that are ablations where none is named.
+    """Return the runs of the numbered tables, by default of all ablations.
 
-    Raises InputError for a table that is none.
+    Raises InputError for a table that is not an ablation.
     """
     known = ablations()
     for number in numbers:
@@ -169,7 +169,7 @@ def methods_of(listed: Sequence[Variant]) -> dict[str, Method]:
 
 
 def _rates(found: Sequence[RunRecord]) -> dict[str, float]:
-    """Return the seconds that a step of each method takes, warm-up included: as recorded, else as measured once."""
+    """Return the seconds per step of each method, warm-up included: from records, else from `SECONDS`."""
     known: dict[str, list[float]] = {}
     for record in (r for r in found if r.finished):
         method, steps = record.label.partition("[")[0], record.run.params.get("steps")

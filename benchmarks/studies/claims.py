@@ -1,7 +1,7 @@
-"""`run-benchmark reproduce DATA RESULTS`: from nothing to the records behind what is claimed of FDK, LIMAR and NMAR.
+"""`run-benchmark reproduce DATA RESULTS`: make the records behind the claims about FDK, LIMAR and NMAR, and check them.
 
-Makes the suite's scans with three seeds, runs the methods on them and on their metal-free twins, and says of each
-claim what was found and whether it holds. All of it resumes; `--table` judges the records that are there.
+Makes the suite's scans with three seeds, runs the methods on them and on their metal-free twins, and prints for each
+claim the finding and whether it holds. All of it resumes; `--table` only judges existing records.
 """
 
 import statistics
@@ -36,11 +36,11 @@ Runs = dict[tuple[str, int, str], RunRecord]
 class Flags:
     """Make the records behind the claims about FDK, LIMAR, NMAR and OS-SART, and check the claims.
 
-    The times are worth something on an idle machine only.
+    Claims about time need an idle machine.
     """
 
     data: tyro.conf.Positional[Path]
-    """The data folder; scans that are missing are made."""
+    """The data folder; missing scans are made."""
     results: tyro.conf.Positional[Path]
     """The folder for records, tables, volumes and pictures."""
     suite: str = "core"
@@ -48,14 +48,14 @@ class Flags:
     seeds: tuple[int, ...] = (1, 2, 3)
     """Repetitions of each scene."""
     table: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Only judge the records that are there, computing nothing."""
+    """Only judge existing records; run nothing."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the scans to make, the runs to do and what they will cost; write nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claim:
-    """What is claimed, what was found, and whether it holds; None where records are missing."""
+    """A claim, the finding, and whether the claim holds; None where records are missing."""
 
     text: str
     found: str
@@ -81,7 +81,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _compute(given: Flags) -> int:
-    """Make the scans that are missing and run what has no record, or print the plans of both; return the exit code."""
+    """Make missing scans and run what has no record, or print both plans; return the exit code."""
     plan = ["--dry-run"] if given.dry_run else []
     if code := make_dataset.main([given.suite, str(given.data), "--seeds", *map(str, given.seeds), *plan]):
         return code
@@ -95,7 +95,7 @@ def _compute(given: Flags) -> int:
 
 
 def _guess(later: int, known: Costs) -> None:
-    """Print what the runs on scans will take that are to be made first."""
+    """Print the expected time of runs on scans that are still to be made."""
     usual = {method: known.method(method) for method in METHODS}
     seconds = sum(2 * later * s for s in usual.values() if s is not None)
     sys.stdout.write(f"on {later} scans to be made and their twins: {human_time(seconds)}, by the records' medians")

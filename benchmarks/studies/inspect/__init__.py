@@ -1,4 +1,4 @@
-"""`run-benchmark inspect`: how the PSNR and SSIM of one volume move with the convention they are computed by."""
+"""`run-benchmark inspect`: how PSNR and SSIM of one volume depend on the convention. The flags of the command."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +9,7 @@ import tyro
 
 @dataclass(frozen=True)
 class Flags:
-    """Show how the scores of one volume move under each convention, as a table in Markdown."""
+    """Show how the scores of one volume depend on the convention, as a table in Markdown."""
 
     data: tyro.conf.Positional[Path]
     """The folder that make-dataset wrote."""

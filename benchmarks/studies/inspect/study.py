@@ -2,8 +2,8 @@
 
 `run-benchmark inspect DATA RESULTS` reads a kept volume, `run-benchmark inspect DATA --method NAME`
 reconstructs one. Each row of the table changes one convention of the protocol `tissue`; conventions
-that are known from the literature as a whole follow. Where the reference is that of 50 keV the method's own volume at
-50 keV is scored, if it has one, as in the tables.
+from the literature follow. Where the reference is at 50 keV, the method's own volume at 50 keV is scored, if it has
+one, as in the tables.
 """
 
 import sys
@@ -116,7 +116,7 @@ WHOLE: tuple[Convention, ...] = (
 
 
 def score(found: Inspected, truth: Truth, how: Convention) -> Scored:
-    """Score a volume; its own at 50 keV, where there is one, against the reference of 50 keV.
+    """Score a volume; against the reference at 50 keV its own at 50 keV, if there is one.
 
     Outside the region the volume counts as the reference in SSIM's window.
     """
@@ -190,7 +190,7 @@ def clipped(values: Volume, reference: Volume, clip: str) -> Volume:
 def similarity(
     values: Volume, reference: Volume, region: NDArray[np.bool_], data_range: float, window: Window
 ) -> float | None:
-    """Return SSIM averaged over the region ("r2": over all voxels and with peak 1, whatever is asked).
+    """Return SSIM averaged over the region ("r2": over all voxels with peak 1, for any region and range).
 
     None with "uniform7" where an axis has fewer than 7 voxels, with "r2" where the reference is empty.
     """

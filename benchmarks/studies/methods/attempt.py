@@ -1,6 +1,7 @@
-"""One run of a method in this process: warmed up, measured, and whatever happens turned into an outcome.
+"""One run of a method in this process: a warm-up, the measured run, and its outcome, failures included.
 
-Runs that share a process are kept apart: each has its own view of the data and leaves nothing behind (`restored`).
+Runs that share a process do not affect each other: each has its own view of the data, and the state of the process is
+restored after it (`restored`).
 """
 
 import contextlib
@@ -35,7 +36,7 @@ from ctsim.types import Scan, Status, Volume
 log = logging.getLogger(__name__)
 
 SCORED = ("ok", "diverged")  # a run's status
-WARM, WARM_UPS = 1.0, 5  # seconds that a warm-up lasts beyond compiling, where a method knows of time, and how often
+WARM, WARM_UPS = 1.0, 5  # for methods with a time limit: seconds of a warm-up, and how often it is repeated at most
 
 
 @dataclass(slots=True, kw_only=True)
@@ -43,7 +44,7 @@ class Outcome:
     """How a run ended: its status and reason, the volume [z, y, x] float32 in 1/mm if any, and its cost.
 
     `at_50kev` is the volume at 50 keV of a method that knows energies.
-    `intermediates` are what the method worked with, for pictures; `details` what it says of its result, for the record.
+    `intermediates` are arrays the method worked with, for pictures; `details` go into the record.
     """
 
     status: str
@@ -60,9 +61,9 @@ class Outcome:
 
 
 def scan_for(method: Method, stored: StoredScan, variant: str) -> Scan:
-    """Return the scan itself or its twin without metal; with the true mask where the method's is "oracle".
+    """Return the scan or its metal-free twin, with the true mask for a method of mask "oracle" (the twin's is empty).
 
-    Its arrays are nobody else's. Raises InputError where there is no twin. The twin's true mask is empty.
+    The arrays are not shared. Raises InputError where there is no twin.
     """
     found = stored if variant == METAL else stored.metal_free
     if found is None:
@@ -74,12 +75,12 @@ def scan_for(method: Method, stored: StoredScan, variant: str) -> Scan:
 
 
 def run_here(stored: StoredScan, variant: str, method: Method, warm_up_seconds: float) -> Outcome:
-    """Run a method in this process on a view of the scan that is its own; that it changed its input is its error."""
+    """Run a method in this process on its own view of the scan; a method that changes its input has failed."""
     try:
         scan = scan_for(method, stored, variant)
         outcome = attempt(method, scan, warm_up_seconds)
         parts = ", ".join(changed(scan, scan_for(method, stored, variant)))
-    except InputError as error:  # of the scan's files; a method's own are outcomes
+    except InputError as error:  # about the scan's files; a method's errors are outcomes
         return Outcome(status="error", reason=describe(error))
     if parts:
         what = f"the method changed its input ({parts}): expected it to work on a copy"
@@ -89,7 +90,7 @@ def run_here(stored: StoredScan, variant: str, method: Method, warm_up_seconds: 
 
 
 def skip(method: Method, stored: StoredScan, variant: str) -> Outcome | None:
-    """Ask a method why it would rather not run; None where it runs."""
+    """Ask a method whether it skips this scan; None where it runs."""
     try:
         scan = scan_for(method, stored, variant)
     except InputError as error:
@@ -99,13 +100,13 @@ def skip(method: Method, stored: StoredScan, variant: str) -> Outcome | None:
             reason = method.skip(scan)
     except KeyboardInterrupt:
         raise
-    except BaseException as error:  # the asked module is somebody else's
+    except BaseException as error:  # the module may be the user's
         return Outcome(status="error", reason=f"skip() failed: {describe(error)}")
     return None if reason is None else Outcome(status="skipped", reason=reason)
 
 
 def describe(error: BaseException) -> str:
-    """Say an exception in one line."""
+    """Describe an exception in one line."""
     if isinstance(error, SystemExit):
         return f"the method called for the process to exit (SystemExit: {error})"
     text = " ".join(str(error).split())
@@ -113,7 +114,7 @@ def describe(error: BaseException) -> str:
 
 
 def attempt(method: Method, scan: Scan, warm_up_seconds: float) -> Outcome:
-    """Run a method in this process and turn whatever happens into an outcome; only Ctrl-C is passed on."""
+    """Run a method in this process and return its outcome; of all exceptions only Ctrl-C is passed on."""
     outcome, usage, view_updates = Outcome(status="error"), None, 0
     try:
         with restored():
@@ -145,7 +146,7 @@ def attempt(method: Method, scan: Scan, warm_up_seconds: float) -> Outcome:
 
 
 def _check(volume: Any) -> None:
-    """Raise InputError unless a method returned a volume of real numbers that ended in a way that there is."""
+    """Raise InputError unless a method returned a volume of real numbers with a known status."""
     if not isinstance(volume, Volume):
         raise _NoVolume(f"the method returned a {_kind(volume)}, expected a ctsim.types.Volume")
     if not isinstance(volume.values, torch.Tensor):
@@ -157,7 +158,7 @@ def _check(volume: Any) -> None:
 
 
 class _NoVolume(InputError):
-    """What a method returned is no volume; the sentence says all."""
+    """A method did not return a volume; the message is the whole reason."""
 
 
 def _kind(value: object) -> str:
@@ -166,7 +167,7 @@ def _kind(value: object) -> str:
 
 
 def _read_at_50kev(outcome: Outcome, volume: Volume) -> None:
-    """Add the volume at 50 keV where the method knows energies; what goes wrong there is the run's failure."""
+    """Add the volume at 50 keV of a method that knows energies; an error there fails the run."""
     try:
         outcome.at_50kev = None if volume.at_energy is None else _array(volume.at_energy(REFERENCE_KEV))
     except KeyboardInterrupt:
@@ -177,15 +178,15 @@ def _read_at_50kev(outcome: Outcome, volume: Volume) -> None:
 
 
 def _failure(error: BaseException) -> Outcome:
-    """Return the outcome of a run that ended by an exception."""
-    # torch has an error of its own for devices
+    """Return the outcome of a run that raised `error`."""
+    # torch has its own error for devices
     out_of_memory = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
     reason = str(error) if isinstance(error, _NoVolume) else describe(error)
     return Outcome(status="out_of_memory" if out_of_memory else "error", reason=reason)
 
 
 def checked(outcome: Outcome, shape: tuple[int, int, int]) -> Outcome:
-    """Turn a volume of another shape into an error and one that is not finite into that status."""
+    """Set the status error for a volume of a wrong shape, nonfinite for values that are not finite."""
     for what, values in (("volume", outcome.values), ("volume at 50 keV", outcome.at_50kev)):
         if values is None or outcome.status not in SCORED:
             continue
@@ -198,16 +199,15 @@ def checked(outcome: Outcome, shape: tuple[int, int, int]) -> Outcome:
 
 
 def _array(volume: torch.Tensor) -> NDArray[np.float32]:
-    """Return a copy: a method may use its memory again while the twin's volume waits for the scan's."""
+    """Return a copy: a method may reuse its memory while the twin's volume is still needed."""
     return np.array(volume.detach().cpu().numpy(), np.float32)
 
 
 def warm_up(method: Method, scan: Scan) -> float:
     """Run the method on a tiny scan of the same kind, so that compiling is not timed; return its seconds.
 
-    A method that can be told how many seconds it may take gets one, again until it needs no more: what it did not get
-    to while it was compiled would be compiled in the timed run. It keeps nothing that a later run would go on from.
-    Its own complaint about the tiny scan is not its result and is only logged.
+    A method with a time limit runs for one second, repeatedly until it no longer compiles: code that it did not reach
+    would be compiled in the timed run. It writes no checkpoints. An error on the tiny scan is only logged.
     """
     told = {"seconds": WARM} if "seconds" in method.params else {}
     others = {name: value for name, value in method.overrides.items() if name != "checkpoints"}
@@ -230,9 +230,9 @@ def warm_up(method: Method, scan: Scan) -> float:
 def tiny(scan: Scan) -> Scan:
     """Return a scan of the first 8 views of `scan` and 8 whole slices of its volume.
 
-    The counts are a view into the scan's own and the slices keep their size, so that kernels are
-    compiled for the very types (dtype, layout, alignment; one tile or several) of the timed run. Of a
-    true mask the 8 slices with the most metal are kept, so that correcting it is compiled too.
+    The counts are a view into the scan's own and the slices keep their size, so that kernels are compiled for the types
+    of the timed run (dtype, layout, alignment; one tile or several). Of a true mask the 8 slices with the most metal
+    are kept, so that the correction is compiled too.
     """
     g = scan.geometry
     n = min(8, g.n_views)
@@ -254,9 +254,10 @@ Setting = tuple[Callable[[], Any], Callable[[Any], object]]
 
 @contextlib.contextmanager
 def restored() -> Iterator[None]:
-    """Put back, when the block ends, what a process has one of: the work folder, threads, defaults, random states.
+    """Restore the global state of the process when the block ends.
 
-    The environment and the filters of warnings are among it. What a block imports or starts stays.
+    That is: work folder, threads, defaults, random states, environment, warning filters. What a block imports or starts
+    stays.
     """
     settings = _settings()
     before, environment = [get() for get, _ in settings], dict(os.environ)
@@ -307,7 +308,7 @@ def _plain(state: Any) -> tuple[Any, ...]:
 
 
 def changed(scan: Scan, fresh: Scan) -> list[str]:
-    """Return the names of the parts of a scan that are not those of `fresh`, bit by bit."""
+    """Return the names of the fields of a scan that differ from those of `fresh` in any bit."""
     names = [field.name for field in dataclasses.fields(scan)]
     return [name for name in names if not _same(getattr(scan, name), getattr(fresh, name))]
 
@@ -317,7 +318,7 @@ def _same(one: Any, other: Any) -> bool:
         return type(one) is type(other) and one == other
     if one.dtype != other.dtype or one.shape != other.shape:
         return False
-    # a view at a time: the comparison takes an array of truths; as bytes: NaN is equal to itself
+    # view by view, since a comparison needs memory; as bytes, so that NaN equals itself
     pairs = zip(one.detach().numpy(), other.detach().numpy(), strict=True)
     return all(np.array_equal(_bytes(a), _bytes(b)) for a, b in pairs)
 

@@ -25,9 +25,9 @@ Row = tuple[str, str]
 Values = dict[tuple[str, Row], list[float | None]]
 """Numbers by scene and row, as in `SHOWN`."""
 MOST_TABLES = 2
-"""Tables below each other, into which scenes are parted; more scenes are averaged."""
+"""At most this many tables below each other; scenes that do not fit are averaged."""
 MOST_FAILURES = 10
-"""Runs that failed or were skipped and are named."""
+"""At most this many failed or skipped runs are named."""
 
 
 def text(records: Sequence[RunRecord], results: Path, data: Path) -> str:
@@ -49,7 +49,7 @@ def text(records: Sequence[RunRecord], results: Path, data: Path) -> str:
 
 
 def _failures(shown: Sequence[RunRecord]) -> list[str]:
-    """Say of the first runs that did not end well what they were and why, and how many more there are."""
+    """Name the first runs that did not end well, with reasons, and the number of the others."""
     bad = [f"{r.run.scene} ({r.run.variant}), {r.label}: {r.status} – {r.reason}" for r in shown if r.status != OK]
     more = len(bad) - MOST_FAILURES
     return [*bad[:MOST_FAILURES], *([f"{more} more runs failed or were skipped, see table.md"] if more > 0 else [])]
@@ -58,7 +58,7 @@ def _failures(shown: Sequence[RunRecord]) -> list[str]:
 def overview(shown: Sequence[RunRecord]) -> str:
     """Return PSNR3D, SSIM3D and seconds of every method on every scene, as text that fits the terminal.
 
-    Scenes stand side by side, in two tables where one is too narrow for all; of more scenes the mean over all is shown.
+    Scenes are columns, in two tables where one is too narrow; if two are, the mean over all scenes is shown.
     Numbers are means over noise seeds.
     """
     own = [record for record in shown if record.run.variant == METAL]

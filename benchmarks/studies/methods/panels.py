@@ -1,4 +1,4 @@
-"""One picture a scene: every method's volume in one window, its signed error on one scale, and what it worked with.
+"""One picture per scene: every method's volume in one window, its signed error on one scale, its intermediates.
 
 Rows are the reference and the methods. Columns are a slice normal to z and one normal to y, their errors against the
 effective-spectrum reference, and, where a method attached them (`.volumes`), the projection that
@@ -40,16 +40,16 @@ from ctsim.store import StoredScan
 
 PLANES = ((0, "z"), (1, "y"))
 TOP, ERROR = 2.5, 1.0
-"""The window ends at 2.5 times the median of the body, errors at once that: for soft tissue 1500 and ± 1000 HU."""
+"""Windows in medians of the body: volumes end at 2.5, errors at ± 1; for soft tissue 1500 and ± 1000 HU."""
 
 METAL, UNJUDGED = "#ffb000", "#8c8c8c"
 KEY = "ctsim shows"  # of the digest in a picture
-CELL, LABEL, DPI = 1.75, 1.1, 150  # inches, inches, dots an inch
+CELL, LABEL, DPI = 1.75, 1.1, 150  # inches, inches, dots per inch
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PanelRow:
-    """What is shown of one method: its name and scores, its volume [z, y, x] in 1/mm, and what it worked with."""
+    """The row of one method: its name and scores, its volume [z, y, x] in 1/mm, and its intermediates."""
 
     caption: str
     volume: NDArray[Any]
@@ -143,7 +143,7 @@ def _caption(record: RunRecord) -> str:
 
 
 def look_of(truth: Truth, measured: NDArray[Any] | None, shadow: NDArray[np.bool_], water: float | None) -> Look:
-    """Choose the windows from the truth and one measured view [v, u], beside the metal's shadow; none from a method."""
+    """Choose the windows from the truth and one measured view [v, u] outside the metal's shadow, not from a method."""
     reference, tissue = truth.references["effective"], truth.body & ~truth.near_metal
     middle = float(np.median(reference[tissue])) if tissue.any() else float(reference.max())
     middle = middle if middle > 0 else float(reference.max())

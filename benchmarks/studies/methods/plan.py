@@ -1,4 +1,4 @@
-"""Which runs there are: scans and methods as tasks, which of them are left, in what order, and what they will take."""
+"""The runs of the methods study: scans and methods as tasks, which are left to do, their order and cost."""
 
 import functools
 import pkgutil
@@ -24,10 +24,9 @@ OPEN = "ctsim.store:open_scan"
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One run to do: a scan (the twin without metal where `variant` says so) and a method.
+    """One run to do: a scan, or its metal-free twin by `variant`, and a method.
 
-    `scene` and `seed` are those of `repetition`; `place` are the numbers of the scan and of the method among those
-    asked for.
+    `scene` and `seed` come from `repetition`; `place` numbers the scan and the method among those asked for.
     """
 
     stored: StoredScan
@@ -40,7 +39,7 @@ class Job:
 
     @functools.cached_property
     def task(self) -> RunTask:
-        """What determines the result, and where a worker finds scan and method."""
+        """The task: what determines the result, and where a worker finds scan and method."""
         run = Run(
             scene=self.scene,
             scene_id=self.stored.scene_id,
@@ -75,7 +74,7 @@ def repetition(stored: StoredScan) -> tuple[str, int]:
 
 
 def jobs(scans: Sequence[StoredScan], chosen: Sequence[Method], *, anchor: bool) -> list[Job]:
-    """List every run: all methods on all scans; with `anchor` each on the metal-free twin first where there is one."""
+    """List every run: all methods on all scans; with `anchor` each first on the metal-free twin, if there is one."""
     found = []
     for i, stored in enumerate(scans):
         variants = (TWIN, METAL) if anchor and stored.metal_free is not None else (METAL,)
@@ -86,7 +85,7 @@ def jobs(scans: Sequence[StoredScan], chosen: Sequence[Method], *, anchor: bool)
 def jobs_on(
     stored: StoredScan, variants: Sequence[str], placed: Sequence[tuple[Method, tuple[int, int]]], open: str = OPEN
 ) -> list[Job]:
-    """List the runs of methods, each with its place, on a scan and on its twin, as `variants` say."""
+    """List the runs of methods, each with its place, on the given variants of a scan."""
     scene, seed = repetition(stored)
     return [
         Job(stored=stored, variant=variant, method=method, scene=scene, seed=seed, place=place, open=open)
@@ -96,7 +95,7 @@ def jobs_on(
 
 
 def job_of(task: RunTask) -> Job:
-    """Return a task with its scan and method."""
+    """Open the scan and the method of a task."""
     hints = task.hints
     stored = pkgutil.resolve_name(hints["open"])(Path(hints["folder"]))
     method = methods.find(hints["method"], hints["overrides"])
@@ -110,10 +109,10 @@ def job_of(task: RunTask) -> Job:
 
 
 def pending(tasks: Sequence[RunTask], records: Sequence[RunRecord], results: Path) -> list[RunTask]:
-    """Keep the tasks that have no record that ended well; a scan's kept volume is not asked for.
+    """Return the tasks without a record that ended well; a missing volume of a scan does not matter.
 
-    A scan that was scored without its twin's volume is run again where the twin is among the tasks. A twin is run
-    again where its scan is to be run and the twin's volume was not kept.
+    A scan that was scored without its twin is run again if the twin is among the tasks. A twin is run again if its scan
+    is to be run and the twin's volume was not kept.
     """
     known = done(records)
     alone = {r.task.identity for r in records if r.finished and lacks_twin(r.scores)}
@@ -131,7 +130,7 @@ def pending(tasks: Sequence[RunTask], records: Sequence[RunRecord], results: Pat
 
 
 class Costs:
-    """Seconds that runs took, from records of runs that ended well; without warm-up and scoring."""
+    """Seconds of recorded runs that ended well, without warm-up and scoring."""
 
     def __init__(self, records: Sequence[RunRecord]) -> None:
         self._seconds: dict[str, list[float]] = {}
@@ -140,14 +139,15 @@ class Costs:
                 self._seconds.setdefault(record.label, []).append(record.cost.wall)
 
     def method(self, label: str) -> float | None:
-        """Return the median of a method's seconds, None where it has never run."""
+        """Return the median of a method's seconds, None if it has never run."""
         return statistics.median(self._seconds[label]) if label in self._seconds else None
 
 
 def ordered(left: Sequence[RunTask], costs: Costs) -> list[tuple[RunTask, ...]]:
-    """Part runs into groups, a scan's after its twin's, so that a table soon has whole rows: cheap methods go first.
+    """Group runs, each scan after its twin, cheap methods first, so that the table soon has whole rows.
 
-    A method that has never run counts as dear as those before it in the methods table, which lists the cheap first.
+    A method that has never run counts as expensive as those before it in the methods table, which starts with the
+    cheap ones.
     """
     labels = sorted(dict.fromkeys(task.subject for task in left), key=rank)
     expected: dict[str, float] = {}

@@ -1,7 +1,7 @@
-"""What a run of a method is, what it leaves, and the record of both.
+"""Runs of methods, their results, and the records of both.
 
-Of a run that was recorded several times the last record that ended well counts, without one the last. Only this
-version of the protocols counts, and of a scene and seed only the newest data.
+Of several records of a run the last that ended well counts, else the last. Only records of this version of the
+protocols count, and of a scene and seed only those of the newest data.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ METAL, TWIN = "metal", "metal_free"
 
 
 class Cost(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a run took: seconds, bytes, views used times passes; the warm-up is not part of the times."""
+    """The cost of a run: seconds without warm-up, bytes, views used times passes."""
 
     wall: float
     cpu: float
@@ -34,7 +34,7 @@ class Cost(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class Run(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a run does: a scene's seed and recipe, a method ("module:function") with its parameters.
+    """A scene's seed and recipe, and a method ("module:function") with its parameters.
 
     `variant` is "metal" for the scan itself and "metal_free" for its twin; `mask` names the source of a metal mask
     ("none", "oracle", "auto").
@@ -50,19 +50,19 @@ class Run(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 
 class RunTask(Task, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A run as a task: `data` hashes the scan's files, `code` the method's sources, `version` is the protocols'.
+    """A run as a task: `data` hashes the scan's files, `code` the method's sources; `version` is that of the protocols.
 
-    `place` holds the numbers of the scan in its dataset and of the method in its command.
+    `place` numbers the scan in its dataset and the method in its command.
     """
 
     settings: Run  # pyright: ignore[reportGeneralTypeIssues, reportIncompatibleVariableOverride]
 
 
 class Result(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How a run ended: scores by protocol, cost, and the details that the method tells of its volume.
+    """How a run ended: scores by protocol, cost, and the details that the method gives of its volume.
 
-    `inputs` is what the method needs beside the counts; `files["volume"]` its kept volume; `data_code` hashes the code
-    of the simulator that made the scan (empty: unknown).
+    `inputs` is what the method needs in addition to the counts; `files["volume"]` its kept volume; `data_code` hashes
+    the code of the simulator that made the scan (empty: unknown).
     """
 
     inputs: str = ""
@@ -79,7 +79,7 @@ class RunRecord(Record[Result], frozen=True, kw_only=True, forbid_unknown_fields
 
     @property
     def run(self) -> Run:
-        """What was run."""
+        """The scene and the method of the run."""
         return self.task.settings
 
     @property
@@ -94,12 +94,12 @@ class RunRecord(Record[Result], frozen=True, kw_only=True, forbid_unknown_fields
 
     @property
     def reason(self) -> str:
-        """Why it ended so."""
+        """The reason of the status."""
         return self.found[0].reason
 
     @property
     def inputs(self) -> str:
-        """What the method needs beside the counts."""
+        """What the method needs in addition to the counts."""
         return self.found[0].inputs
 
     @property
@@ -109,7 +109,7 @@ class RunRecord(Record[Result], frozen=True, kw_only=True, forbid_unknown_fields
 
     @property
     def cost(self) -> Cost | None:
-        """What it took; None where it did not run."""
+        """The cost; None where it did not run."""
         return self.found[0].cost
 
     @property
@@ -119,7 +119,7 @@ class RunRecord(Record[Result], frozen=True, kw_only=True, forbid_unknown_fields
 
     @property
     def details(self) -> dict[str, Any]:
-        """What the method tells of its volume."""
+        """The details that the method gives of its volume."""
         return self.found[0].details
 
     @property
@@ -155,9 +155,9 @@ def read(results: Path) -> list[RunRecord]:
 
 
 def latest(records: Sequence[RunRecord]) -> list[RunRecord]:
-    """Keep what a table shows: of each scene, seed, variant and method label the run that was recorded last.
+    """Return the records that a table shows: the last of each scene, seed, variant and method label.
 
-    Their order is that of the dataset, of the methods table and of the command, whichever run ended first.
+    They are in the order of the dataset, of the methods table and of the command, not in that of the runs' ends.
     """
     data = {r.task.case: (r.run.scene_id, r.task.data) for r in records if r.task.version == VERSION}
     known = [r for r in records if data.get(r.task.case) == (r.run.scene_id, r.task.data) and r.task.version == VERSION]
@@ -175,12 +175,12 @@ def latest(records: Sequence[RunRecord]) -> list[RunRecord]:
 
 
 def rank(label: str) -> int:
-    """Return the place of a method in the methods table by its label; those outside come after all of it."""
+    """Return the place of a method in the methods table by its label; other methods come last."""
     return list(TABLE).index(name) if (name := label.partition("[")[0]) in TABLE else len(TABLE)
 
 
 def outdated(records: Sequence[RunRecord]) -> str:
-    """Say in one sentence how many records are of other protocol versions and in no table; "" if none is."""
+    """Say in one sentence how many records have other protocol versions and are left out; "" if none."""
     others = [r.task.version for r in records if r.task.version != VERSION]
     if not others:
         return ""
@@ -192,7 +192,7 @@ def outdated(records: Sequence[RunRecord]) -> str:
 
 
 def remarks(records: Sequence[RunRecord]) -> list[str]:
-    """Say, a sentence without its stop each, what tables of these records leave out and what they mix."""
+    """Say what tables of these records leave out and what they mix, each as a sentence without a full stop."""
     shown = latest(records)
     known = {r.task.data: r.data_code for r in shown if r.data_code}
     made = {f"{r.run.scene} (seed {r.run.seed})": known.get(r.task.data, "") for r in shown}

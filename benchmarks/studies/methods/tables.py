@@ -1,8 +1,8 @@
 """Tables from records: Markdown, CSV and LaTeX, one table a protocol, ranked within an input class.
 
-Nothing is computed anew. A cell is the mean ± standard deviation over noise seeds; a run that failed
-shows its status in place of numbers, and its reason below the tables. The numbers are made once for all tables of a
-command. A large table has a million of them: they are plain tuples, which the collector of garbage need not follow.
+No score is computed here. A cell is the mean ± standard deviation over noise seeds; a failed run shows its status in
+place of numbers, and its reason below the tables. The numbers are made once for all tables of a command. A large table
+has a million of them: they are plain tuples, which the garbage collector need not follow.
 """
 
 import csv
@@ -218,7 +218,7 @@ _NUMBER = re.compile(r"\d+\.\d+")
 def caption(records: Sequence[RunRecord], protocol: str) -> str:
     """State protocol, region, reference, alignment and data range of a table."""
     if protocol == "cost":
-        return "Protocol cost: seconds and peak resident memory of a run; compilation and first call stand apart."
+        return "Protocol cost: seconds and peak resident memory of a run; compilation and first call are not included."
     if protocol == "against":
         nmar = row_of(NMAR, (r.label for r in records if r.status == OK and r.run.variant == METAL))
         return (

@@ -1,8 +1,8 @@
-"""What a run keeps beside its record: its volumes, what it worked with for the pictures, and what it says of them.
+"""The files of a run: its volumes, and the intermediates for the pictures; and the details for its record.
 
-Volumes are TIFF stacks that name the run they came from. A method attaches what it worked with (a metal trace, bridged
-projections, a prior) to its volume, `Volume(..., details={"intermediates": {"view": 15, "trace": ...}})`; no score
-reads it. It is kept beside the volume as NAME.npz. The other details stand in the record.
+Volumes are TIFF stacks that name their run. A method attaches intermediates (a metal trace, filled projections, a
+prior) to its volume, `Volume(..., details={"intermediates": {"view": 15, "trace": ...}})`; no score reads them. They
+are kept next to the volume as NAME.npz. The other details go into the record.
 """
 
 import json
@@ -24,26 +24,26 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.tiffstack import write_all
 
-# what tifffile (TiffFileError is a ValueError) and JSON raise for files that are cut short or changed
+# raised by tifffile (TiffFileError is a ValueError) and JSON for files that are cut short or changed
 DAMAGED = (ValueError, LookupError, AttributeError, TypeError, RecursionError, struct.error)
 
 KEY = "intermediates"
 _RUN = "run"
 Intermediates = dict[str, NDArray[Any]]
 
-LONGEST = 10_000  # bytes of JSON of an entry that a record keeps
-ELSEWHERE = ("view_updates", KEY)  # details that a run keeps in its cost and beside its volume
+LONGEST = 10_000  # bytes of JSON; a record drops longer entries
+ELSEWHERE = ("view_updates", KEY)  # details that a run keeps in its cost and in a file
 
 
 def volume_name(task: RunTask) -> str:
-    """Return the path of a kept volume in the results folder: scene and method with what the file system allows."""
+    """Return the path of a kept volume in the results folder: scene and method in allowed characters."""
     label = "".join(c if c.isalnum() or c in "-.=" else "_" for c in task.subject)
     twin = "" if task.part == METAL else "__metal_free"
     return f"volumes/{task.hints['name']}{twin}__{label}.tif"
 
 
 def is_kept(task: RunTask, results: Path) -> bool:
-    """Whether the volume on the disk is this very run's, not one of other parameters, code or data."""
+    """Whether the volume on the disk is of this run, not of other parameters, code or data."""
     return identity_of(results / volume_name(task)) == task.identity
 
 
@@ -68,7 +68,7 @@ def write_volume(path: Path, values: NDArray[np.float32], identity: str = "") ->
 
 
 def keep(path: Path, values: NDArray[np.float32], at_50kev: NDArray[np.float32] | None, identity: str) -> None:
-    """Write a run's volume, and beside it the one at 50 keV; without one, that of an earlier run of this name goes."""
+    """Write a run's volume and its volume at 50 keV; without the latter, delete one of an earlier run of this name."""
     write_volume(path, values, identity)
     if at_50kev is None:
         at_50kev_of(path).unlink(missing_ok=True)
@@ -77,17 +77,17 @@ def keep(path: Path, values: NDArray[np.float32], at_50kev: NDArray[np.float32] 
 
 
 def at_50kev_of(path: Path) -> Path:
-    """Return where the volume at 50 keV of a kept volume's run lies."""
+    """Return the path of the volume at 50 keV of a kept volume's run."""
     return path.parent / "50kev" / path.name
 
 
 def own_at_50kev(path: Path, identity: str) -> Path | None:
-    """Return where the volume at 50 keV of a kept volume's run lies; None where that very run has none."""
+    """Return the path of the volume at 50 keV of this run; None where it has none."""
     return at_50kev_of(path) if identity_of(at_50kev_of(path)) == identity else None
 
 
 def identity_of(path: Path) -> str | None:
-    """Return the identity of the run that wrote `path`; None where there is no such volume or it does not say."""
+    """Return the identity of the run that wrote `path`; None where the file is missing or does not name it."""
     try:
         with tifffile.TiffFile(path) as file:
             found = json.loads(file.pages.first.description).get("run")
@@ -108,9 +108,9 @@ def map_volume(path: Path) -> NDArray[np.float32]:
 
 
 def read_volume(path: Path) -> NDArray[np.float32]:
-    """Read a kept volume [z, y, x] in 1/mm, which is not compressed: no more than the file holds.
+    """Read a kept volume [z, y, x] in 1/mm.
 
-    Raises InputError where the file is not there or no volume.
+    Raises InputError where the file is missing or not a volume.
     """
     try:
         values = np.array(map_volume(path))
@@ -145,7 +145,7 @@ def attached(details: Mapping[str, Any], geometry: Geometry) -> Intermediates:
 
 
 def intermediates_of(volume: Path) -> Path:
-    """Return where the intermediates of a kept volume lie."""
+    """Return the path of the intermediates of a kept volume."""
     return volume.with_suffix(".npz")
 
 
@@ -158,7 +158,7 @@ def write_intermediates(path: Path, found: Intermediates, identity: str) -> None
 
 
 def read_intermediates(path: Path, identity: str) -> Intermediates:
-    """Read the intermediates of a run; {} where it left none, or the file is another run's.
+    """Read the intermediates of a run; {} where there are none, or the file is of another run.
 
     Raises InputError where the file is damaged.
     """
@@ -174,9 +174,9 @@ def read_intermediates(path: Path, identity: str) -> Intermediates:
 def recordable(details: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of a volume's details that a record keeps: numbers, words, and lists and dicts of them.
 
-    An array, a tensor or any other object is left out, and so is an entry of more than `LONGEST` bytes. A list that
-    holds one is left out whole, for its places mean something; a dict loses that entry, and is left out where it loses
-    all. What is not finite becomes None.
+    Arrays, tensors and other objects are left out, and entries of more than `LONGEST` bytes. A list that holds one is
+    left out whole, since its positions have a meaning; a dict loses only that entry, and is left out if none remains.
+    Numbers that are not finite become None.
     """
     found: dict[str, Any] = {}
     for name, value in _entries(details).items():

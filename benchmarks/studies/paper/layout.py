@@ -21,7 +21,7 @@ _TIME = re.compile(r"(?:(\d+)h )?(?:(\d+)m )?(\d+)s")
 
 
 class What(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a table, a column or a row says of its runs."""
+    """The keys of a table, a column or a row about its runs."""
 
     suite: str = ""
     scene: str = ""

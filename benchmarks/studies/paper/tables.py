@@ -1,8 +1,8 @@
 """`run-benchmark paper-tables RESULTS...`: all tables of the paper, its own figures next to what was measured here.
 
-Ours come from the records of one or several results folders; nothing is computed. A record counts where it is of the
-very scene, of any seed, that the table plans; those of others of its name are counted below the table. A cell without a
-record is "–", and the command that makes it stands there, too.
+Our figures come from the records of one or several results folders; no score is computed. A record counts if its scene
+is the planned one, with any seed; records of other scenes of that name are counted below the table. A cell without a
+record is "–"; the command that makes the record is given below.
 """
 
 import functools
@@ -34,14 +34,14 @@ ABLATION = "ablation"
 
 @dataclass(frozen=True)
 class Flags:
-    """Print the paper's tables, its own figures beside ours from records, computing nothing."""
+    """Print the paper's tables: its figures next to ours, which are read from records."""
 
     results: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders with records of run-benchmark; of a run that is in several the newest counts."""
+    """Folders with records of run-benchmark; if a run is in several, the newest counts."""
     form: Form = "md"
     """Markdown or LaTeX (booktabs)."""
     protocol: Protocol = "paper"
-    """What ours are scored under; `paper` is nearest to what the paper may have done."""
+    """The protocol of our scores; `paper` is nearest to what the paper may have done."""
     table: Annotated[tyro.conf.UseAppendAction[tuple[int, ...]], tyro.conf.arg(metavar="N")] = ()
     """Only this table of the paper; may be given several times (default: all)."""
 
@@ -154,10 +154,10 @@ def _cell(layout: PaperTable, k: int, planned: Planned, measured: "Measured", pr
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measured:
-    """What the tables take from records: those that count of each planned scene and label, and their means over seeds.
+    """The records that count for each planned scene and label, and their means over seeds.
 
-    Scenes are called SUITE/NAME. `replaced` counts by scene the records of data that were made again since; `all` are
-    the records before, whose scenes have the names of the scans. `suites` are those that plan a scene, by its name.
+    Scenes are called SUITE/NAME. `replaced` counts by scene the records of data that was made again since; `all` are
+    all records, with the scans' names for scenes. `suites` are the suites that plan a scene, by its name.
     """
 
     runs: dict[tuple[str, str], list[RunRecord]]
@@ -168,7 +168,7 @@ class Measured:
 
     @classmethod
     def of(cls, found: Sequence[RunRecord], planned: Sequence[Planned]) -> "Measured":
-        """Keep what counts of records that are sorted by time."""
+        """Select from records that are sorted by time."""
         named: dict[str, dict[str, None]] = {}
         for p in planned:
             named.setdefault(p.scene, {})[p.suite] = None
@@ -186,14 +186,14 @@ class Measured:
 
 
 def _called(record: RunRecord, scene: str) -> RunRecord:
-    """Return a record whose scene has this name; the identity stays that of the run as it was."""
+    """Return a record with another scene name and the same identity."""
     run = msgspec.structs.replace(record.run, scene=scene)
     task = msgspec.structs.replace(record.task, settings=run, case=case_of(run))
     return msgspec.structs.replace(record, task=task)
 
 
 def _place(run: Run, named: dict[str, dict[str, None]]) -> str:
-    """Return which planned scene a run is of; "" where it has no more in common than the name."""
+    """Return the planned scene of a run; "" where only the name is the same."""
     of = (suite for suite in named.get(run.scene, ()) if run.scene_id in identities(suite, run.scene, run.seed))
     return next((f"{suite}/{run.scene}" for suite in of), "")
 
@@ -217,7 +217,7 @@ _scenes = functools.cache(suites.load)
 
 
 def strangers(measured: Measured, planned: Iterable[Planned]) -> list[str]:
-    """Say how many records have the scene's name and the label of a planned cell but are of no planned scene."""
+    """Say how many records have a planned cell's scene name and label, but come from another scene."""
     cells: dict[tuple[str, str], set[str]] = {}
     for p in planned:
         cells.setdefault((p.suite, p.scene), set()).add(p.label)
@@ -260,7 +260,7 @@ def caption(layout: PaperTable, used: list[RunRecord], protocol: str) -> str:
     parts.append("The phantoms differ from the paper's: orders and gains compare, values do not.")
     if layout.rank:
         where = {"down": "column", "across": "row"}[layout.rank]
-        parts.append(f"The best of a {where} is bold on either side, the second underlined, whatever its inputs.")
+        parts.append(f"The best of a {where} is bold on either side, the second underlined, for all inputs alike.")
     return " ".join(parts)
 
 
@@ -292,10 +292,10 @@ def _by(used: list[RunRecord], what: Callable[[RunRecord], str]) -> str:
 
 
 def _remarks(used: list[RunRecord], measured: Measured) -> list[str]:
-    """Say which runs failed and why, and how many records older data have left behind."""
+    """Say which runs failed and why, and how many records of older data are left out."""
     failed = [f"{r.run.scene}, {r.label}: {r.status} – {r.reason or 'no reason given'}" for r in used if r.status != OK]
     old = [s for s in dict.fromkeys(r.run.scene for r in used) if s in measured.replaced]
-    left = "records of older data are left out; the scan was made anew"
+    left = "records of older data are left out; the scan was made again"
     return failed + [f"{scene}: {measured.replaced[scene]} {left}" for scene in old]
 
 

@@ -1,8 +1,8 @@
 """What `run-benchmark peers` measures: path lengths, line integrals, a dataset and FDK; `poly` has the fifth case.
 
 Contenders of a case run in one process on the same number of threads, in turns (A B A B …), after an untimed run each.
-Seconds are those of whole sweeps over the views; what a contender can prepare once for a scene (bricks, pose matrices,
-permuted volumes) is prepared before.
+Times are of whole sweeps over the views. What a contender can prepare once for a scene (bricks, pose matrices, permuted
+volumes) is prepared before the clock starts.
 """
 
 import tempfile
@@ -134,7 +134,7 @@ def exact(setup: Setup, metal: str) -> list[Measurement]:
 
 
 def fdk(setup: Setup, metal: str) -> list[Measurement]:
-    """Measure FDK of exact line integrals at 50 keV; RMSE against the truth where every view sees the voxel."""
+    """Measure FDK of exact line integrals at 50 keV: RMSE against the truth in voxels that every view sees."""
     scene = Rods(setup, metal)
     geometry, truth = scene.geometry, scene.volume
     p = scene.integrals(scene.phantom).astype(np.float32)
@@ -154,9 +154,9 @@ def fdk(setup: Setup, metal: str) -> list[Measurement]:
 
 
 def paper(setup: Setup, scene: str) -> list[Measurement]:
-    """Measure a scene of the suite `paper` by make-dataset in a process of its own, start included.
+    """Measure make-dataset on a scene of the suite `paper`, in a process of its own, start included.
 
-    The scene of the suite `quick` goes before, so that kernels are compiled and cached.
+    The scene of the suite `quick` is made first, so that kernels are compiled and cached.
     """
     with tempfile.TemporaryDirectory(prefix="ctsim-peers-") as folder:
         seconds, peak = [], 0
@@ -180,10 +180,10 @@ CASES: dict[str, Callable[[Setup, str], list[Measurement]]] = {f.__name__: f for
 
 
 def measure(task: Task, given: Flags) -> list[Measurement]:
-    """Measure a case on all of its scenes."""
+    """Measure a case on all its scenes."""
     host.use_threads(task.settings["threads"])
     case = finding.case(task.case)
-    runs = {"repeats": given.repeats, "threads": host.host().threads}  # which may be fewer than asked for
+    runs = {"repeats": given.repeats, "threads": host.host().threads}  # the machine may have fewer than asked for
     setup = Setup(case=case, side=SIDES[task.part], versions=versions(task), **runs)
     out: list[Measurement] = []
     for name in case.scenes or case.metals:

@@ -1,4 +1,4 @@
-"""What `run-benchmark peers` compares: the catalogue `peers.toml` next to it, and what a contender reaches."""
+"""What `run-benchmark peers` compares: the catalogue `peers.toml`, and the measurement of a contender."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -14,7 +14,7 @@ from ctsim.errors import InputError
 from ctsim.phantoms.suites import decode, parse_toml
 
 OURS = "ctsim"
-MEASURED = RTK, XCIST = "itk-rtk", "xcist"  # the catalogue's peers that there is code for
+MEASURED = RTK, XCIST = "itk-rtk", "xcist"  # peers of the catalogue that this command has code for
 FULL, SMALL = "full", "small"
 SIDES = {FULL: 256, SMALL: 32}  # of grids and detectors
 Name = Annotated[str, msgspec.Meta(min_length=1)]
@@ -22,9 +22,9 @@ Seconds = Annotated[float, msgspec.Meta(ge=0)]
 
 
 class Case(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A case: on which scenes, or on rods of which metals, in how many views, and with which peers.
+    """A case: its scenes, or the metals of its rods, the number of views, and the peers.
 
-    `turn` and `rest` are seconds expected on full grids, see the file.
+    `turn` and `rest` are the seconds expected on full grids; `peers.toml` explains them.
     """
 
     name: Name
@@ -38,7 +38,7 @@ class Case(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class Peer(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A library that does what a case measures: how it is found, how it is installed, and whether it needs a GPU."""
+    """Another library: how to find it, how to install it, and whether it needs a GPU."""
 
     name: Name
     distribution: Name
@@ -48,7 +48,7 @@ class Peer(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     @property
     def version(self) -> str | None:
-        """Its version, None where it is not installed."""
+        """Its version, None if it is not installed."""
         if self.module and util.find_spec(self.module) is None:
             return None
         try:
@@ -58,12 +58,12 @@ class Peer(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     @property
     def absence(self) -> str:
-        """The sentence that says that it is not there, and how to install it."""
+        """The sentence that it is not installed, and how to install it."""
         return f"{self.distribution} is not installed ({self.install}{'; needs an NVIDIA GPU' if self.gpu else ''})"
 
 
 class Catalogue(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The whole file: names differ, and each case has scenes or metals, and peers that are listed."""
+    """The whole file. Checks that names differ, and that each case has scenes or metals, and listed peers."""
 
     case: tuple[Case, ...]
     peer: tuple[Peer, ...]
@@ -81,7 +81,7 @@ class Catalogue(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 def parse(text: str, where: str) -> Catalogue:
-    """Read a catalogue from TOML text; `where` names the file in messages. Raises InputError where it is none."""
+    """Read a catalogue from TOML text; `where` names the file in messages. Raises InputError where it is invalid."""
     return decode(parse_toml(text, where), Catalogue, where)
 
 
@@ -93,7 +93,7 @@ def load() -> Catalogue:
 
 
 def case(name: str) -> Case:
-    """Return a case of the bundled catalogue. Raises InputError naming those there are."""
+    """Return a case of the bundled catalogue. Raises InputError with the known names."""
     cases = {case.name: case for case in load().case}
     if name not in cases:
         raise InputError(f"there is no case {name!r}: expected one of {', '.join(cases)}")
@@ -106,11 +106,11 @@ def installed() -> dict[str, str]:
 
 
 class Measurement(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What one contender reaches on one scene.
+    """The measurement of one contender on one scene.
 
-    `seconds` has its timed runs, of `views` views each; `warm_up` is the first call; `error` is what `error_kind`
-    says; `peak_bytes` the resident memory of a process that does only this. `skipped` says, with a `reason`, that the
-    contender takes no part.
+    `seconds` has its timed runs, of `views` views each; `warm_up` is the first call; `error_kind` defines `error`;
+    `peak_bytes` is the resident memory of a process that does only this. `skipped`, with a `reason`, says that the
+    contender does not take part.
     """
 
     scene: str = "all"
@@ -171,7 +171,7 @@ class Setup:
         }
 
     def left_out(self) -> list[Measurement]:
-        """Return rows for the peers that are not measured: how to install them, or that there is no code for them."""
+        """Return rows for the peers that are not measured, each with the reason."""
         out = []
         for peer in load().peer:
             if peer.name in self.case.peers and not self.measures(peer.name):

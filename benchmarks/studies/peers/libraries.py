@@ -1,14 +1,14 @@
 """Other libraries behind a few functions, as `run-benchmark peers` measures them; each is loaded when it is set up.
 
 RTK (the PyPI package itk-rtk): Joseph's forward projector and FDK. Volumes and projections are ours, [z, y, x] and
-[view, v, u] in mm, permuted by `ctsim.interop`. What RTK wants prepared (its axis order, its pose matrices) is prepared
-when a `Rtk` is made, before any clock runs. Rit et al., J. Phys. Conf. Ser. 489, 2014,
+[view, v, u] in mm, permuted by `ctsim.interop`. What RTK needs (its axis order, its pose matrices) is prepared when a
+`Rtk` is made, before the clock starts. Rit et al., J. Phys. Conf. Ser. 489, 2014,
 doi:10.1088/1742-6596/489/1/012079.
 
 XCIST (the PyPI package gecatsim): polychromatic P of voxel volumes. A view goes through XCIST's own stages (gantry,
 voxelised distance-driven projector, energy-integrating detection) with one source point, one sub-view, no noise and no
 scatter; reading the phantom and the open beam are prepared when an `Xcist` is made. Spectrum and attenuation are the
-caller's, so that P is the same quantity as every contender's. Wu et al., Phys. Med. Biol. 67, 2022,
+caller's, so that P is the same quantity for all contenders. Wu et al., Phys. Med. Biol. 67, 2022,
 doi:10.1088/1361-6560/ac9174.
 """
 
@@ -34,7 +34,7 @@ from ctsim.interop import Library, angles_to, volume_from, volume_to
 AXES = (1, 0, 2)  # RTK's x, y, z are our y, z, x
 _MODELS = ("detector", "source", "gantry", "ray_angles", "filters", "flux", "phantom")
 _STAGES = ("RunModels", "C_Projector_Voxelized", "Detection_EI")
-_NEVER = -1  # a view number that no view has: XCIST prepares at its first view and frees its memory at its last
+_NEVER = -1  # not a view's number: XCIST prepares at its first view and frees its memory at its last
 
 
 class Rtk:
@@ -115,9 +115,9 @@ class Rtk:
 class Xcist:
     """XCIST set up for one circular scan, with its phantom loaded.
 
-    `volumes` are volume shares [z, y, x] on the geometry's grid, one a material; `mu` [bin, material] is
+    `volumes` are volume shares [z, y, x] on the geometry's grid, one per material; `mu` [bin, material] is
     1/mm, `energies` [bin] keV, `weights` [bin] the shares of the signal of the open beam. The library holds one
-    phantom a process, so that making another `Xcist` ends the one before.
+    phantom per process, so making another `Xcist` closes the previous one.
     Raises InputError for poses, voxels that are not square in x and y, and a detector shifted along u.
     """
 
@@ -146,7 +146,7 @@ class Xcist:
             self._cfg.phantom.filename = _write_phantom(Path(folder), geometry, volumes)
             self._open = self._first_views()
         Xcist._loaded = self
-        # theirs is from another table of cross-sections, and knows materials by other compositions
+        # XCIST's own attenuation has other cross-sections and compositions
         self._cfg.clib.set_material_info_vox(len(volumes), len(energies), table)
 
     def project(self) -> NDArray[np.float32]:
@@ -158,12 +158,12 @@ class Xcist:
     def close(self) -> None:
         """Free the library's phantom."""
         if Xcist._loaded is self:
-            self._cfg.sim.stopViewId = 0  # it frees after the view that it takes for the last
+            self._cfg.sim.stopViewId = 0  # it frees its memory after the view it takes for the last
             self._view(0)
             Xcist._loaded = None
 
     def _first_views(self) -> NDArray[np.float32]:
-        """Run what XCIST does once, with a view of the open beam, which is returned [v, u]; load the phantom."""
+        """Do XCIST's one-time work, load the phantom, and return a view of the open beam [v, u]."""
         sim = self._cfg.sim
         sim.startViewId, sim.stopViewId, sim.isPhantomScan = 0, _NEVER, False
         opened = self._view(0)
@@ -173,14 +173,14 @@ class Xcist:
         return opened
 
     def _view(self, k: int) -> NDArray[np.float32]:
-        """Return the signal of one view, [v, u]: the body of XCIST's loop over views, less its files."""
+        """Return the signal of one view, [v, u]: the body of XCIST's loop over views, without its files."""
         cfg, (n_v, n_u) = self._cfg, self.geometry.n_detector
-        # theirs is in degrees from +y counter-clockwise, seen from +z
+        # XCIST counts degrees from +y, counter-clockwise seen from +z
         cfg.protocol.startAngle = float(np.degrees(self.geometry.angles[k])) - 90.0
-        self._run_models(cfg, k, 0, _MODELS)  # after the first view the gantry alone, all else stays
+        self._run_models(cfg, k, 0, _MODELS)  # after the first view only the gantry moves
         cfg.thisSubView = copy.copy(cfg.detFlux)
         lit = self._project(cfg, k, 0) if cfg.sim.isPhantomScan else cfg
-        # theirs runs down columns, and along −u
+        # XCIST's order is by columns, along −u
         return np.asarray(self._detect(lit, k, 0).thisView, np.float32).reshape(n_u, n_v).T[:, ::-1]
 
 
@@ -207,7 +207,7 @@ def _undisturbed() -> Iterator[None]:
 
 
 def _configure(cfg: Any, geometry: Geometry, energies: NDArray[np.float64], weights: NDArray[np.float64]) -> None:
-    """Set the scanner, the physics and the scan in XCIST's terms, with photons that times energy are the weights."""
+    """Set scanner, physics and scan in XCIST's terms; photons times energy are the weights."""
     (n_v, n_u), (d_v, d_u) = geometry.n_detector, geometry.d_detector
     cfg.spec.nEbin = len(energies)
     cfg.spec.Evec = cfg.sim.Evec = np.asarray(energies, np.float32)
@@ -231,11 +231,11 @@ def _write_phantom(folder: Path, geometry: Geometry, volumes: Sequence[NDArray[n
     """Write volumes as XCIST's voxelised phantom, rows from +y down; return the path of its JSON file."""
     for k, volume in enumerate(volumes):
         np.ascontiguousarray(volume[:, ::-1], np.float32).tofile(folder / f"{k}.raw")
-    # any material that it knows will do, since the attenuation is replaced
+    # any material it knows: the attenuation is replaced
     each: dict[str, object] = {"mat_name": "water", "volumefractionmap_datatype": "float"}
     axes = zip("zyx", ("slices", "rows", "cols"), geometry.n_voxel, geometry.d_voxel, geometry.off_origin, strict=True)
     for axis, count, n, d, offset in axes:
-        # the offset is that of the isocentre, counted from 1
+        # offset of the isocentre, counted from 1
         each |= {count: n, f"{axis}_size": d, f"{axis}_offset": (n + 1) / 2 - offset / d}
     phantom = {name: [value] * len(volumes) for name, value in each.items()} | {
         "n_materials": len(volumes),

@@ -1,6 +1,6 @@
-"""The case `poly` of `run-benchmark peers`: polychromatic projections, against what a pixel of finite size measures.
+"""The case `poly` of `run-benchmark peers`: polychromatic projections, against the signal of a pixel of finite size.
 
-It loads no torch, which would count in a contender's peak memory.
+A module of its own, since it must not load torch, which would count in a contender's peak memory.
 """
 
 import contextlib
@@ -36,7 +36,7 @@ Run = Callable[[], NDArray[np.float32]]
 
 
 def eighty_bins(rule: EnergyRule) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gather a fine spectrum in at most 80 equal bins: mean energy (keV) and signal share of each."""
+    """Sum a fine spectrum in at most 80 equal bins; return the mean energy (keV) and signal share of each."""
     bins = np.linspace(rule.energies[0], rule.energies[-1], BINS + 1)
     of = np.clip(np.searchsorted(bins, rule.energies, side="right") - 1, 0, BINS - 1)
     share = np.bincount(of, rule.w1, BINS)
@@ -58,7 +58,7 @@ class Contenders:
         return peers[name]() if name in peers else self.ours(voxels="voxels" in name)
 
     def ours(self, *, voxels: bool) -> Run:
-        """Prepare our measurement, the body in voxels or analytic as the metal always is."""
+        """Prepare our measurement: metal analytic, the body in voxels or analytic."""
         metal = tuple(s for s in self.phantom.solids if s.metal)
         phantom = voxelised(self.phantom, self.geometry, metal) if voxels else self.phantom
         rule = make_plan(phantom, self.scanner, Simulation(tolerance=1e-4), Truth(twin=False), "peers").rule
@@ -116,7 +116,7 @@ def poly(setup: Setup, scene: str) -> list[Measurement]:
 
 
 def _alone(setup: Setup, scene: str, name: str) -> int | None:
-    """Measure the peak memory in a process of its own; None where that died."""
+    """Measure the peak memory in a process of its own; None if that died."""
     with Process() as process, contextlib.suppress(Stopped):
         return process.run(peak, setup, scene, name)
 
@@ -124,7 +124,7 @@ def _alone(setup: Setup, scene: str, name: str) -> int | None:
 def peak(setup: Setup, scene: str, name: str) -> int:
     """Prepare a contender; return the peak resident memory (bytes) while it runs twice.
 
-    It holds the interpreter and the libraries that are loaded, and the contender's volumes.
+    It includes the interpreter, the loaded libraries and the contender's volumes.
     """
     host.use_threads(setup.threads)
     run = Contenders(setup, scene).prepare(name)
