@@ -77,7 +77,7 @@ class Command:
 def in_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the study of skipping compare nothing with nothing, here."""
     nothing = Pair(scene="s", what="w", skipping=float, whole=float, difference=lambda a, b: a - b, unit="P")
-    monkeypatch.setattr(Skipping, "apart", False)
+    monkeypatch.setattr(Skipping, "isolated", False)
     for case in list(simulator.CASES):
         monkeypatch.setitem(simulator.CASES, case, lambda setup: iter([nothing]))
 
@@ -86,7 +86,7 @@ def timed_in_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the study of run times find one mark of FDK, on scans that are not there, here."""
     mark = pareto_finding.Mark(label="defaults", seconds=0.5, values={"rmse": 0.1, "psnr3d": 30.0}, default=True)
     run = pareto_finding.TimedRun(marks=(mark,))
-    monkeypatch.setattr(Pareto, "apart", False)
+    monkeypatch.setattr(Pareto, "isolated", False)
     monkeypatch.setattr(Pareto, "prepare", lambda self, given: None)
     monkeypatch.setattr(pareto_measure, "measure", lambda task, given: [run])
     monkeypatch.setattr(methods_run, "fdk_seconds", lambda geometry: 1.0)
@@ -116,7 +116,7 @@ def three_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     def measure(self: Stress, task: Any, given: Any) -> list[Judged]:
         return [Judged(found="nothing", seconds={"row": (0.5,)})]
 
-    monkeypatch.setattr(Stress, "apart", False)
+    monkeypatch.setattr(Stress, "isolated", False)
     monkeypatch.setattr(Stress, "limit", lambda self, task, given: None if given.seconds == 120 else given.seconds)
     monkeypatch.setattr(Stress, "rows", lambda self, given: rows)
     monkeypatch.setattr(Stress, "measure", measure)
@@ -431,7 +431,7 @@ def test_what_a_task_raises_ends_the_command_and_keeps_what_is_finished(tiny, tm
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [tiny_study.Apart, tiny_study.Tiny])
+@pytest.mark.parametrize("kind", [tiny_study.Isolated, tiny_study.Tiny])
 def test_a_task_that_hangs_or_dies_is_a_row_and_costs_no_other(tiny, tmp_path, capsys, kind):
     assert tiny(tmp_path, "slow good dies better", "--seconds", "4", kind=kind) == 1
     assert found(tmp_path) == [

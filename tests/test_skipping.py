@@ -41,7 +41,7 @@ def run(tmp_path_factory):
 @pytest.fixture
 def here(monkeypatch):
     """Cases are measured in this process, where they can be replaced."""
-    monkeypatch.setattr(skipping.Skipping, "apart", False)
+    monkeypatch.setattr(skipping.Skipping, "isolated", False)
 
 
 def small(tmp_path):

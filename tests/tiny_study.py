@@ -56,10 +56,10 @@ class Tiny(study.Study):
         return [simple(["case", "status", "reason", "value"], rows, title="Tiny")]
 
 
-class Apart(Tiny):
+class Isolated(Tiny):
     """Measures in a process of its own."""
 
-    apart = True
+    isolated = True
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -72,7 +72,7 @@ class Study(Generic[R, G]):
 
     `name` is the command's word, `file` the name of its records, `unit` its word for a task. `kind` is the type of an
     outcome, `record` the type of a record. `work` names a function `work(task, given) -> Sequence[kind]` as
-    "module:function"; it is imported where it runs. With `apart` every task has a process of its own, also without a
+    "module:function"; it is imported where it runs. With `isolated` every task has a process of its own, also without a
     time limit. With `rounds` every task is measured once a round, so that all see the same drift of the machine. With
     `follows` the tables are also written while tasks are measured. `estimate` says what the seconds of --dry-run leave
     out.
@@ -82,7 +82,7 @@ class Study(Generic[R, G]):
     file: ClassVar[str]
     unit: ClassVar[str] = "task"
     work: ClassVar[str]
-    apart: ClassVar[bool] = False
+    isolated: ClassVar[bool] = False
     rounds: ClassVar[bool] = False
     follows: ClassVar[bool] = False
     estimate: ClassVar[str] = "without compiling"
@@ -333,7 +333,7 @@ def _rounds(groups: Sequence[tuple[Task, ...]]) -> list[list[tuple[Task, ...]]]:
 
 @contextlib.contextmanager
 def _measuring(study: Study[R, G], given: G) -> Iterator[Callable[[Task], R]]:
-    """Yield a function that measures a task and returns its record: here, or in another process (see `apart`).
+    """Yield a function that measures a task and returns its record: here, or in another process (see `isolated`).
 
     The other process serves all tasks, so kernels are compiled once. Its temporary files are removed at the end.
     """
@@ -342,7 +342,7 @@ def _measuring(study: Study[R, G], given: G) -> Iterator[Callable[[Task], R]]:
     def record(task: Task) -> R:
         limit = study.limit(task, given)
         try:
-            if limit is None and not study.apart:
+            if limit is None and not study.isolated:
                 return record_of(study, task, study.measure(task, given))
             return record_of(study, task, process.run(study.measure, task, given, seconds=limit))
         except Stopped as end:

@@ -43,7 +43,7 @@ class Pareto(study.Study[Record[TimedRun], Flags]):
     unit = "run"
     kind, record, flags = TimedRun, Timed, Flags
     work = "ctsim.benchmarks.studies.pareto.measure:measure"
-    apart = rounds = True
+    isolated = rounds = True
     estimate = "without compiling, planning and the reference"
 
     def check(self, given: Flags) -> None:

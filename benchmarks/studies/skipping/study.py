@@ -72,7 +72,7 @@ class Skipping(study.Study[Record[Skip], Flags]):
     unit = "case"
     kind, record, flags = Skip, Record[Skip], Flags
     work = "ctsim.benchmarks.studies.skipping.methods:measure"
-    apart = True
+    isolated = True
     estimate = "without compiling and preparing (a minute for all cases)"
 
     def tasks(self, given: Flags) -> list[Task]:

@@ -189,7 +189,7 @@ class Stress(study.Study[Record[Judged], Flags]):
     unit = "row"
     kind, record, flags = Judged, StressRecord, Flags
     work = "ctsim.benchmarks.studies.stress.worker:judge"
-    apart = True
+    isolated = True
     estimate = "on one idle core, without compiling (a minute)"
 
     def __init__(self) -> None:
