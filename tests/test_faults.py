@@ -194,7 +194,8 @@ def test_make_dataset_survives_kills_of_a_clusters_workers(bench, tmp_path):
                 if ended.wait(0.002):
                     return
             kills.append(rng.choice([nanny.pid for nanny in cluster.workers.values() if nanny.pid]))
-            os.kill(kills[-1], signal.SIGKILL)
+            with contextlib.suppress(ProcessLookupError):  # it was killed before, and its nanny has not seen it yet
+                os.kill(kills[-1], signal.SIGKILL)
             time.sleep(0.1)  # else all are killed for one count
 
     with LocalCluster(

@@ -162,7 +162,7 @@ def test_an_infinite_value_and_a_missing_refusal_are_found():
 class Here(Ends):
     """Three rows, carried out in this process and counted."""
 
-    apart, ran, sources = False, 0, "these"
+    isolated, ran, sources = False, 0, "these"
 
     def rows(self, given):
         return catalogue("fine", "wrong", "raising", code=Here.sources)
