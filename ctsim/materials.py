@@ -290,6 +290,25 @@ def compton(which: str | Material, energies: ArrayLike) -> tuple[NDArray[np.floa
     return 0.1 * m.density * total, given / total
 
 
+def scattering_function(
+    which: str | Material, momentum_transfer: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the incoherent scattering function per electron [n] and the squared form factor per atom [n], of a mixture.
+
+    `momentum_transfer` is q = sin(θ/2)/λ in 1/Å. The first goes from 0 to 1 with q; the second is in units of its own,
+    since only its shape is used: the size is in the attenuation.
+    """
+    xrl = _xraylib()
+    incoherent, squared, electrons = (np.zeros(momentum_transfer.size) for _ in range(3))
+    for z, w in _mass_fractions(_as_material(which).formula):
+        atoms = w / xrl.AtomicWeight(z)
+        electrons += atoms * z
+        q = momentum_transfer.tolist()
+        incoherent += atoms * np.array([xrl.SF_Compt(z, v) if v > 0 else 0.0 for v in q])
+        squared += atoms * np.array([xrl.FF_Rayl(z, v) for v in q]) ** 2
+    return incoherent / electrons, squared
+
+
 def k_vacancies(which: str | Material, energies: ArrayLike) -> dict[int, NDArray[np.float64]]:
     """Return, per element with a K shell, the attenuation (1/mm) [n] that leaves a K vacancy."""
     m, e = _as_material(which), _as_energies(energies)

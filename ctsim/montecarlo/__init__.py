@@ -1,0 +1,1 @@
+"""Photon Monte Carlo: scatter images and absorbed energy in the phantoms that the simulator projects."""

@@ -1,0 +1,1 @@
+"""Compiled code of the photon Monte Carlo, and its float64 references."""

@@ -1,0 +1,408 @@
+"""Photons through bricks and solids: Woodcock tracking with a majorant for each block, compiled.
+
+A photon flies through blocks of voxels. In a block it meets tentative collisions at the rate of the block's greatest
+attenuation, and one is real with the share that the material at its place has of it (Woodcock 1965). Random numbers
+are Philox blocks of the history's own number, so a history depends on nothing but itself; histories are summed in
+`CHUNKS` fixed parts, so that sums are bitwise equal for any number of threads.
+"""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from ctsim.kernels.bricks_cpu import CELLS, CODE_BITS, MIXED, SIDE, walk
+from ctsim.kernels.noise_cpu import philox
+from ctsim.kernels.raytrace_cpu import _paint
+from ctsim.kernels.solids_cpu import inside, intersect
+
+CHUNKS = 64
+E_MIN, PER_STEP = 1.0, 10.0  # as in `ctsim.montecarlo.tables`: keV, energy steps per keV
+REST, HC = 510.998950, 12.3984198
+CUT = 2.0  # keV; a photon below it stays where it is
+FARTHEST = 1e30
+_LOW, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
+PRIMARY, SINGLE, MULTIPLE = 0, 1, 2
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _start(rng, key, history):
+    rng[0], rng[1], rng[2], rng[3] = np.uint64(4), history & _LOW, history >> _32, np.uint64(0)
+    rng[4], rng[5] = key & _LOW, key >> _32
+
+
+@njit(cache=True, error_model="numpy")
+def _uniform(rng):
+    """Return a random number within (0, 1)."""
+    i = rng[0]
+    if i == np.uint64(4):
+        rng[6], rng[7], rng[8], rng[9] = philox(rng[1], rng[2], rng[3], np.uint64(1), rng[4], rng[5])
+        rng[3] += np.uint64(1)
+        i = np.uint64(0)
+    rng[0] = i + np.uint64(1)
+    return (float(rng[np.int64(i) + 6]) + 0.5) * 2.0**-32
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _label(code, slot, pool, density, grid, x, y, z):
+    """Return the label of a place in the volume and its relative density; 0 outside."""
+    i, j, k = (x - grid[6]) * grid[3], (y - grid[7]) * grid[4], (z - grid[8]) * grid[5]
+    label, relative = 0, 1.0
+    if 0 <= i < grid[0] and 0 <= j < grid[1] and 0 <= k < grid[2]:
+        ix, iy, iz = int(i), int(j), int(k)
+        bz, by, bx = iz // SIDE, iy // SIDE, ix // SIDE
+        label = np.int64(code[0, bz, by, bx] & CODE_BITS)
+        if label == MIXED:
+            cell = np.int64(slot[bz, by, bx]) * CELLS + ((iz % SIDE) * SIDE + iy % SIDE) * SIDE + ix % SIDE
+            label = np.int64(pool[cell])
+            if density.size > 0:
+                relative = density[cell]
+    return label, relative
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _material(volume, prims, first, listed, block, x, y, z):
+    """Return the material at a place and its relative density; solids replace the volume, later ones earlier ones."""
+    for n in range(first[block + 1] - 1, first[block] - 1, -1):
+        if inside(prims[listed[n]], x, y, z):
+            return np.int64(prims[listed[n], 1]), 1.0
+    return _label(volume[0], volume[1], volume[2], volume[3], volume[4], x, y, z)
+
+
+@njit(cache=True, error_model="numpy")
+def _fly(volume, prims, blocks, mu, energy, ray, rng):
+    """Move a photon to its next collision; return the material, its three attenuations, or -1 where it leaves."""
+    kind, most, first, listed, frame = blocks
+    mz, my, mx = kind.shape
+    x, y, z, dx, dy, dz = ray[0], ray[1], ray[2], ray[3], ray[4], ray[5]
+    ix = 1.0 / dx if abs(dx) > 1e-12 else FARTHEST
+    iy = 1.0 / dy if abs(dy) > 1e-12 else FARTHEST
+    iz = 1.0 / dz if abs(dz) > 1e-12 else FARTHEST
+    lx, ly, lz, wx, wy, wz = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
+    ux, uy, uz = ix > 0, iy > 0, iz > 0
+    t = max(0.0, max((lx if ux else lx + mx * wx) - x, 0.0) * ix if ux else min((lx + mx * wx) - x, 0.0) * ix)
+    t = max(t, max(ly - y, 0.0) * iy if uy else min((ly + my * wy) - y, 0.0) * iy)
+    t = max(t, max(lz - z, 0.0) * iz if uz else min((lz + mz * wz) - z, 0.0) * iz)
+    # a hair inside, so that the block is the one that is entered
+    px, py, pz = x + dx * t - lx, y + dy * t - ly, z + dz * t - lz
+    slack = 1e-9
+    if px < -slack or py < -slack or pz < -slack or px > mx * wx + slack or py > my * wy + slack or pz > mz * wz + slack:
+        return -1, 0.0, 0.0, 0.0
+    bx = min(max(int(px / wx), 0), mx - 1)
+    by = min(max(int(py / wy), 0), my - 1)
+    bz = min(max(int(pz / wz), 0), mz - 1)
+    sx, sy, sz = (1 if ux else -1), (1 if uy else -1), (1 if uz else -1)
+    tx = (lx + (bx + (1 if ux else 0)) * wx - x) * ix
+    ty = (ly + (by + (1 if uy else 0)) * wy - y) * iy
+    tz = (lz + (bz + (1 if uz else 0)) * wz - z) * iz
+    jx, jy, jz = wx * abs(ix), wy * abs(iy), wz * abs(iz)
+    place = (energy - E_MIN) * PER_STEP
+    i = int(place)
+    part = place - i
+    left = -math.log(_uniform(rng))
+    while True:
+        rate = most[kind[bz, by, bx], i]
+        near = min(tx, min(ty, tz))
+        if rate * (near - t) < left:
+            left -= rate * max(near - t, 0.0)
+            t = max(near, t)
+            if tx == near:
+                bx += sx
+                tx += jx
+                if bx < 0 or bx >= mx:
+                    return -1, 0.0, 0.0, 0.0
+            elif ty == near:
+                by += sy
+                ty += jy
+                if by < 0 or by >= my:
+                    return -1, 0.0, 0.0, 0.0
+            else:
+                bz += sz
+                tz += jz
+                if bz < 0 or bz >= mz:
+                    return -1, 0.0, 0.0, 0.0
+            continue
+        t += left / rate
+        px, py, pz = x + dx * t, y + dy * t, z + dz * t
+        m, relative = _material(volume, prims, first, listed, (bz * my + by) * mx + bx, px, py, pz)
+        if m > 0:
+            photo = (mu[0, m, i] + part * (mu[0, m, i + 1] - mu[0, m, i])) * relative
+            compton = (mu[1, m, i] + part * (mu[1, m, i + 1] - mu[1, m, i])) * relative
+            rayleigh = (mu[2, m, i] + part * (mu[2, m, i + 1] - mu[2, m, i])) * relative
+            if _uniform(rng) * rate < photo + compton + rayleigh:
+                ray[0], ray[1], ray[2] = px, py, pz
+                return m, photo, compton, rayleigh
+        left = -math.log(_uniform(rng))
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _turn(ray, cos, phi):
+    """Turn the direction of a ray by a polar angle and an azimuth about itself."""
+    sin = math.sqrt(max(0.0, 1.0 - cos * cos))
+    a, b = sin * math.cos(phi), sin * math.sin(phi)
+    dx, dy, dz = ray[3], ray[4], ray[5]
+    # Duff et al. 2017: a frame about the direction without a singular pole
+    sign = math.copysign(1.0, dz)
+    c = -1.0 / (sign + dz)
+    d = dx * dy * c
+    x = a * (1.0 + sign * dx * dx * c) + b * d + cos * dx
+    y = a * (sign * d) + b * (sign + dy * dy * c) + cos * dy
+    z = a * (-sign * dx) + b * (-dy) + cos * dz
+    scale = 1.0 / math.sqrt(x * x + y * y + z * z)
+    ray[3], ray[4], ray[5] = x * scale, y * scale, z * scale
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _bound(bound, m, q, per_q):
+    place = min(q * per_q, bound.shape[1] - 1.001)
+    i = int(place)
+    return bound[m, i] + (place - i) * (bound[m, i + 1] - bound[m, i])
+
+
+@njit(cache=True, error_model="numpy")
+def _compton(bound, m, energy, per_q, rng):
+    """Draw a Compton collision by Klein–Nishina times the incoherent scattering function; return ε and cos θ."""
+    alpha = energy / REST
+    least = 1.0 / (1.0 + 2.0 * alpha)
+    one, two = -math.log(least), 0.5 * (1.0 - least * least)
+    while True:
+        if _uniform(rng) * (one + two) < one:
+            ratio = math.exp(-one * _uniform(rng))
+        else:
+            ratio = math.sqrt(least * least + (1.0 - least * least) * _uniform(rng))
+        away = min((1.0 - ratio) / (ratio * alpha), 2.0)  # 1 − cos θ
+        accept = 1.0 - ratio * away * (2.0 - away) / (1.0 + ratio * ratio)
+        accept *= _bound(bound, m, energy / HC * math.sqrt(0.5 * away), per_q)
+        if _uniform(rng) < accept:
+            return ratio, 1.0 - away
+
+
+@njit(cache=True, error_model="numpy")
+def _rayleigh(form, m, energy, per_q, rng):
+    """Draw the cosine of a Rayleigh collision: q² by the squared form factor, then Thomson's law by rejection."""
+    last = min(energy / HC * per_q, form.shape[1] - 1.001)
+    n = int(last)
+    span = (last * last - n * n) / (2.0 * n + 1.0)
+    total = form[m, n] + span * (form[m, n + 1] - form[m, n])
+    while True:
+        wanted = _uniform(rng) * total
+        low, high = 0, n + 1
+        while high - low > 1:
+            middle = (low + high) >> 1
+            if form[m, middle] <= wanted:
+                low = middle
+            else:
+                high = middle
+        part = (wanted - form[m, low]) / max(form[m, low + 1] - form[m, low], 1e-300)
+        squared = (low * low + part * (2.0 * low + 1.0)) / (last * last)  # sin²(θ/2)
+        cos = 1.0 - 2.0 * min(squared, 1.0)
+        if 2.0 * _uniform(rng) < 1.0 + cos * cos:
+            return cos
+
+
+@njit(cache=True, error_model="numpy")
+def _depth(volume, prims, mu, energy, ray, work):
+    """Return the optical thickness from a ray's start to its end, `ray[6]` mm along it."""
+    lengths, covered, painted, pieces, hits, pair = work
+    place = (energy - E_MIN) * PER_STEP
+    i = int(place)
+    part = place - i
+    n = walk(volume[0], volume[1], volume[2], volume[3], volume[4], ray, 0.0, ray[6], pieces)
+    lengths[:] = 0.0
+    t = 0.0
+    for k in range(n):
+        if pieces[k, 0] > t:
+            lengths[int(pieces[k, 1])] += (pieces[k, 0] - t) * pieces[k, 2]
+            t = pieces[k, 0]
+    hit = 0
+    for p in range(prims.shape[0]):
+        for k in range(intersect(prims[p], ray[0], ray[1], ray[2], ray[3], ray[4], ray[5], pair)):
+            enter, leave = max(pair[2 * k], 0.0), min(pair[2 * k + 1], ray[6])
+            if leave > enter:
+                hits[hit, 0], hits[hit, 1], hits[hit, 2] = enter, leave, prims[p, 1]
+                hit += 1
+    if hit > 0:
+        _paint(hits, hit, pieces, n, covered, painted)
+        for m in range(1, lengths.size):
+            lengths[m] = max(lengths[m] - covered[m], 0.0) + painted[m]
+    tau = 0.0
+    for m in range(1, lengths.size):
+        if lengths[m] > 0:
+            low = mu[0, m, i] + mu[1, m, i] + mu[2, m, i]
+            high = mu[0, m, i + 1] + mu[1, m, i + 1] + mu[2, m, i + 1]
+            tau += (low + part * (high - low)) * lengths[m]
+    return tau
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _absorbed(signal, energy):
+    place = (energy - E_MIN) * PER_STEP
+    i = int(place)
+    return signal[i] + (place - i) * (signal[i + 1] - signal[i])
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _aim(ray, way, x, y, z):
+    """Set `way` to the ray from `ray`'s place to (x, y, z), and its length."""
+    dx, dy, dz = x - ray[0], y - ray[1], z - ray[2]
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    way[0], way[1], way[2] = ray[0], ray[1], ray[2]
+    way[3], way[4], way[5], way[6] = dx / length, dy / length, dz / length, length
+
+
+@njit(cache=True, error_model="numpy")
+def _force(volume, prims, tables, beam, m, energy, ray, way, work, rng, image):
+    """Score what a Compton collision sends to a random place of the detector, on average over all its outcomes."""
+    mu, klein, bound, _, per_q = tables
+    pose, extent, normal, signal = beam
+    rows, columns = image.shape
+    u, v = _uniform(rng), _uniform(rng)
+    a, b = (u - 0.5) * extent[1], (v - 0.5) * extent[0]
+    _aim(
+        ray, way,
+        pose[3] + a * pose[6] + b * pose[9],
+        pose[4] + a * pose[7] + b * pose[10],
+        pose[5] + a * pose[8] + b * pose[11],
+    )  # fmt: skip
+    cos = way[3] * ray[3] + way[4] * ray[4] + way[5] * ray[5]
+    ratio = 1.0 / (1.0 + energy / REST * (1.0 - cos))
+    later = energy * ratio
+    if later < CUT:
+        return
+    place = (energy - E_MIN) * PER_STEP
+    i = int(place)
+    whole = klein[m, i] + (place - i) * (klein[m, i + 1] - klein[m, i])
+    law = ratio * ratio * (ratio + 1.0 / ratio - 1.0 + cos * cos)
+    law *= _bound(bound, m, energy / HC * math.sqrt(max(0.5 * (1.0 - cos), 0.0)), per_q) / whole
+    slant = abs(way[3] * normal[0] + way[4] * normal[1] + way[5] * normal[2])  # detector area times cos, in mm²
+    share = law * slant / (way[6] * way[6])
+    tau = _depth(volume, prims, mu, later, way, work)
+    image[min(int(v * rows), rows - 1), min(int(u * columns), columns - 1)] += (
+        share * math.exp(-tau) * _absorbed(signal, later)
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _reach(volume, prims, tables, beam, energy, ray, way, work, image):
+    """Score a photon at the place of the detector that it flies to, by its chance to get there."""
+    pose, extent, normal, signal = beam
+    towards = ray[3] * normal[0] + ray[4] * normal[1] + ray[5] * normal[2]
+    if abs(towards) < 1e-9:
+        return
+    cx, cy, cz = pose[3] - ray[0], pose[4] - ray[1], pose[5] - ray[2]
+    length = (cx * normal[0] + cy * normal[1] + cz * normal[2]) / towards
+    if length <= 0:
+        return
+    x, y, z = length * ray[3] - cx, length * ray[4] - cy, length * ray[5] - cz
+    uu = pose[6] * pose[6] + pose[7] * pose[7] + pose[8] * pose[8]
+    vv = pose[9] * pose[9] + pose[10] * pose[10] + pose[11] * pose[11]
+    uv = pose[6] * pose[9] + pose[7] * pose[10] + pose[8] * pose[11]
+    xu, xv = x * pose[6] + y * pose[7] + z * pose[8], x * pose[9] + y * pose[10] + z * pose[11]
+    scale = 1.0 / (uu * vv - uv * uv)
+    u, v = (xu * vv - xv * uv) * scale / extent[1] + 0.5, (xv * uu - xu * uv) * scale / extent[0] + 0.5
+    if 0 <= u < 1 and 0 <= v < 1:
+        for k in range(6):
+            way[k] = ray[k]
+        way[6] = length
+        tau = _depth(volume, prims, tables[0], energy, way, work)
+        rows, columns = image.shape
+        image[int(v * rows), int(u * columns)] += math.exp(-tau) * _absorbed(signal, energy)
+
+
+@njit(cache=True, error_model="numpy")
+def _history(volume, prims, blocks, tables, beam, regions, spectrum, scratch, rng, images, deposit):
+    """Follow one photon from the source until it is absorbed or leaves."""
+    mu, _, bound, form, per_q = tables
+    pose, extent, _, signal = beam
+    ray, way, work = scratch
+    cumulative, energies = spectrum
+    wanted = _uniform(rng) * cumulative[-1]
+    energy = energies[min(np.searchsorted(cumulative, wanted, side="right"), energies.size - 1)]
+    a, b = (_uniform(rng) - 0.5) * extent[1], (_uniform(rng) - 0.5) * extent[0]
+    ray[0], ray[1], ray[2] = pose[0], pose[1], pose[2]
+    x, y, z = (
+        pose[3] + a * pose[6] + b * pose[9],
+        pose[4] + a * pose[7] + b * pose[10],
+        pose[5] + a * pose[8] + b * pose[11],
+    )
+    _aim(ray, way, x, y, z)
+    ray[3], ray[4], ray[5] = way[3], way[4], way[5]
+    order = 0
+    while True:
+        m, photo, compton, rayleigh = _fly(volume, prims, blocks, mu, energy, ray, rng)
+        if m < 0:
+            if order == 0 and images.size > 0:
+                rows, columns = images.shape[1:]
+                u, v = a / extent[1] + 0.5, b / extent[0] + 0.5
+                images[PRIMARY, min(int(v * rows), rows - 1), min(int(u * columns), columns - 1)] += _absorbed(
+                    signal, energy
+                )
+            return
+        pick = _uniform(rng) * (photo + compton + rayleigh)
+        where = -1
+        if deposit.size > 0:
+            where = _region(regions, volume[4], ray)
+        if pick < photo:
+            if where >= 0:
+                deposit[where] += energy
+            return
+        order += 1
+        if pick < photo + compton:
+            if images.size > 0:
+                _force(
+                    volume, prims, tables, beam, m, energy, ray, way, work, rng, images[SINGLE if order == 1 else MULTIPLE]
+                )
+            ratio, cos = _compton(bound, m, energy, per_q, rng)
+            if where >= 0:
+                deposit[where] += energy * (1.0 - ratio)
+            energy *= ratio
+            _turn(ray, cos, 2.0 * math.pi * _uniform(rng))
+        else:
+            _turn(ray, _rayleigh(form, m, energy, per_q, rng), 2.0 * math.pi * _uniform(rng))
+            if images.size > 0:
+                _reach(volume, prims, tables, beam, energy, ray, way, work, images[SINGLE if order == 1 else MULTIPLE])
+        if energy < CUT:
+            if where >= 0:
+                deposit[where] += energy
+            return
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _region(regions, grid, ray):
+    i, j, k = (ray[0] - grid[6]) * grid[3], (ray[1] - grid[7]) * grid[4], (ray[2] - grid[8]) * grid[5]
+    if 0 <= i < grid[0] and 0 <= j < grid[1] and 0 <= k < grid[2]:
+        return np.int64(regions[int(k), int(j), int(i)])
+    return 0
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def transport(volume, prims, blocks, tables, beam, regions, spectrum, key, first, count, images, deposit):
+    """Follow histories first … first + count − 1 of the stream `key`, and add up what they leave.
+
+    `volume` is (code, slot, pool, density, grid) of `ctsim.bricks.Bricks`; `prims` as in `ctsim.solids.pack`; `blocks`
+    (kind, most, first, listed, frame) of `ctsim.montecarlo.world.Blocks`; `tables` (mu, klein, bound, form, 1/d_q);
+    `beam` (pose, pixels (v, u), detector normal times area in mm², absorbed signal by energy); `regions` uint8
+    [z, y, x]; `spectrum` (cumulative weights, energies). `images` [chunk, order, v, u] gets the signal of primary, once
+    and more often scattered photons; `deposit` [chunk, region] the absorbed energy (keV). Either may be empty.
+    """
+    for chunk in prange(CHUNKS):
+        n_m = mu_count(tables)
+        n_p = prims.shape[0]
+        grid = volume[4]
+        work = (
+            np.empty(n_m), np.empty(n_m), np.empty(n_m), np.empty((int(grid[0] + grid[1] + grid[2]) + 8, 3)),
+            np.empty((2 * n_p + 1, 3)), np.empty(4),
+        )  # fmt: skip
+        scratch = (np.empty(7), np.empty(7), work)
+        rng = np.zeros(10, np.uint64)
+        for history in range(first + chunk * count // CHUNKS, first + (chunk + 1) * count // CHUNKS):
+            _start(rng, key, np.uint64(history))
+            _history(
+                volume, prims, blocks, tables, beam, regions, spectrum, scratch, rng, images[chunk], deposit[chunk]
+            )
+
+
+@njit(cache=True, inline="always")
+def mu_count(tables):
+    """Return the number of materials."""
+    return tables[0].shape[1]
