@@ -43,16 +43,28 @@ def scatter_image(
     cells: tuple[int, int],
     histories: int,
     stream: str = "",
+    isotropic: bool = False,
 ) -> Image:
     """Return one view's scatter.
 
-    The source sends as many photons to each pixel of the detector. `signal` [n] is what the detector makes of a photon
+    The source sends as many photons to each pixel of the detector, or into each solid angle if `isotropic`. `signal` [n] is what the detector makes of a photon
     at the spectrum's energies; `pose` is a row of `Geometry.pose_array`; `cells` (v, u) part the detector.
     """
     if histories < 1:
         raise InputError(f"histories must be at least 1, got {histories}")
     images = np.zeros((transport_cpu.CHUNKS, 3, *cells))
-    _run(world, spectrum, signal, pose, n_detector, histories, stream, images, np.zeros((transport_cpu.CHUNKS, 0)))
+    _run(
+        world,
+        spectrum,
+        signal,
+        pose,
+        n_detector,
+        histories,
+        stream,
+        isotropic,
+        images,
+        np.zeros((transport_cpu.CHUNKS, 0)),
+    )
     open_signal = float(spectrum.weights @ signal) * histories / (cells[0] * cells[1])
     primary, single, multiple = images.sum(0) / open_signal
     parts = images[:, 1:].sum(1) * transport_cpu.CHUNKS / open_signal
@@ -73,6 +85,7 @@ def absorbed_energy(
     *,
     histories: int,
     stream: str = "",
+    isotropic: bool = False,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the energy (keV) per photon that each region of the label grid absorbs, and its standard error: [region].
 
@@ -80,12 +93,26 @@ def absorbed_energy(
     """
     deposit = np.zeros((transport_cpu.CHUNKS, int(regions.max()) + 1))
     images = np.zeros((transport_cpu.CHUNKS, 3, 0, 0))
-    _run(world, spectrum, np.ones_like(spectrum.energies), pose, n_detector, histories, stream, images, deposit, regions)
+    _run(
+        world,
+        spectrum,
+        np.ones_like(spectrum.energies),
+        pose,
+        n_detector,
+        histories,
+        stream,
+        isotropic,
+        images,
+        deposit,
+        regions,
+    )
     parts = deposit * transport_cpu.CHUNKS / histories
     return parts.mean(0), parts.std(0, ddof=1) / np.sqrt(transport_cpu.CHUNKS)
 
 
-def _run(world, spectrum, signal, pose, n_detector, histories, stream, images, deposit, regions=None) -> None:
+def _run(
+    world, spectrum, signal, pose, n_detector, histories, stream, isotropic, images, deposit, regions=None
+) -> None:
     tables = world.tables
     n = tables.mu.shape[2]
     grid = E_MIN + STEP * np.arange(n)
@@ -93,10 +120,11 @@ def _run(world, spectrum, signal, pose, n_detector, histories, stream, images, d
         raise InputError(f"the tables end at {grid[-2]:g} keV, the spectrum at {spectrum.e_max:g} keV")
     absorbed = np.interp(grid, spectrum.energies, signal)
     normal = np.cross(pose[6:9], pose[9:12]) * n_detector[0] * n_detector[1]
+    nearest = abs((pose[3:6] - pose[:3]) @ normal) / np.linalg.norm(normal)
     transport_cpu.transport(
         tuple(world.bricks[:5]), world.prims, tuple(world.blocks),
         (tables.mu, tables.klein, tables.bound, tables.form, 1.0 / tables.d_q),
-        (pose, np.array(n_detector, np.float64), normal, absorbed),
+        (pose, np.array(n_detector, np.float64), normal, absorbed, nearest if isotropic else 0.0),
         np.zeros((1, 1, 1), np.uint8) if regions is None else regions,
         (np.cumsum(spectrum.weights), spectrum.energies),
         stream_key(stream, "montecarlo", 0), 0, histories, images, deposit,

@@ -44,7 +44,9 @@ class World(NamedTuple):
         """Prepare a phantom for photons of up to `e_max` keV."""
         tables = Interactions.of(phantom.materials, e_max)
         prims = pack(phantom.solids, phantom.materials)
-        return World(bricks=make_bricks(phantom), prims=prims, blocks=make_blocks(phantom, prims, tables), tables=tables)
+        return World(
+            bricks=make_bricks(phantom), prims=prims, blocks=make_blocks(phantom, prims, tables), tables=tables
+        )
 
 
 def make_blocks(phantom: Phantom, prims: NDArray[np.float64], tables: Interactions) -> Blocks:

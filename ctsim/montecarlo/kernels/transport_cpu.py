@@ -86,7 +86,14 @@ def _fly(volume, prims, blocks, mu, energy, ray, rng):
     # a hair inside, so that the block is the one that is entered
     px, py, pz = x + dx * t - lx, y + dy * t - ly, z + dz * t - lz
     slack = 1e-9
-    if px < -slack or py < -slack or pz < -slack or px > mx * wx + slack or py > my * wy + slack or pz > mz * wz + slack:
+    if (
+        px < -slack
+        or py < -slack
+        or pz < -slack
+        or px > mx * wx + slack
+        or py > my * wy + slack
+        or pz > mz * wz + slack
+    ):
         return -1, 0.0, 0.0, 0.0
     bx = min(max(int(px / wx), 0), mx - 1)
     by = min(max(int(py / wy), 0), my - 1)
@@ -254,7 +261,7 @@ def _aim(ray, way, x, y, z):
 def _force(volume, prims, tables, beam, m, energy, ray, way, work, rng, image):
     """Score what a Compton collision sends to a random place of the detector, on average over all its outcomes."""
     mu, klein, bound, _, per_q = tables
-    pose, extent, normal, signal = beam
+    pose, extent, normal, signal, _ = beam
     rows, columns = image.shape
     u, v = _uniform(rng), _uniform(rng)
     a, b = (u - 0.5) * extent[1], (v - 0.5) * extent[0]
@@ -285,7 +292,7 @@ def _force(volume, prims, tables, beam, m, energy, ray, way, work, rng, image):
 @njit(cache=True, error_model="numpy")
 def _reach(volume, prims, tables, beam, energy, ray, way, work, image):
     """Score a photon at the place of the detector that it flies to, by its chance to get there."""
-    pose, extent, normal, signal = beam
+    pose, extent, normal, signal, _ = beam
     towards = ray[3] * normal[0] + ray[4] * normal[1] + ray[5] * normal[2]
     if abs(towards) < 1e-9:
         return
@@ -313,19 +320,21 @@ def _reach(volume, prims, tables, beam, energy, ray, way, work, image):
 def _history(volume, prims, blocks, tables, beam, regions, spectrum, scratch, rng, images, deposit):
     """Follow one photon from the source until it is absorbed or leaves."""
     mu, _, bound, form, per_q = tables
-    pose, extent, _, signal = beam
+    pose, extent, _, signal, nearest = beam
     ray, way, work = scratch
     cumulative, energies = spectrum
     wanted = _uniform(rng) * cumulative[-1]
     energy = energies[min(np.searchsorted(cumulative, wanted, side="right"), energies.size - 1)]
-    a, b = (_uniform(rng) - 0.5) * extent[1], (_uniform(rng) - 0.5) * extent[0]
     ray[0], ray[1], ray[2] = pose[0], pose[1], pose[2]
-    x, y, z = (
-        pose[3] + a * pose[6] + b * pose[9],
-        pose[4] + a * pose[7] + b * pose[10],
-        pose[5] + a * pose[8] + b * pose[11],
-    )
-    _aim(ray, way, x, y, z)
+    while True:
+        a, b = (_uniform(rng) - 0.5) * extent[1], (_uniform(rng) - 0.5) * extent[0]
+        x = pose[3] + a * pose[6] + b * pose[9]
+        y = pose[4] + a * pose[7] + b * pose[10]
+        z = pose[5] + a * pose[8] + b * pose[11]
+        _aim(ray, way, x, y, z)
+        # of a source that sends as many photons into every solid angle fewer reach a unit of area far off the middle
+        if nearest <= 0 or _uniform(rng) < (nearest / way[6]) ** 3:
+            break
     ray[3], ray[4], ray[5] = way[3], way[4], way[5]
     order = 0
     while True:
@@ -350,7 +359,17 @@ def _history(volume, prims, blocks, tables, beam, regions, spectrum, scratch, rn
         if pick < photo + compton:
             if images.size > 0:
                 _force(
-                    volume, prims, tables, beam, m, energy, ray, way, work, rng, images[SINGLE if order == 1 else MULTIPLE]
+                    volume,
+                    prims,
+                    tables,
+                    beam,
+                    m,
+                    energy,
+                    ray,
+                    way,
+                    work,
+                    rng,
+                    images[SINGLE if order == 1 else MULTIPLE],
                 )
             ratio, cos = _compton(bound, m, energy, per_q, rng)
             if where >= 0:
@@ -381,7 +400,8 @@ def transport(volume, prims, blocks, tables, beam, regions, spectrum, key, first
 
     `volume` is (code, slot, pool, density, grid) of `ctsim.bricks.Bricks`; `prims` as in `ctsim.solids.pack`; `blocks`
     (kind, most, first, listed, frame) of `ctsim.montecarlo.world.Blocks`; `tables` (mu, klein, bound, form, 1/d_q);
-    `beam` (pose, pixels (v, u), detector normal times area in mm², absorbed signal by energy); `regions` uint8
+    `beam` (pose, pixels (v, u), detector normal times area in mm², absorbed signal by energy, distance of the source from
+    the detector's plane, or 0 for as many photons on every unit of its area); `regions` uint8
     [z, y, x]; `spectrum` (cumulative weights, energies). `images` [chunk, order, v, u] gets the signal of primary, once
     and more often scattered photons; `deposit` [chunk, region] the absorbed energy (keV). Either may be empty.
     """

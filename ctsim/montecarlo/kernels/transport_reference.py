@@ -75,9 +75,19 @@ def _mu(which, energy: float) -> float:
 def _compton(weights: dict[int, float], energy: float, cosines: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return cm² per sr and g: xraylib's differential cross-section (barn per atom and sr)."""
     avogadro = 0.602214076
-    return np.array([sum(n * avogadro * xrl.DCSb_Compt(z, energy, max(float(np.arccos(c)), 1e-3)) for z, n in weights.items()) for c in cosines])
+    return np.array(
+        [
+            sum(n * avogadro * xrl.DCSb_Compt(z, energy, max(float(np.arccos(c)), 1e-3)) for z, n in weights.items())
+            for c in cosines
+        ]
+    )
 
 
 def _rayleigh(weights: dict[int, float], energy: float, cosines: NDArray[np.float64]) -> NDArray[np.float64]:
     avogadro = 0.602214076
-    return np.array([sum(n * avogadro * xrl.DCSb_Rayl(z, energy, max(float(np.arccos(c)), 1e-3)) for z, n in weights.items()) for c in cosines])
+    return np.array(
+        [
+            sum(n * avogadro * xrl.DCSb_Rayl(z, energy, max(float(np.arccos(c)), 1e-3)) for z, n in weights.items())
+            for c in cosines
+        ]
+    )
