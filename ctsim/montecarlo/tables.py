@@ -26,7 +26,7 @@ _ELECTRON_REST, HC = 510.998950, 12.3984198  # keV, keV·Å
 class Interactions(NamedTuple):
     """What photons do in each material.
 
-    `mu` [3, material, energy] is the attenuation (1/mm) by photoelectric absorption, Compton and Rayleigh scatter at
+    `mu` [material, energy, 3] is the attenuation (1/mm) by photoelectric absorption, Compton and Rayleigh scatter at
     E_MIN + i·STEP keV; `klein` [material, energy] is the integral over all directions of the Compton law, in units of
     r_e²/2 per electron; `bound` [material, q] the incoherent scattering function per electron; `form` [material, q]
     the integral of the squared form factor over q² from 0; `d_q` the step of q (1/Å). Material 0 is air, which nothing
@@ -50,13 +50,13 @@ def _tabulated(materials: tuple[str, ...], e_max: float) -> Interactions:
     n = math.ceil((e_max - E_MIN) / STEP) + 2
     energies = E_MIN + STEP * np.arange(n)
     q = np.linspace(0.0, energies[-1] / HC, N_Q)
-    mu, klein = np.zeros((3, len(materials), n)), np.ones((len(materials), n))
+    mu, klein = np.zeros((len(materials), n, 3)), np.ones((len(materials), n))
     bound, form = np.zeros((len(materials), N_Q)), np.zeros((len(materials), N_Q))
     for k, name in enumerate(materials):
         if k == 0:
             continue
-        mu[0, k], mu[1, k] = photoelectric(name, energies), compton(name, energies)[0]
-        mu[2, k] = np.maximum(attenuation(name, energies) - mu[0, k] - mu[1, k], 0.0)
+        mu[k, :, 0], mu[k, :, 1] = photoelectric(name, energies), compton(name, energies)[0]
+        mu[k, :, 2] = np.maximum(attenuation(name, energies) - mu[k, :, 0] - mu[k, :, 1], 0.0)
         bound[k], squared = sf(material(name), q)
         klein[k] = _klein(energies, q, bound[k])
         steps = 0.5 * (squared[1:] + squared[:-1]) * np.diff(q**2)

@@ -114,7 +114,7 @@ def _run(
     world, spectrum, signal, pose, n_detector, histories, stream, isotropic, images, deposit, regions=None
 ) -> None:
     tables = world.tables
-    n = tables.mu.shape[2]
+    n = tables.mu.shape[1]
     grid = E_MIN + STEP * np.arange(n)
     if spectrum.e_max > grid[-2]:
         raise InputError(f"the tables end at {grid[-2]:g} keV, the spectrum at {spectrum.e_max:g} keV")

@@ -19,7 +19,7 @@ class Blocks(NamedTuple):
     """Boxes of whole bricks that hold few materials each.
 
     `kind` [bz, by, bx] numbers the sets of materials that occur; `most` [kind, energy] bounds the attenuation (1/mm) of a
-    set between energies i and i + 1; the solids that reach into block b are listed[first[b] : first[b + 1]], in paint
+    set between energies i and i + 1, solids left out; the solids that reach into block b are listed[first[b] : first[b + 1]], in paint
     order; `frame` is the low corner and the edges of a block (x, y, z; mm). Solids that reach beyond the label grid are
     cut off at it, unless the grid of blocks is widened.
     """
@@ -64,12 +64,10 @@ def make_blocks(phantom: Phantom, prims: NDArray[np.float64], tables: Interactio
         if phantom.density is not None:
             scale[b] = max(1.0, float(phantom.density[part].max()))
     first, listed = _listed(prims, shape, low, wide)
-    for b in range(len(first) - 1):
-        present[b, prims[listed[first[b] : first[b + 1]], 1].astype(int)] = True
     # sets with the same greatest density share a row, which is rounded up to a sixteenth
     rounded = np.ceil(scale * 16) / 16
     sets, kind = np.unique(np.column_stack([present, rounded]), axis=0, return_inverse=True)
-    total = tables.mu.sum(0)
+    total = tables.mu.sum(2)
     bound = np.maximum(total, np.roll(total, -1, 1))
     most = np.stack([np.where(row[:-1, None] > 0, bound, 0).max(0) * row[-1] for row in sets])
     return Blocks(

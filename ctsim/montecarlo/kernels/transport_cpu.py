@@ -14,13 +14,14 @@ from numba import njit, prange
 from ctsim.kernels.bricks_cpu import CELLS, CODE_BITS, MIXED, SIDE, walk
 from ctsim.kernels.noise_cpu import philox
 from ctsim.kernels.raytrace_cpu import _paint
-from ctsim.kernels.solids_cpu import inside, intersect
+from ctsim.kernels.solids_cpu import intersect
 
 CHUNKS = 64
 E_MIN, PER_STEP = 1.0, 10.0  # as in `ctsim.montecarlo.tables`: keV, energy steps per keV
 REST, HC = 510.998950, 12.3984198
 CUT = 2.0  # keV; a photon below it stays where it is
 FARTHEST = 1e30
+EDGE = 1e-9  # of a block: a photon that enters the grid may lie this far outside it by rounding
 _LOW, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
 PRIMARY, SINGLE, MULTIPLE = 0, 1, 2
 
@@ -47,7 +48,7 @@ def _uniform(rng):
 def _label(code, slot, pool, density, grid, x, y, z):
     """Return the label of a place in the volume and its relative density; 0 outside."""
     i, j, k = (x - grid[6]) * grid[3], (y - grid[7]) * grid[4], (z - grid[8]) * grid[5]
-    label, relative = 0, 1.0
+    label, relative = 0, np.float32(1.0)
     if 0 <= i < grid[0] and 0 <= j < grid[1] and 0 <= k < grid[2]:
         ix, iy, iz = int(i), int(j), int(k)
         bz, by, bx = iz // SIDE, iy // SIDE, ix // SIDE
@@ -60,86 +61,107 @@ def _label(code, slot, pool, density, grid, x, y, z):
     return label, relative
 
 
+@njit(cache=True, error_model="numpy")
+def _crossed(prims, first, listed, block, ray, start, end, pair, hits):
+    """List the parts (enter, leave, material) of a ray between start and end in a block's solids; return how many."""
+    n = 0
+    for k in range(first[block], first[block + 1]):
+        prim = prims[listed[k]]
+        for i in range(intersect(prim, ray[0], ray[1], ray[2], ray[3], ray[4], ray[5], pair)):
+            enter, leave = max(pair[2 * i], start), min(pair[2 * i + 1], end)
+            if leave > enter:
+                hits[n, 0], hits[n, 1], hits[n, 2] = enter, leave, prim[1]
+                n += 1
+    return n
+
+
 @njit(cache=True, error_model="numpy", inline="always")
-def _material(volume, prims, first, listed, block, x, y, z):
-    """Return the material at a place and its relative density; solids replace the volume, later ones earlier ones."""
-    for n in range(first[block + 1] - 1, first[block] - 1, -1):
-        if inside(prims[listed[n]], x, y, z):
-            return np.int64(prims[listed[n], 1]), 1.0
-    return _label(volume[0], volume[1], volume[2], volume[3], volume[4], x, y, z)
+def _within(hits, n, t, end):
+    """Return the material of the solid painted last at t, 0 where there is none, and where that ends at the latest."""
+    m, until = 0, end
+    for k in range(n):
+        if hits[k, 0] <= t < hits[k, 1]:
+            m = np.int64(hits[k, 2])
+            until = min(until, hits[k, 1])
+        elif hits[k, 0] > t:
+            until = min(until, hits[k, 0])
+    return m, until
 
 
 @njit(cache=True, error_model="numpy")
-def _fly(volume, prims, blocks, mu, energy, ray, rng):
-    """Move a photon to its next collision; return the material, its three attenuations, or -1 where it leaves."""
+def _fly(volume, prims, blocks, mu, energy, ray, pair, hits, rng, found):
+    """Move a photon to its next collision; fill `found` with the attenuations, return the material, -1 if it leaves."""
     kind, most, first, listed, frame = blocks
+    code, slot, pool, density, grid = volume
     mz, my, mx = kind.shape
     x, y, z, dx, dy, dz = ray[0], ray[1], ray[2], ray[3], ray[4], ray[5]
+    wx, wy, wz = frame[3], frame[4], frame[5]
+    lx, ly, lz = frame[0] - x, frame[1] - y, frame[2] - z
     ix = 1.0 / dx if abs(dx) > 1e-12 else FARTHEST
     iy = 1.0 / dy if abs(dy) > 1e-12 else FARTHEST
     iz = 1.0 / dz if abs(dz) > 1e-12 else FARTHEST
-    lx, ly, lz, wx, wy, wz = frame[0], frame[1], frame[2], frame[3], frame[4], frame[5]
-    ux, uy, uz = ix > 0, iy > 0, iz > 0
-    t = max(0.0, max((lx if ux else lx + mx * wx) - x, 0.0) * ix if ux else min((lx + mx * wx) - x, 0.0) * ix)
-    t = max(t, max(ly - y, 0.0) * iy if uy else min((ly + my * wy) - y, 0.0) * iy)
-    t = max(t, max(lz - z, 0.0) * iz if uz else min((lz + mz * wz) - z, 0.0) * iz)
-    # a hair inside, so that the block is the one that is entered
-    px, py, pz = x + dx * t - lx, y + dy * t - ly, z + dz * t - lz
-    slack = 1e-9
-    if (
-        px < -slack
-        or py < -slack
-        or pz < -slack
-        or px > mx * wx + slack
-        or py > my * wy + slack
-        or pz > mz * wz + slack
-    ):
-        return -1, 0.0, 0.0, 0.0
-    bx = min(max(int(px / wx), 0), mx - 1)
-    by = min(max(int(py / wy), 0), my - 1)
-    bz = min(max(int(pz / wz), 0), mz - 1)
-    sx, sy, sz = (1 if ux else -1), (1 if uy else -1), (1 if uz else -1)
-    tx = (lx + (bx + (1 if ux else 0)) * wx - x) * ix
-    ty = (ly + (by + (1 if uy else 0)) * wy - y) * iy
-    tz = (lz + (bz + (1 if uz else 0)) * wz - z) * iz
+    ux, uy, uz = 1 if ix > 0 else 0, 1 if iy > 0 else 0, 1 if iz > 0 else 0
+    t = max((lx + (1 - ux) * mx * wx) * ix, (ly + (1 - uy) * my * wy) * iy)
+    t = max(max(t, (lz + (1 - uz) * mz * wz) * iz), 0.0)
+    bx, by, bz = (dx * t - lx) / wx, (dy * t - ly) / wy, (dz * t - lz) / wz
+    if min(bx, min(by, bz)) < -EDGE or bx > mx + EDGE or by > my + EDGE or bz > mz + EDGE:
+        return -1
+    bx, by, bz = min(max(int(bx), 0), mx - 1), min(max(int(by), 0), my - 1), min(max(int(bz), 0), mz - 1)
+    sx, sy, sz = 2 * ux - 1, 2 * uy - 1, 2 * uz - 1
+    tx, ty, tz = (lx + (bx + ux) * wx) * ix, (ly + (by + uy) * wy) * iy, (lz + (bz + uz) * wz) * iz
     jx, jy, jz = wx * abs(ix), wy * abs(iy), wz * abs(iz)
     place = (energy - E_MIN) * PER_STEP
     i = int(place)
-    part = place - i
+    part = np.float32(place - i)
     left = -math.log(_uniform(rng))
     while True:
-        rate = most[kind[bz, by, bx], i]
         near = min(tx, min(ty, tz))
-        if rate * (near - t) < left:
-            left -= rate * max(near - t, 0.0)
-            t = max(near, t)
-            if tx == near:
-                bx += sx
-                tx += jx
-                if bx < 0 or bx >= mx:
-                    return -1, 0.0, 0.0, 0.0
-            elif ty == near:
-                by += sy
-                ty += jy
-                if by < 0 or by >= my:
-                    return -1, 0.0, 0.0, 0.0
+        block = (bz * my + by) * mx + bx
+        n = 0
+        if first[block + 1] > first[block]:
+            n = _crossed(prims, first, listed, block, ray, t, near, pair, hits)
+        while t < near:
+            m, until = _within(hits, n, t, near)
+            if m > 0:
+                _attenuations(mu, m, i, part, np.float32(1.0), found)
+                rate = found[0] + found[1] + found[2]
             else:
-                bz += sz
-                tz += jz
-                if bz < 0 or bz >= mz:
-                    return -1, 0.0, 0.0, 0.0
-            continue
-        t += left / rate
-        px, py, pz = x + dx * t, y + dy * t, z + dz * t
-        m, relative = _material(volume, prims, first, listed, (bz * my + by) * mx + bx, px, py, pz)
-        if m > 0:
-            photo = (mu[0, m, i] + part * (mu[0, m, i + 1] - mu[0, m, i])) * relative
-            compton = (mu[1, m, i] + part * (mu[1, m, i + 1] - mu[1, m, i])) * relative
-            rayleigh = (mu[2, m, i] + part * (mu[2, m, i + 1] - mu[2, m, i])) * relative
-            if _uniform(rng) * rate < photo + compton + rayleigh:
-                ray[0], ray[1], ray[2] = px, py, pz
-                return m, photo, compton, rayleigh
-        left = -math.log(_uniform(rng))
+                rate = most[kind[bz, by, bx], i]
+            if rate * (until - t) < left:
+                left -= rate * (until - t)
+                t = until
+                continue
+            t += left / rate
+            px, py, pz = x + dx * t, y + dy * t, z + dz * t
+            if m == 0:
+                m, relative = _label(code, slot, pool, density, grid, px, py, pz)
+                _attenuations(mu, m, i, part, relative, found)
+                if _uniform(rng) * rate >= found[0] + found[1] + found[2]:
+                    left = -math.log(_uniform(rng))
+                    continue
+            ray[0], ray[1], ray[2] = px, py, pz
+            return m
+        if tx == near:
+            bx += sx
+            tx += jx
+            if bx < 0 or bx >= mx:
+                return -1
+        elif ty == near:
+            by += sy
+            ty += jy
+            if by < 0 or by >= my:
+                return -1
+        else:
+            bz += sz
+            tz += jz
+            if bz < 0 or bz >= mz:
+                return -1
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _attenuations(mu, m, i, part, relative, found):
+    for k in range(3):
+        found[k] = (mu[m, i, k] + part * (mu[m, i + 1, k] - mu[m, i, k])) * relative
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -235,8 +257,8 @@ def _depth(volume, prims, mu, energy, ray, work):
     tau = 0.0
     for m in range(1, lengths.size):
         if lengths[m] > 0:
-            low = mu[0, m, i] + mu[1, m, i] + mu[2, m, i]
-            high = mu[0, m, i + 1] + mu[1, m, i + 1] + mu[2, m, i + 1]
+            low = mu[m, i, 0] + mu[m, i, 1] + mu[m, i, 2]
+            high = mu[m, i + 1, 0] + mu[m, i + 1, 1] + mu[m, i + 1, 2]
             tau += (low + part * (high - low)) * lengths[m]
     return tau
 
@@ -321,7 +343,7 @@ def _history(volume, prims, blocks, tables, beam, regions, spectrum, scratch, rn
     """Follow one photon from the source until it is absorbed or leaves."""
     mu, _, bound, form, per_q = tables
     pose, extent, _, signal, nearest = beam
-    ray, way, work = scratch
+    ray, way, found, work = scratch
     cumulative, energies = spectrum
     wanted = _uniform(rng) * cumulative[-1]
     energy = energies[min(np.searchsorted(cumulative, wanted, side="right"), energies.size - 1)]
@@ -338,7 +360,7 @@ def _history(volume, prims, blocks, tables, beam, regions, spectrum, scratch, rn
     ray[3], ray[4], ray[5] = way[3], way[4], way[5]
     order = 0
     while True:
-        m, photo, compton, rayleigh = _fly(volume, prims, blocks, mu, energy, ray, rng)
+        m = _fly(volume, prims, blocks, mu, energy, ray, work[5], work[4], rng, found)
         if m < 0:
             if order == 0 and images.size > 0:
                 rows, columns = images.shape[1:]
@@ -347,16 +369,16 @@ def _history(volume, prims, blocks, tables, beam, regions, spectrum, scratch, rn
                     signal, energy
                 )
             return
-        pick = _uniform(rng) * (photo + compton + rayleigh)
+        pick = _uniform(rng) * (found[0] + found[1] + found[2])
         where = -1
         if deposit.size > 0:
             where = _region(regions, volume[4], ray)
-        if pick < photo:
+        if pick < found[0]:
             if where >= 0:
                 deposit[where] += energy
             return
         order += 1
-        if pick < photo + compton:
+        if pick < found[0] + found[1]:
             if images.size > 0:
                 _force(
                     volume,
@@ -413,7 +435,7 @@ def transport(volume, prims, blocks, tables, beam, regions, spectrum, key, first
             np.empty(n_m), np.empty(n_m), np.empty(n_m), np.empty((int(grid[0] + grid[1] + grid[2]) + 8, 3)),
             np.empty((2 * n_p + 1, 3)), np.empty(4),
         )  # fmt: skip
-        scratch = (np.empty(7), np.empty(7), work)
+        scratch = (np.empty(7), np.empty(7), np.empty(3, np.float32), work)
         rng = np.zeros(10, np.uint64)
         for history in range(first + chunk * count // CHUNKS, first + (chunk + 1) * count // CHUNKS):
             _start(rng, key, np.uint64(history))
@@ -425,4 +447,4 @@ def transport(volume, prims, blocks, tables, beam, regions, spectrum, key, first
 @njit(cache=True, inline="always")
 def mu_count(tables):
     """Return the number of materials."""
-    return tables[0].shape[1]
+    return tables[0].shape[0]
