@@ -293,7 +293,7 @@ def compton(which: str | Material, energies: ArrayLike) -> tuple[NDArray[np.floa
 def scattering_function(
     which: str | Material, momentum_transfer: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the incoherent scattering function per electron [n] and the squared form factor per atom [n], of a mixture.
+    """Return a mixture's incoherent scattering function per electron [n] and its squared form factor [n].
 
     `momentum_transfer` is q = sin(θ/2)/λ in 1/Å. The first goes from 0 to 1 with q; the second is in units of its own,
     since only its shape is used: the size is in the attenuation.

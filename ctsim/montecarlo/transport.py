@@ -47,8 +47,9 @@ def scatter_image(
 ) -> Image:
     """Return one view's scatter.
 
-    The source sends as many photons to each pixel of the detector, or into each solid angle if `isotropic`. `signal` [n] is what the detector makes of a photon
-    at the spectrum's energies; `pose` is a row of `Geometry.pose_array`; `cells` (v, u) part the detector.
+    The source sends as many photons to each pixel of the detector, or into each solid angle if `isotropic`. `signal`
+    [n] is what the detector makes of a photon at the spectrum's energies; `pose` is a row of `Geometry.pose_array`;
+    `cells` (v, u) part the detector.
     """
     if histories < 1:
         raise InputError(f"histories must be at least 1, got {histories}")

@@ -18,10 +18,10 @@ MOST_BLOCKS = 32
 class Blocks(NamedTuple):
     """Boxes of whole bricks that hold few materials each.
 
-    `kind` [bz, by, bx] numbers the sets of materials that occur; `most` [kind, energy] bounds the attenuation (1/mm) of a
-    set between energies i and i + 1, solids left out; the solids that reach into block b are listed[first[b] : first[b + 1]], in paint
-    order; `frame` is the low corner and the edges of a block (x, y, z; mm). Solids that reach beyond the label grid are
-    cut off at it, unless the grid of blocks is widened.
+    `kind` [bz, by, bx] numbers the sets of voxel materials that occur; `most` [kind, energy] bounds the attenuation
+    (1/mm) of a set between energies i and i + 1, solids left out. The solids that reach into block b are
+    listed[first[b] : first[b + 1]], in paint order. `frame` is the low corner and the edges of a block (x, y, z; mm).
+    Solids are cut off where the grid of blocks ends.
     """
 
     kind: NDArray[np.int64]

@@ -1,9 +1,9 @@
 """Photons through bricks and solids: Woodcock tracking with a majorant for each block, compiled.
 
 A photon flies through blocks of voxels. In a block it meets tentative collisions at the rate of the block's greatest
-attenuation, and one is real with the share that the material at its place has of it (Woodcock 1965). Random numbers
-are Philox blocks of the history's own number, so a history depends on nothing but itself; histories are summed in
-`CHUNKS` fixed parts, so that sums are bitwise equal for any number of threads.
+attenuation, and one is real with the share that the material at its place has of it (Woodcock 1965); solids have
+exact boundaries instead, so that metal slows nothing else. A history's random numbers depend on its number alone, and
+histories are summed in `CHUNKS` fixed parts: results are bitwise equal for any number of threads.
 """
 
 import math
@@ -28,20 +28,20 @@ PRIMARY, SINGLE, MULTIPLE = 0, 1, 2
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _start(rng, key, history):
-    rng[0], rng[1], rng[2], rng[3] = np.uint64(4), history & _LOW, history >> _32, np.uint64(0)
-    rng[4], rng[5] = key & _LOW, key >> _32
+    """Begin a history's own stream: xoroshiro128+ (Blackman and Vigna 2018) from one Philox block."""
+    w0, w1, w2, w3 = philox(history & _LOW, history >> _32, np.uint64(0), np.uint64(1), key & _LOW, key >> _32)
+    rng[0], rng[1] = (w0 << _32) | w1, (w2 << _32) | w3 | np.uint64(1)  # all zeros would stay so
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _uniform(rng):
     """Return a random number within (0, 1)."""
-    i = rng[0]
-    if i == np.uint64(4):
-        rng[6], rng[7], rng[8], rng[9] = philox(rng[1], rng[2], rng[3], np.uint64(1), rng[4], rng[5])
-        rng[3] += np.uint64(1)
-        i = np.uint64(0)
-    rng[0] = i + np.uint64(1)
-    return (float(rng[np.int64(i) + 6]) + 0.5) * 2.0**-32
+    s0, s1 = rng[0], rng[1]
+    word = s0 + s1
+    s1 ^= s0
+    rng[0] = ((s0 << np.uint64(24)) | (s0 >> np.uint64(40))) ^ s1 ^ (s1 << np.uint64(16))
+    rng[1] = (s1 << np.uint64(37)) | (s1 >> np.uint64(27))
+    return (float(word >> np.uint64(12)) + 0.5) * 2.0**-52
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -380,19 +380,8 @@ def _history(volume, prims, blocks, tables, beam, regions, spectrum, scratch, rn
         order += 1
         if pick < found[0] + found[1]:
             if images.size > 0:
-                _force(
-                    volume,
-                    prims,
-                    tables,
-                    beam,
-                    m,
-                    energy,
-                    ray,
-                    way,
-                    work,
-                    rng,
-                    images[SINGLE if order == 1 else MULTIPLE],
-                )
+                image = images[SINGLE if order == 1 else MULTIPLE]
+                _force(volume, prims, tables, beam, m, energy, ray, way, work, rng, image)
             ratio, cos = _compton(bound, m, energy, per_q, rng)
             if where >= 0:
                 deposit[where] += energy * (1.0 - ratio)
@@ -401,7 +390,8 @@ def _history(volume, prims, blocks, tables, beam, regions, spectrum, scratch, rn
         else:
             _turn(ray, _rayleigh(form, m, energy, per_q, rng), 2.0 * math.pi * _uniform(rng))
             if images.size > 0:
-                _reach(volume, prims, tables, beam, energy, ray, way, work, images[SINGLE if order == 1 else MULTIPLE])
+                image = images[SINGLE if order == 1 else MULTIPLE]
+                _reach(volume, prims, tables, beam, energy, ray, way, work, image)
         if energy < CUT:
             if where >= 0:
                 deposit[where] += energy
@@ -422,10 +412,10 @@ def transport(volume, prims, blocks, tables, beam, regions, spectrum, key, first
 
     `volume` is (code, slot, pool, density, grid) of `ctsim.bricks.Bricks`; `prims` as in `ctsim.solids.pack`; `blocks`
     (kind, most, first, listed, frame) of `ctsim.montecarlo.world.Blocks`; `tables` (mu, klein, bound, form, 1/d_q);
-    `beam` (pose, pixels (v, u), detector normal times area in mm², absorbed signal by energy, distance of the source from
-    the detector's plane, or 0 for as many photons on every unit of its area); `regions` uint8
-    [z, y, x]; `spectrum` (cumulative weights, energies). `images` [chunk, order, v, u] gets the signal of primary, once
-    and more often scattered photons; `deposit` [chunk, region] the absorbed energy (keV). Either may be empty.
+    `beam` (pose, pixels (v, u), detector normal times area in mm², absorbed signal by energy, distance of the source
+    from the detector's plane, or 0 for as many photons on every unit of its area); `regions` uint8 [z, y, x];
+    `spectrum` (cumulative weights, energies). `images` [chunk, order, v, u] gets the signal of photons scattered never,
+    once and more often; `deposit` [chunk, region] the absorbed energy (keV). Either may be empty.
     """
     for chunk in prange(CHUNKS):
         n_m = mu_count(tables)
@@ -436,7 +426,7 @@ def transport(volume, prims, blocks, tables, beam, regions, spectrum, key, first
             np.empty((2 * n_p + 1, 3)), np.empty(4),
         )  # fmt: skip
         scratch = (np.empty(7), np.empty(7), np.empty(3, np.float32), work)
-        rng = np.zeros(10, np.uint64)
+        rng = np.zeros(2, np.uint64)
         for history in range(first + chunk * count // CHUNKS, first + (chunk + 1) * count // CHUNKS):
             _start(rng, key, np.uint64(history))
             _history(

@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 
 from ctsim.materials import material
 
-REST, HC = 510.998950, 12.3984198
+REST = 510.998950  # keV
+AVOGADRO = 0.602214076  # per mol, times 1e-24 cm² per barn
 Law = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
@@ -73,21 +74,11 @@ def _mu(which, energy: float) -> float:
 
 
 def _compton(weights: dict[int, float], energy: float, cosines: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return cm² per sr and g: xraylib's differential cross-section (barn per atom and sr)."""
-    avogadro = 0.602214076
-    return np.array(
-        [
-            sum(n * avogadro * xrl.DCSb_Compt(z, energy, max(float(np.arccos(c)), 1e-3)) for z, n in weights.items())
-            for c in cosines
-        ]
-    )
+    """Return cm² per sr and g, from xraylib's barn per sr and atom."""
+    angles = np.maximum(np.arccos(cosines), 1e-3).tolist()
+    return AVOGADRO * np.array([sum(n * xrl.DCSb_Compt(z, energy, a) for z, n in weights.items()) for a in angles])
 
 
 def _rayleigh(weights: dict[int, float], energy: float, cosines: NDArray[np.float64]) -> NDArray[np.float64]:
-    avogadro = 0.602214076
-    return np.array(
-        [
-            sum(n * avogadro * xrl.DCSb_Rayl(z, energy, max(float(np.arccos(c)), 1e-3)) for z, n in weights.items())
-            for c in cosines
-        ]
-    )
+    angles = np.maximum(np.arccos(cosines), 1e-3).tolist()
+    return AVOGADRO * np.array([sum(n * xrl.DCSb_Rayl(z, energy, a) for z, n in weights.items()) for a in angles])
