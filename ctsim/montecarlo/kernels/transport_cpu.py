@@ -61,7 +61,7 @@ def _label(code, slot, pool, density, grid, x, y, z):
     return label, relative
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _crossed(prims, first, listed, block, ray, start, end, pair, hits):
     """List the parts (enter, leave, material) of a ray between start and end in a block's solids; return how many."""
     n = 0
@@ -88,7 +88,7 @@ def _within(hits, n, t, end):
     return m, until
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _fly(volume, prims, blocks, mu, energy, ray, pair, hits, rng, found):
     """Move a photon to its next collision; fill `found` with the attenuations, return the material, -1 if it leaves."""
     kind, most, first, listed, frame = blocks
@@ -188,7 +188,7 @@ def _bound(bound, m, q, per_q):
     return bound[m, i] + (place - i) * (bound[m, i + 1] - bound[m, i])
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _compton(bound, m, energy, per_q, rng):
     """Draw a Compton collision by Klein–Nishina times the incoherent scattering function; return ε and cos θ."""
     alpha = energy / REST
@@ -206,7 +206,7 @@ def _compton(bound, m, energy, per_q, rng):
             return ratio, 1.0 - away
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _rayleigh(form, m, energy, per_q, rng):
     """Draw the cosine of a Rayleigh collision: q² by the squared form factor, then Thomson's law by rejection."""
     last = min(energy / HC * per_q, form.shape[1] - 1.001)
@@ -229,7 +229,7 @@ def _rayleigh(form, m, energy, per_q, rng):
             return cos
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _depth(volume, prims, mu, energy, ray, work):
     """Return the optical thickness from a ray's start to its end, `ray[6]` mm along it."""
     lengths, covered, painted, pieces, hits, pair = work
@@ -279,7 +279,7 @@ def _aim(ray, way, x, y, z):
     way[3], way[4], way[5], way[6] = dx / length, dy / length, dz / length, length
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _force(volume, prims, tables, beam, m, energy, ray, way, work, rng, image):
     """Score what a Compton collision sends to a random place of the detector, on average over all its outcomes."""
     mu, klein, bound, _, per_q = tables
@@ -311,7 +311,7 @@ def _force(volume, prims, tables, beam, m, energy, ray, way, work, rng, image):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _reach(volume, prims, tables, beam, energy, ray, way, work, image):
     """Score a photon at the place of the detector that it flies to, by its chance to get there."""
     pose, extent, normal, signal, _ = beam
@@ -338,7 +338,7 @@ def _reach(volume, prims, tables, beam, energy, ray, way, work, image):
         image[int(v * rows), int(u * columns)] += math.exp(-tau) * _absorbed(signal, energy)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _history(volume, prims, blocks, tables, beam, regions, spectrum, scratch, rng, images, deposit):
     """Follow one photon from the source until it is absorbed or leaves."""
     mu, _, bound, form, per_q = tables
