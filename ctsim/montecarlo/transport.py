@@ -125,8 +125,8 @@ def _run(
     transport_cpu.transport(
         tuple(world.bricks[:5]), world.prims, tuple(world.blocks),
         (tables.mu, tables.klein, tables.bound, tables.form, 1.0 / tables.d_q),
-        (pose, np.array(n_detector, np.float64), normal, absorbed, nearest if isotropic else 0.0),
+        (np.array(pose), np.array(n_detector, np.float64), normal, absorbed, nearest if isotropic else 0.0),
         np.zeros((1, 1, 1), np.uint8) if regions is None else regions,
-        (np.cumsum(spectrum.weights), spectrum.energies),
+        (np.cumsum(spectrum.weights), np.array(spectrum.energies)),
         stream_key(stream, "montecarlo", 0), 0, histories, images, deposit,
     )  # fmt: skip

@@ -13,6 +13,7 @@ from numba import njit, prange
 
 from ctsim.kernels.bricks_cpu import CELLS, CODE_BITS, MIXED, SIDE, walk
 from ctsim.kernels.noise_cpu import philox
+from ctsim.kernels.once import compiled_once
 from ctsim.kernels.raytrace_cpu import _paint
 from ctsim.kernels.solids_cpu import intersect
 
@@ -406,7 +407,38 @@ def _region(regions, grid, ray):
     return 0
 
 
+VOLUME = "Tuple((uint16[:,:,:,::1], int32[:,:,::1], uint8[::1], float32[::1], float64[::1]))"
+BLOCKS = "Tuple((int64[:,:,::1], float32[:,::1], int64[::1], int64[::1], float64[::1]))"
+TABLES = "Tuple((float32[:,:,::1], float32[:,::1], float32[:,::1], float64[:,::1], float64))"
+BEAM = "Tuple((float64[::1], float64[::1], float64[::1], float64[::1], float64))"
+
+
+@compiled_once(
+    *(VOLUME, "float64[:,::1]", BLOCKS, TABLES, BEAM, "uint8[:,:,::1]", "UniTuple(float64[::1], 2)", "uint64", "int64"),
+    *("int64", "float64[:,:,::1]", "float64[::1]"),
+)
+def _histories(volume, prims, blocks, tables, beam, regions, spectrum, key, first, last, images, deposit):
+    n_m, n_p, grid = tables[0].shape[0], prims.shape[0], volume[4]
+    lengths, covered, painted = np.empty(n_m), np.empty(n_m), np.empty(n_m)
+    pieces, hits, pair = np.empty((int(grid[0] + grid[1] + grid[2]) + 8, 3)), np.empty((2 * n_p + 1, 3)), np.empty(4)
+    work = lengths, covered, painted, pieces, hits, pair
+    scratch = np.empty(7), np.empty(7), np.empty(3, np.float32), work
+    rng = np.zeros(2, np.uint64)
+    for history in range(first, last):
+        _start(rng, key, np.uint64(history))
+        _history(volume, prims, blocks, tables, beam, regions, spectrum, scratch, rng, images, deposit)
+
+
 @njit(parallel=True, cache=True, error_model="numpy")
+def _chunks(histories, volume, prims, blocks, tables, beam, regions, spectrum, key, first, count, images, deposit):
+    for chunk in prange(CHUNKS):
+        start, stop = first + chunk * count // CHUNKS, first + (chunk + 1) * count // CHUNKS
+        _histories(
+            histories, volume, prims, blocks, tables, beam, regions, spectrum, key, start, stop, images[chunk],
+            deposit[chunk],
+        )  # fmt: skip
+
+
 def transport(volume, prims, blocks, tables, beam, regions, spectrum, key, first, count, images, deposit):
     """Follow histories first … first + count − 1 of the stream `key`, and add up what they leave.
 
@@ -417,24 +449,6 @@ def transport(volume, prims, blocks, tables, beam, regions, spectrum, key, first
     `spectrum` (cumulative weights, energies). `images` [chunk, order, v, u] gets the signal of photons scattered never,
     once and more often; `deposit` [chunk, region] the absorbed energy (keV). Either may be empty.
     """
-    for chunk in prange(CHUNKS):
-        n_m = mu_count(tables)
-        n_p = prims.shape[0]
-        grid = volume[4]
-        work = (
-            np.empty(n_m), np.empty(n_m), np.empty(n_m), np.empty((int(grid[0] + grid[1] + grid[2]) + 8, 3)),
-            np.empty((2 * n_p + 1, 3)), np.empty(4),
-        )  # fmt: skip
-        scratch = (np.empty(7), np.empty(7), np.empty(3, np.float32), work)
-        rng = np.zeros(2, np.uint64)
-        for history in range(first + chunk * count // CHUNKS, first + (chunk + 1) * count // CHUNKS):
-            _start(rng, key, np.uint64(history))
-            _history(
-                volume, prims, blocks, tables, beam, regions, spectrum, scratch, rng, images[chunk], deposit[chunk]
-            )
-
-
-@njit(cache=True, inline="always")
-def mu_count(tables):
-    """Return the number of materials."""
-    return tables[0].shape[0]
+    _chunks(
+        _histories.address(), volume, prims, blocks, tables, beam, regions, spectrum, key, first, count, images, deposit
+    )
