@@ -413,30 +413,52 @@ TABLES = "Tuple((float32[:,:,::1], float32[:,::1], float32[:,::1], float64[:,::1
 BEAM = "Tuple((float64[::1], float64[::1], float64[::1], float64[::1], float64))"
 
 
-@compiled_once(
-    *(VOLUME, "float64[:,::1]", BLOCKS, TABLES, BEAM, "uint8[:,:,::1]", "UniTuple(float64[::1], 2)", "uint64", "int64"),
-    *("int64", "float64[:,:,::1]", "float64[::1]"),
+SCRATCH = (
+    "Tuple((float64[:,::1], float64[:,::1], float64[:,::1], float64[:,::1], float32[::1], uint64[::1]))"  # of a chunk
 )
-def _histories(volume, prims, blocks, tables, beam, regions, spectrum, key, first, last, images, deposit):
-    n_m, n_p, grid = tables[0].shape[0], prims.shape[0], volume[4]
-    lengths, covered, painted = np.empty(n_m), np.empty(n_m), np.empty(n_m)
-    pieces, hits, pair = np.empty((int(grid[0] + grid[1] + grid[2]) + 8, 3)), np.empty((2 * n_p + 1, 3)), np.empty(4)
-    work = lengths, covered, painted, pieces, hits, pair
-    scratch = np.empty(7), np.empty(7), np.empty(3, np.float32), work
-    rng = np.zeros(2, np.uint64)
+
+
+@compiled_once(
+    *(VOLUME, "float64[:,::1]", BLOCKS, TABLES, BEAM, "uint8[:,:,::1]", "UniTuple(float64[::1], 2)", SCRATCH, "uint64"),
+    *("int64", "int64", "float64[:,:,::1]", "float64[::1]"),
+)
+def _histories(volume, prims, blocks, tables, beam, regions, spectrum, scratch, key, first, last, images, deposit):
+    rays, lengths, pieces, hits, found, rng = scratch
+    work = lengths[0], lengths[1], lengths[2], pieces, hits, rays[2]
+    parts = rays[0], rays[1], found, work
     for history in range(first, last):
         _start(rng, key, np.uint64(history))
-        _history(volume, prims, blocks, tables, beam, regions, spectrum, scratch, rng, images, deposit)
+        _history(volume, prims, blocks, tables, beam, regions, spectrum, parts, rng, images, deposit)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _chunks(histories, volume, prims, blocks, tables, beam, regions, spectrum, key, first, count, images, deposit):
+def _chunks(
+    histories, volume, prims, blocks, tables, beam, regions, spectrum, scratch, key, first, count, images, deposit
+):  # fmt: skip
+    rays, lengths, pieces, hits, found, rng = scratch
     for chunk in prange(CHUNKS):
         start, stop = first + chunk * count // CHUNKS, first + (chunk + 1) * count // CHUNKS
+        mine = rays[chunk], lengths[chunk], pieces[chunk], hits[chunk], found[chunk], rng[chunk]
         _histories(
-            histories, volume, prims, blocks, tables, beam, regions, spectrum, key, start, stop, images[chunk],
+            histories, volume, prims, blocks, tables, beam, regions, spectrum, mine, key, start, stop, images[chunk],
             deposit[chunk],
         )  # fmt: skip
+
+
+def _scratch(n_materials, n_prims, grid):
+    """Return memory for each chunk.
+
+    It is made here, since Numba counts references, atomically, of arrays that compiled code made: they would take more
+    than half of the time.
+    """
+    return (
+        np.empty((CHUNKS, 3, 8)),
+        np.empty((CHUNKS, 3, n_materials)),
+        np.empty((CHUNKS, int(grid[:3].sum()) + 8, 3)),
+        np.empty((CHUNKS, 2 * n_prims + 1, 3)),
+        np.empty((CHUNKS, 3), np.float32),
+        np.empty((CHUNKS, 2), np.uint64),
+    )
 
 
 def transport(volume, prims, blocks, tables, beam, regions, spectrum, key, first, count, images, deposit):
@@ -449,6 +471,8 @@ def transport(volume, prims, blocks, tables, beam, regions, spectrum, key, first
     `spectrum` (cumulative weights, energies). `images` [chunk, order, v, u] gets the signal of photons scattered never,
     once and more often; `deposit` [chunk, region] the absorbed energy (keV). Either may be empty.
     """
+    scratch = _scratch(tables[0].shape[0], prims.shape[0], volume[4])
     _chunks(
-        _histories.address(), volume, prims, blocks, tables, beam, regions, spectrum, key, first, count, images, deposit
-    )
+        _histories.address(), volume, prims, blocks, tables, beam, regions, spectrum, scratch, key, first, count,
+        images, deposit,
+    )  # fmt: skip
