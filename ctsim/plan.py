@@ -28,6 +28,8 @@ from ctsim.types import Phantom, Scanner
 THICKNESS_MARGIN = 1.1  # a coarse survey can miss the thickest ray
 # a draw and core, a byte, a voxel of a scan's labels and references (4.4 s for 2 scans of 256³)
 NOISE_SECONDS, WRITE_SECONDS, VOLUME_SECONDS = 40e-9, 1e-9, 130e-9
+# core-seconds of scatter by Monte Carlo, a scan to 2 % (5 to 12 for the scenes of `quick` and a head of water)
+SCATTER_SECONDS, SCATTER_ERROR = 10.0, 0.02
 PLANNING_BYTES = 45_000_000  # of the search for energies
 
 
@@ -55,7 +57,9 @@ class Plan:
 
     `materials` are the ones that rays meet, air first. In P = −ln(signal/open), `error` is the greatest found of the
     energy quadrature and `edge_error` is the largest found in eight windows at edges of inserts, in one view (see
-    `ctsim.survey`); `l0` is the median water-equivalent path of the body in mm. `memory_bytes` estimates the arrays;
+    `ctsim.survey`); `scatter_error` is the RMS error of scatter by Monte Carlo over its mean, None for other scatter;
+    `scatter_fraction` is the constant of level 1, whose error is not known. `l0` is the median water-equivalent path of
+    the body in mm. `memory_bytes` estimates the arrays;
     Python and its libraries take a quarter of a gigabyte more. `notes` are those of `ctsim.notes`.
     """
 
@@ -69,6 +73,7 @@ class Plan:
     spectrum: Spectrum
     l0: float
     scatter_fraction: float
+    scatter_error: float | None
     edge_error: float
     n_rays: int
     seconds: float
@@ -88,7 +93,7 @@ class Plan:
 
     def to_dict(self) -> dict:
         """Return the plan for plan.json."""
-        return {
+        told = {
             "stream_id": self.stream_id,
             "simulation": msgspec.to_builtins(self.settings),
             "truth": msgspec.to_builtins(self.truth),
@@ -106,7 +111,12 @@ class Plan:
             "flops": self.flops,
             "memory_bytes": self.memory_bytes,
             "seconds": self.seconds,
-        } | ({"notes": list(self.notes)} if self.notes else {})
+        }
+        if self.scatter_error is not None:
+            told["scatter_error"] = self.scatter_error
+        if self.notes:
+            told["notes"] = list(self.notes)
+        return told
 
     def text(self) -> str:
         """Return the plan for people: what is done, what is skipped and why, error, and what it takes."""
@@ -116,10 +126,11 @@ class Plan:
             if not stage.runs:
                 skipped.setdefault(stage.reason, []).append(stage.name)
         edges = f", {self.edge_error:.0e} (worst edge pixel looked at)" if self.edge_error else ""
+        scatter = f", {self.scatter_error:.0%} of the scatter" if self.scatter_error else ""
         lines = {
             "does": does,
             "skips": "; ".join(f"{reason}: {', '.join(names)}" for reason, names in skipped.items()),
-            "error": f"{self.error:.0e} (energies){edges}",
+            "error": f"{self.error:.0e} (energies){edges}{scatter}",
             "takes": f"{human_time(self.seconds)}, {human_bytes(self.disk_bytes)} on disk, "
             f"{human_bytes(self.memory_bytes)} of memory, {self.n_rays / 1e6:.3g} M rays, {self.flops / 1e9:.2g} Gflop",
         }
@@ -147,6 +158,8 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
     n_rays, n_voxels = int(np.prod(scanner.geometry.shape)), int(np.prod(scanner.geometry.n_voxel))
     draws = n_rays * (2 if twin else 1) * (scanner.noise.model != "none")
     disk = _disk_bytes(outputs, scanner.geometry, twin)
+    scatter_error = simulation.scatter_error if scanner.scatter.level == 3 else None
+    scatter = 0.0 if scatter_error is None else SCATTER_SECONDS * (SCATTER_ERROR / scatter_error) ** 2
     passes = 2 if scanner.noise.model == "tigre" else 1  # the first finds the scan's largest P
     return Plan(
         stream_id=stream_id,
@@ -159,11 +172,13 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
         spectrum=source,
         l0=found.median_path(phantom.materials, mean_energy),
         scatter_fraction=open_fraction(scanner.scatter, scanner.geometry),
+        scatter_error=scatter_error,
         edge_error=tried.edge_error,
         n_rays=n_rays,
         seconds=passes * scanner.geometry.n_views * tried.seconds
         + draws * NOISE_SECONDS / numba.get_num_threads()
         + n_voxels * (2 if twin else 1) * VOLUME_SECONDS
+        + scatter * (2 if twin else 1) / numba.get_num_threads()
         + disk * WRITE_SECONDS,
         flops=float(n_rays) * len(rule.energies) * (2 * len(present) + 16),
         disk_bytes=disk,

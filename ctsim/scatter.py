@@ -1,7 +1,7 @@
 """Scatter that is added to the mean signal before any photon is drawn.
 
 Level 0 adds nothing; level 1 adds one constant to every pixel of every view, as a fraction S/I0 of the
-open field.
+open field; level 3 is a Monte Carlo simulation of the scene, see `ctsim.montecarlo.series`.
 """
 
 import math
@@ -16,18 +16,18 @@ from ctsim.geometry import Geometry
 class Scatter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The scatter model."""
 
-    level: Literal[0, 1] = 0
-    """0: none. 1: one constant in every pixel."""
+    level: Literal[0, 1, 3] = 0
+    """0: none. 1: one constant in every pixel. 3: by Monte Carlo, for this object with and without its metal."""
     fraction: Annotated[float, msgspec.Meta(ge=0, lt=10)] | None = None
     """The constant as a share of the open field, instead of the geometry's; needs level 1."""
 
     def __post_init__(self) -> None:
-        if self.level not in (0, 1):
-            raise InputError(f"scatter.level must be 0 or 1, got {self.level}")
+        if self.level not in (0, 1, 3):
+            raise InputError(f"scatter.level must be 0, 1 or 3, got {self.level}")
         if self.fraction is not None and not 0 <= self.fraction < 10:
             raise InputError(f"scatter.fraction must be within [0, 10) of the open field, got {self.fraction}")
-        if self.fraction is not None and self.level == 0:
-            raise InputError(f"scatter.fraction = {self.fraction} needs scatter.level = 1, got level 0")
+        if self.fraction is not None and self.level != 1:
+            raise InputError(f"scatter.fraction = {self.fraction} needs scatter.level = 1, got level {self.level}")
 
 
 def constant_fraction(geometry: Geometry) -> float:
@@ -46,7 +46,7 @@ def constant_fraction(geometry: Geometry) -> float:
 
 
 def open_fraction(scatter: Scatter, geometry: Geometry) -> float:
-    """Return the S/I0 that a scan adds to every pixel: 0 at level 0, else given or from the geometry."""
-    if scatter.level == 0:
+    """Return the S/I0 that level 1 adds to every pixel, given or from the geometry; 0 at other levels."""
+    if scatter.level != 1:
         return 0.0
     return constant_fraction(geometry) if scatter.fraction is None else scatter.fraction

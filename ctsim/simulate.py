@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from ctsim.detector import response
 from ctsim.materials import attenuation
+from ctsim.montecarlo.series import ScatterSeries, scatter_series
+from ctsim.montecarlo.transport import Source
 from ctsim.noise import detect, detect_tigre, flat_field, largest_p, pixel_pattern
 from ctsim.plan import Plan
 from ctsim.project import Response, Tracer, path_lengths, transmit
@@ -91,17 +93,23 @@ class _Simulator:
         self.names = {o.name for o in plan.outputs}
         self.lengths = np.zeros((len(self.tracer.materials), *self.geometry.n_detector), np.float32)
 
+        self.scatter = [self._scatter(body)]
+        if "metal_free/counts" in self.names:
+            self.scatter.append(self._scatter(body.without_metal()))
         self.largest = self._largest_p() if scanner.noise.model == "tigre" else [math.nan] * 2
 
     def view(self, k: int) -> dict[str, NDArray]:
         """Everything the plan wants of view k."""
         scan, twin, spans = self._signals(k)
-        out = self._images(*scan)
-        out["counts"] = self._counts(*scan, k, self.largest[0])
+        lit = self._lit(scan, k, 0)
+        out = self._images(scan, lit)
+        out["counts"] = self._counts(lit, k, self.largest[0])
         if twin is not None:
-            images = self._images(*twin)
-            known = None if spans is None else (out["counts"].copy(), spans)
-            images["counts"] = self._counts(*twin, k, self.largest[1], known)
+            lit = self._lit(twin, k, 1)
+            images = self._images(twin, lit)
+            # scatter of its own makes every pixel of the twin another
+            known = None if spans is None or self.scatter[1] else (out["counts"].copy(), spans)
+            images["counts"] = self._counts(lit, k, self.largest[1], known)
             out |= {f"metal_free/{name}": image for name, image in images.items()}
         return out | self._paths(k)
 
@@ -126,7 +134,7 @@ class _Simulator:
         for k in range(self.geometry.n_views):
             for which, moments in enumerate(self._signals(k)[:2]):
                 if moments is not None:
-                    largest[which] = max(largest[which], largest_p(self._lit(*moments)[0]))
+                    largest[which] = max(largest[which], largest_p(self._lit(moments, k, which)[0]))
         return largest
 
     def _transmit(self, tracer: Tracer, k: int, out: tuple[Image, Image, NDArray] | None = None) -> tuple[Image, Image]:
@@ -141,23 +149,43 @@ class _Simulator:
             out=out,
         )
 
-    def _lit(self, m1: Image, m2: Image) -> Moments:
-        """Return the moments of what reaches the detector, scatter included."""
+    def _scatter(self, body: Phantom) -> ScatterSeries | None:
+        """Follow photons through a body, where the plan wants that."""
+        if self.scanner.scatter.level != 3:
+            return None
+        source = Source(
+            spectrum=self.plan.spectrum,
+            detector=self.scanner.detector,
+            n_detector=self.geometry.n_detector,
+            gain=self.beam.gain,
+            layer=self.beam.layer,
+            layer_material=self.beam.layer_material,
+        )
+        return scatter_series(
+            body, source, self.geometry, tolerance=self.plan.settings.scatter_error, stream=self.plan.stream_id
+        )
+
+    def _lit(self, moments: Moments, k: int, which: int) -> Moments:
+        """Return the moments of what reaches the detector in view k of the scan (0) or its twin (1), with scatter."""
+        m1, m2 = moments
         if self.beam.gain is not None:
             m1, m2 = m1 * self.beam.gain, m2 * self.beam.gain
+        if (series := self.scatter[which]) is not None:
+            s1, s2 = series.view(k)
+            return m1 + s1, m2 + s2
         s = self.plan.scatter_fraction
         if s:
             # scattered photons carry the open field's spectrum, and come from all over the object: no heel of a pixel's
             m1, m2 = m1 + np.float32(s), m2 + np.float32(s * self.plan.rule.w2.sum())
         return m1, m2
 
-    def _images(self, m1: Image, m2: Image) -> dict[str, NDArray]:
-        """Return the noise-free images that were asked for."""
-        out: dict[str, NDArray] = {}
+    def _images(self, moments: Moments, lit: Moments) -> dict[str, NDArray]:
+        """Return the noise-free images that were asked for, of the moments without and with scatter."""
+        m1, out = moments[0], {}
         if "scatter_free" in self.names:
             out["scatter_free"] = -np.log(m1 / self.beam.open1)
         if "noise_free" in self.names:
-            seen, opened = self._lit(m1, m2)[0], self.beam.open1
+            seen, opened = lit[0], self.beam.open1
             if self.beam.gain is not None:
                 # behind the anode there is no open field to divide by: what the primary alone would give
                 seen, opened = np.where(self.beam.gain > 0, (seen, opened * self.beam.gain), (m1, opened))
@@ -165,10 +193,10 @@ class _Simulator:
         return out
 
     def _counts(
-        self, m1: Image, m2: Image, k: int, largest: float, known: tuple[NDArray, NDArray[np.int64]] | None = None
+        self, moments: Moments, k: int, largest: float, known: tuple[NDArray, NDArray[np.int64]] | None = None
     ) -> NDArray:
         """Draw the counts; `known` = (counts, spans) are counts to be drawn again in those columns only."""
-        m1, m2 = self._lit(m1, m2)
+        m1, m2 = moments
         key, noise, i0 = stream_key(self.plan.stream_id, "view", k), self.scanner.noise, self.scanner.i0
         if noise.model == "tigre":
             return detect_tigre(m1, top=largest, noise=noise, i0=i0, key=key)

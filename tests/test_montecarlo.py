@@ -4,10 +4,11 @@ import numba
 import numpy as np
 import pytest
 
+from ctsim.detector import Detector
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.montecarlo.kernels.transport_reference import single_scatter
-from ctsim.montecarlo.transport import absorbed_energy, scatter_image
+from ctsim.montecarlo.transport import Source, absorbed_energy, scatter_image
 from ctsim.montecarlo.world import World
 from ctsim.project import Tracer, path_lengths
 from ctsim.solids import ELLIPSOID, FRUSTUM, Primitive, Solid
@@ -18,10 +19,7 @@ POSE = np.array([250.0, 0, 0, -250, 0, 0, 0, 120, 0, 0, 0, 120])
 DRY_AIR = "C 0.0124 N 75.5268 O 23.1781 Ar 1.2827@0.00120479"
 SOFT = "H 10.5 C 25.6 N 2.7 O 60.2 Na 0.1 P 0.2 S 0.3 Cl 0.2 K 0.2@1.03"  # TG-195, table of materials
 SIGMAS = 4.0
-
-
-def mono(energy):
-    return Spectrum(energies=np.array([energy]), weights=np.array([1.0]))
+ALL = Detector(kind="ideal", thickness=100.0)  # takes all energy, to 1e-4 at 120 keV
 
 
 def ball(material, radius=30.0, n=80, **more):
@@ -31,24 +29,28 @@ def ball(material, radius=30.0, n=80, **more):
     return Phantom(labels=labels, materials=("air", material), d_voxel=(1.0, 1.0, 1.0), solids=(solid,), **more)
 
 
+def source(energy, n_detector=(1, 1), **more):
+    spectrum = Spectrum(energies=np.array([energy]), weights=np.array([1.0]))
+    return Source(spectrum=spectrum, detector=ALL, n_detector=n_detector, **more)
+
+
 def image(phantom, energy, histories, cells=(3, 3), **more):
-    return scatter_image(
-        World.of(phantom, energy + 1), mono(energy), np.array([energy]), POSE, (1, 1), cells=cells, histories=histories,
-        **more,
-    )  # fmt: skip
+    world = World.of(phantom, energy + 1)
+    return scatter_image(world, source(energy), POSE, cells=cells, histories=histories, **more)
 
 
 @pytest.mark.parametrize(("material", "energy"), [("water", 60.0), ("water", 25.0), ("Al", 80.0), ("PMMA", 120.0)])
 def test_photons_scattered_once_are_as_many_as_quadrature_says(material, energy):
     """The reference shares neither sampling nor tables: xraylib's differential cross-sections, integrated."""
-    fine = single_scatter(material, 30.0, energy, POSE, (9, 9), nodes=32)
-    expected = sum(fine).reshape(3, 3, 3, 3).sum((1, 3)) * 9 / energy
+    fine = single_scatter(material, 30.0, energy, POSE, (27, 27), nodes=24)
+    expected = sum(fine).reshape(3, 9, 3, 9).sum((1, 3)) * 9 / energy
     found = image(ball(material), energy, 1_500_000)
     off = (found.single - expected) / found.error
     assert abs(off).max() < SIGMAS, off
     assert found.error.max() < 0.06 * expected.max()
     total = found.single.sum() / expected.sum() - 1
-    assert abs(total) < SIGMAS * np.sqrt((found.error**2).sum()) / expected.sum()
+    # xraylib's total cross-sections differ from the integrals of its differential ones by up to 0.4 %
+    assert abs(total) < 0.004 + SIGMAS * np.sqrt((found.error**2).sum()) / expected.sum()
 
 
 @pytest.mark.parametrize("voxels", [False, True])
@@ -73,7 +75,7 @@ def test_primary_photons_are_as_many_as_the_ray_tracer_says(voxels):
         dsd=500.0, n_views=1,
     )  # fmt: skip
     found = scatter_image(
-        World.of(phantom, 71.0), mono(energy), np.array([energy]), geometry.pose(0), geometry.n_detector, cells=cells,
+        World.of(phantom, 71.0), source(energy, geometry.n_detector), geometry.pose(0), cells=cells,
         histories=4_000_000,
     )  # fmt: skip
     lengths = path_lengths(Tracer.of(phantom), geometry, 0)
@@ -126,7 +128,7 @@ def test_energy_is_kept():
     """In a ball that lets nothing out, all energy is absorbed."""
     regions = np.ones((80, 80, 80), np.uint8)
     pose = np.array([0.0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1])  # from the middle outwards
-    found, _ = absorbed_energy(World.of(ball("Fe"), 61.0), mono(60.0), pose, (1, 1), regions, histories=20_000)
+    found, _ = absorbed_energy(World.of(ball("Fe"), 61.0), source(60.0), pose, regions, histories=20_000)
     assert found.sum() == pytest.approx(60.0, rel=1e-3)
 
 
@@ -156,7 +158,7 @@ def test_tg195_case_2_radiography():
     phantom = Phantom(labels=labels, materials=("air", DRY_AIR, SOFT), d_voxel=(5.0,) * 3, off_origin=(900.0, 0.0, 0.0))
     pose = np.array([0.0, 0, 1e-3, 0, 0, 1800, 390, 0, 0, 0, 390, 0])
     found, error = absorbed_energy(
-        World.of(phantom, 58.0), mono(56.4), pose, (1, 1), regions, histories=2_000_000, isotropic=True
+        World.of(phantom, 58.0), source(56.4, isotropic=True), pose, regions, histories=2_000_000
     )
     assert found[1:].sum() * 1e3 == pytest.approx(BODY, rel=3e-3)
     off = (found[2:] * 1e3 - CUBES) / np.hypot(error[2:] * 1e3, 0.005 * np.array(CUBES))  # codes differ by 0.5 %
@@ -180,7 +182,7 @@ def test_tg195_case_4_computed_tomography(wide, expected):
     )  # fmt: skip
     pose = np.array([600.0, 0, 0, 0, 0, 0, 0, 320, 0, 0, 0, wide])
     found, error = absorbed_energy(
-        World.of(phantom, 58.0), mono(56.4), pose, (1, 1), regions, histories=600_000, isotropic=True
+        World.of(phantom, 58.0), source(56.4, isotropic=True), pose, regions, histories=600_000
     )
     off = (found[1:] * 1e3 - expected) / np.hypot(error[1:] * 1e3, 0.005 * np.array(expected))
     assert abs(off).max() < SIGMAS, (found[1:] * 1e3 / expected - 1, off)

@@ -48,7 +48,7 @@ class Interactions(NamedTuple):
 @functools.lru_cache(maxsize=8)
 def _tabulated(materials: tuple[str, ...], e_max: float) -> Interactions:
     n = math.ceil((e_max - E_MIN) / STEP) + 2
-    energies = E_MIN + STEP * np.arange(n)
+    energies = E_MIN + STEP * np.arange(n, dtype=np.float64)
     q = np.linspace(0.0, energies[-1] / HC, N_Q)
     mu, klein = np.zeros((len(materials), n, 3)), np.ones((len(materials), n))
     bound, form = np.zeros((len(materials), N_Q)), np.zeros((len(materials), N_Q))

@@ -5,13 +5,46 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.detector import Detector, response
 from ctsim.errors import InputError
-from ctsim.materials import E_MIN
+from ctsim.materials import E_MIN, attenuation
 from ctsim.montecarlo.kernels import transport_cpu
+from ctsim.montecarlo.kernels.transport_cpu import CHUNKS, MULTIPLE, SINGLE, SQUARED
 from ctsim.montecarlo.tables import STEP
 from ctsim.montecarlo.world import World
 from ctsim.rng import stream_key
 from ctsim.spectrum import Spectrum
+
+PLANES = SQUARED + 1
+_NONE = np.zeros((0, 0), np.float32)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """Photons on their way to a detector of `n_detector` (v, u) pixels.
+
+    As many photons start to each pixel, or into each solid angle if `isotropic`. `gain` and `layer`, float32 [v, u],
+    are the intensity of a pixel and the mm of `layer_material` before it, as of a bow-tie filter. The detector takes
+    photons from all sides as it takes those that hit it head-on.
+    """
+
+    spectrum: Spectrum
+    detector: Detector
+    n_detector: tuple[int, int]
+    isotropic: bool = False
+    gain: NDArray[np.float32] | None = None
+    layer: NDArray[np.float32] | None = None
+    layer_material: str | None = None
+
+    @property
+    def most(self) -> float:
+        """The greatest intensity of a pixel."""
+        return 1.0 if self.gain is None else float(self.gain.max())
+
+    @property
+    def open_signal(self) -> float:
+        """Mean signal of a photon in the open field."""
+        return float(self.spectrum.weights @ response(self.detector, self.spectrum.energies)[0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,12 +52,14 @@ class Image:
     """What reaches the detector, as a share of the open field's signal: float64 [v, u] on cells of the detector.
 
     `primary`, `single` and `multiple` are photons that were scattered not at all, once and more often; `error` is the
-    standard error of single + multiple.
+    standard error of single + multiple. `squared` is the mean squared signal of scattered photons over the squared mean
+    of the open field, as m2 in `ctsim.quadrature`.
     """
 
     primary: NDArray[np.float64]
     single: NDArray[np.float64]
     multiple: NDArray[np.float64]
+    squared: NDArray[np.float64]
     error: NDArray[np.float64]
 
     @property
@@ -35,98 +70,97 @@ class Image:
 
 def scatter_image(
     world: World,
-    spectrum: Spectrum,
-    signal: NDArray[np.float64],
+    source: Source,
     pose: NDArray[np.float64],
-    n_detector: tuple[int, int],
     *,
     cells: tuple[int, int],
     histories: int,
     stream: str = "",
-    isotropic: bool = False,
 ) -> Image:
-    """Return one view's scatter.
-
-    The source sends as many photons to each pixel of the detector, or into each solid angle if `isotropic`. `signal`
-    [n] is what the detector makes of a photon at the spectrum's energies; `pose` is a row of `Geometry.pose_array`;
-    `cells` (v, u) part the detector.
-    """
-    if histories < 1:
-        raise InputError(f"histories must be at least 1, got {histories}")
-    images = np.zeros((transport_cpu.CHUNKS, 3, *cells))
-    _run(
-        world,
-        spectrum,
-        signal,
-        pose,
-        n_detector,
-        histories,
-        stream,
-        isotropic,
-        images,
-        np.zeros((transport_cpu.CHUNKS, 0)),
-    )
-    open_signal = float(spectrum.weights @ signal) * histories / (cells[0] * cells[1])
-    primary, single, multiple = images.sum(0) / open_signal
-    parts = images[:, 1:].sum(1) * transport_cpu.CHUNKS / open_signal
+    """Return one view's scatter; `pose` is a row of `Geometry.pose_array`, `cells` (v, u) part the detector."""
+    images = add_histories(world, source, pose, cells=cells, histories=histories, key=stream_key(stream, "scatter", 0))
+    primary, single, multiple, squared = images.sum(0) / histories
     return Image(
         primary=primary,
         single=single,
         multiple=multiple,
-        error=parts.std(0, ddof=1) / np.sqrt(transport_cpu.CHUNKS),
+        squared=squared,
+        error=images[:, SINGLE : MULTIPLE + 1].sum(1).std(0, ddof=1) * np.sqrt(CHUNKS) / histories,
     )
+
+
+def add_histories(
+    world: World,
+    source: Source,
+    pose: NDArray[np.float64],
+    *,
+    cells: tuple[int, int],
+    histories: int,
+    key: np.uint64,
+    first: int = 0,
+) -> NDArray[np.float64]:
+    """Follow histories of a stream from `first` on; return their sums [part, plane, v, u] times the number of cells.
+
+    The parts are independent; the planes are PRIMARY, SINGLE, MULTIPLE and SQUARED, as in `Image`.
+    """
+    images = np.zeros((CHUNKS, PLANES, *cells))
+    _run(world, source, pose, histories, key, first, images=images)
+    images *= cells[0] * cells[1] * source.most / source.open_signal
+    images[:, SQUARED] /= source.open_signal
+    return images
 
 
 def absorbed_energy(
     world: World,
-    spectrum: Spectrum,
+    source: Source,
     pose: NDArray[np.float64],
-    n_detector: tuple[int, int],
     regions: NDArray[np.uint8],
     *,
     histories: int,
     stream: str = "",
-    isotropic: bool = False,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the energy (keV) per photon that each region of the label grid absorbs, and its standard error: [region].
 
     `regions` is uint8 [z, y, x]; what is absorbed outside the grid counts as region 0.
     """
-    deposit = np.zeros((transport_cpu.CHUNKS, int(regions.max()) + 1))
-    images = np.zeros((transport_cpu.CHUNKS, 3, 0, 0))
-    _run(
-        world,
-        spectrum,
-        np.ones_like(spectrum.energies),
-        pose,
-        n_detector,
-        histories,
-        stream,
-        isotropic,
-        images,
-        deposit,
-        regions,
-    )
-    parts = deposit * transport_cpu.CHUNKS / histories
-    return parts.mean(0), parts.std(0, ddof=1) / np.sqrt(transport_cpu.CHUNKS)
+    deposit = np.zeros((CHUNKS, int(regions.max()) + 1))
+    _run(world, source, pose, histories, stream_key(stream, "dose", 0), 0, deposit=deposit, regions=regions)
+    parts = deposit * CHUNKS / histories
+    return parts.mean(0), parts.std(0, ddof=1) / np.sqrt(CHUNKS)
 
 
 def _run(
-    world, spectrum, signal, pose, n_detector, histories, stream, isotropic, images, deposit, regions=None
+    world: World,
+    source: Source,
+    pose: NDArray[np.float64],
+    histories: int,
+    key: np.uint64,
+    first: int,
+    *,
+    images: NDArray[np.float64] | None = None,
+    deposit: NDArray[np.float64] | None = None,
+    regions: NDArray[np.uint8] | None = None,
 ) -> None:
-    tables = world.tables
-    n = tables.mu.shape[1]
-    grid = E_MIN + STEP * np.arange(n)
+    if histories < CHUNKS:
+        raise InputError(f"histories must be at least {CHUNKS}, got {histories}")
+    tables, spectrum = world.tables, source.spectrum
+    grid = E_MIN + STEP * np.arange(tables.mu.shape[1])
     if spectrum.e_max > grid[-2]:
         raise InputError(f"the tables end at {grid[-2]:g} keV, the spectrum at {spectrum.e_max:g} keV")
-    absorbed = np.interp(grid, spectrum.energies, signal)
-    normal = np.cross(pose[6:9], pose[9:12]) * n_detector[0] * n_detector[1]
+    n_v, n_u = source.n_detector
+    normal = np.cross(pose[6:9], pose[9:12]) * n_v * n_u
     nearest = abs((pose[3:6] - pose[:3]) @ normal) / np.linalg.norm(normal)
+    signals = np.stack(response(source.detector, grid))  # scattered photons have energies that the tube does not have
+    gain = _NONE if source.gain is None else source.gain / np.float32(source.most)
+    layer = _NONE if source.layer is None else source.layer
+    stops = np.zeros(0) if source.layer_material is None else attenuation(source.layer_material, grid)
     transport_cpu.transport(
         tuple(world.bricks[:5]), world.prims, tuple(world.blocks),
         (tables.mu, tables.klein, tables.bound, tables.form, 1.0 / tables.d_q),
-        (np.array(pose), np.array(n_detector, np.float64), normal, absorbed, nearest if isotropic else 0.0),
+        (np.array(pose), np.array([n_v, n_u], np.float64), normal, signals, nearest if source.isotropic else 0.0),
         np.zeros((1, 1, 1), np.uint8) if regions is None else regions,
-        (np.cumsum(spectrum.weights), np.array(spectrum.energies)),
-        stream_key(stream, "montecarlo", 0), 0, histories, images, deposit,
+        (np.cumsum(spectrum.weights), np.array(spectrum.energies), gain, layer, stops),
+        key, first, histories,
+        np.zeros((CHUNKS, PLANES, 0, 0)) if images is None else images,
+        np.zeros((CHUNKS, 0)) if deposit is None else deposit,
     )  # fmt: skip

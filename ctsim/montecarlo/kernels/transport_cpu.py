@@ -18,13 +18,16 @@ from ctsim.kernels.raytrace_cpu import _paint
 from ctsim.kernels.solids_cpu import intersect
 
 CHUNKS = 64
+COMPTON, RAYLEIGH = 2, 32
+"""Directions that are scored of one collision. Rayleigh scatter is rare, and most of what reaches the detector."""
 E_MIN, PER_STEP = 1.0, 10.0  # as in `ctsim.montecarlo.tables`: keV, energy steps per keV
 REST, HC = 510.998950, 12.3984198
 CUT = 2.0  # keV; a photon below it stays where it is
 FARTHEST = 1e30
 EDGE = 1e-9  # of a block: a photon that enters the grid may lie this far outside it by rounding
 _LOW, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
-PRIMARY, SINGLE, MULTIPLE = 0, 1, 2
+PRIMARY, SINGLE, MULTIPLE, SQUARED = 0, 1, 2, 3
+"""Planes of an image: signal of photons by how often they scattered, and the squared signal of all that did."""
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -265,10 +268,19 @@ def _depth(volume, prims, mu, energy, ray, work):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _absorbed(signal, energy):
+def _at(table, energy):
     place = (energy - E_MIN) * PER_STEP
     i = int(place)
-    return signal[i] + (place - i) * (signal[i + 1] - signal[i])
+    return table[i] + (place - i) * (table[i + 1] - table[i])
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _score(images, order, v, u, share, signals, energy):
+    """Add a scattered photon's share to the cell at (v, u) within 0 … 1."""
+    rows, columns = images.shape[1:]
+    j, i = min(int(v * rows), rows - 1), min(int(u * columns), columns - 1)
+    images[SINGLE if order == 1 else MULTIPLE, j, i] += share * _at(signals[0], energy)
+    images[SQUARED, j, i] += share * _at(signals[1], energy)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -281,11 +293,10 @@ def _aim(ray, way, x, y, z):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _force(volume, prims, tables, beam, m, energy, ray, way, work, rng, image):
+def _force(volume, prims, tables, beam, m, energy, order, ray, way, work, rng, images):
     """Score what a Compton collision sends to a random place of the detector, on average over all its outcomes."""
     mu, klein, bound, _, per_q = tables
-    pose, extent, normal, signal, _ = beam
-    rows, columns = image.shape
+    pose, extent, normal, signals, _ = beam
     u, v = _uniform(rng), _uniform(rng)
     a, b = (u - 0.5) * extent[1], (v - 0.5) * extent[0]
     _aim(
@@ -299,23 +310,19 @@ def _force(volume, prims, tables, beam, m, energy, ray, way, work, rng, image):
     later = energy * ratio
     if later < CUT:
         return
-    place = (energy - E_MIN) * PER_STEP
-    i = int(place)
-    whole = klein[m, i] + (place - i) * (klein[m, i + 1] - klein[m, i])
+    whole = _at(klein[m], energy)
     law = ratio * ratio * (ratio + 1.0 / ratio - 1.0 + cos * cos)
     law *= _bound(bound, m, energy / HC * math.sqrt(max(0.5 * (1.0 - cos), 0.0)), per_q) / whole
     slant = abs(way[3] * normal[0] + way[4] * normal[1] + way[5] * normal[2])  # detector area times cos, in mm²
     share = law * slant / (way[6] * way[6])
     tau = _depth(volume, prims, mu, later, way, work)
-    image[min(int(v * rows), rows - 1), min(int(u * columns), columns - 1)] += (
-        share * math.exp(-tau) * _absorbed(signal, later)
-    )
+    _score(images, order, v, u, share * math.exp(-tau) / COMPTON, signals, later)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _reach(volume, prims, tables, beam, energy, ray, way, work, image):
+def _reach(volume, prims, tables, beam, energy, order, ray, way, work, images):
     """Score a photon at the place of the detector that it flies to, by its chance to get there."""
-    pose, extent, normal, signal, _ = beam
+    pose, extent, normal, signals, _ = beam
     towards = ray[3] * normal[0] + ray[4] * normal[1] + ray[5] * normal[2]
     if abs(towards) < 1e-9:
         return
@@ -335,17 +342,29 @@ def _reach(volume, prims, tables, beam, energy, ray, way, work, image):
             way[k] = ray[k]
         way[6] = length
         tau = _depth(volume, prims, tables[0], energy, way, work)
-        rows, columns = image.shape
-        image[int(v * rows), int(u * columns)] += math.exp(-tau) * _absorbed(signal, energy)
+        _score(images, order, v, u, math.exp(-tau) / RAYLEIGH, signals, energy)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _history(volume, prims, blocks, tables, beam, regions, spectrum, scratch, rng, images, deposit):
+def _scatter_coherently(volume, prims, tables, beam, m, energy, order, ray, way, work, rng, images):
+    """Turn a photon by Rayleigh scatter, and score several of the ways that it may take."""
+    _, _, _, form, per_q = tables
+    n = RAYLEIGH if images.size > 0 else 1
+    x, y, z = ray[3], ray[4], ray[5]
+    for _ in range(n):  # the photon goes on the last of these ways
+        ray[3], ray[4], ray[5] = x, y, z
+        _turn(ray, _rayleigh(form, m, energy, per_q, rng), 2.0 * math.pi * _uniform(rng))
+        if images.size > 0:
+            _reach(volume, prims, tables, beam, energy, order, ray, way, work, images)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _history(volume, prims, blocks, tables, beam, regions, source, scratch, rng, images, deposit):
     """Follow one photon from the source until it is absorbed or leaves."""
-    mu, _, bound, form, per_q = tables
-    pose, extent, _, signal, nearest = beam
+    mu, _, bound, _, per_q = tables
+    pose, extent, _, signals, nearest = beam
     ray, way, found, work = scratch
-    cumulative, energies = spectrum
+    cumulative, energies, gain, layer, stops = source
     wanted = _uniform(rng) * cumulative[-1]
     energy = energies[min(np.searchsorted(cumulative, wanted, side="right"), energies.size - 1)]
     ray[0], ray[1], ray[2] = pose[0], pose[1], pose[2]
@@ -359,16 +378,24 @@ def _history(volume, prims, blocks, tables, beam, regions, spectrum, scratch, rn
         if nearest <= 0 or _uniform(rng) < (nearest / way[6]) ** 3:
             break
     ray[3], ray[4], ray[5] = way[3], way[4], way[5]
+    v, u = b / extent[0] + 0.5, a / extent[1] + 0.5
+    if gain.size > 0 or layer.size > 0:
+        j, i = min(int(v * extent[0]), int(extent[0]) - 1), min(int(u * extent[1]), int(extent[1]) - 1)
+        passes = 1.0
+        if gain.size > 0:
+            passes = float(gain[j, i])
+        if layer.size > 0:
+            passes *= math.exp(-_at(stops, energy) * layer[j, i])
+        if _uniform(rng) >= passes:
+            return
     order = 0
     while True:
         m = _fly(volume, prims, blocks, mu, energy, ray, work[5], work[4], rng, found)
         if m < 0:
             if order == 0 and images.size > 0:
                 rows, columns = images.shape[1:]
-                u, v = a / extent[1] + 0.5, b / extent[0] + 0.5
-                images[PRIMARY, min(int(v * rows), rows - 1), min(int(u * columns), columns - 1)] += _absorbed(
-                    signal, energy
-                )
+                j, i = min(int(v * rows), rows - 1), min(int(u * columns), columns - 1)
+                images[PRIMARY, j, i] += _at(signals[0], energy)
             return
         pick = _uniform(rng) * (found[0] + found[1] + found[2])
         where = -1
@@ -381,18 +408,15 @@ def _history(volume, prims, blocks, tables, beam, regions, spectrum, scratch, rn
         order += 1
         if pick < found[0] + found[1]:
             if images.size > 0:
-                image = images[SINGLE if order == 1 else MULTIPLE]
-                _force(volume, prims, tables, beam, m, energy, ray, way, work, rng, image)
+                for _ in range(COMPTON):
+                    _force(volume, prims, tables, beam, m, energy, order, ray, way, work, rng, images)
             ratio, cos = _compton(bound, m, energy, per_q, rng)
             if where >= 0:
                 deposit[where] += energy * (1.0 - ratio)
             energy *= ratio
             _turn(ray, cos, 2.0 * math.pi * _uniform(rng))
         else:
-            _turn(ray, _rayleigh(form, m, energy, per_q, rng), 2.0 * math.pi * _uniform(rng))
-            if images.size > 0:
-                image = images[SINGLE if order == 1 else MULTIPLE]
-                _reach(volume, prims, tables, beam, energy, ray, way, work, image)
+            _scatter_coherently(volume, prims, tables, beam, m, energy, order, ray, way, work, rng, images)
         if energy < CUT:
             if where >= 0:
                 deposit[where] += energy
@@ -410,8 +434,8 @@ def _region(regions, grid, ray):
 VOLUME = "Tuple((uint16[:,:,:,::1], int32[:,:,::1], uint8[::1], float32[::1], float64[::1]))"
 BLOCKS = "Tuple((int64[:,:,::1], float32[:,::1], int64[::1], int64[::1], float64[::1]))"
 TABLES = "Tuple((float32[:,:,::1], float32[:,::1], float32[:,::1], float64[:,::1], float64))"
-BEAM = "Tuple((float64[::1], float64[::1], float64[::1], float64[::1], float64))"
-
+BEAM = "Tuple((float64[::1], float64[::1], float64[::1], float64[:,::1], float64))"
+SOURCE = "Tuple((float64[::1], float64[::1], float32[:,::1], float32[:,::1], float64[::1]))"
 
 SCRATCH = (
     "Tuple((float64[:,::1], float64[:,::1], float64[:,::1], float64[:,::1], float32[::1], uint64[::1]))"  # of a chunk
@@ -419,28 +443,28 @@ SCRATCH = (
 
 
 @compiled_once(
-    *(VOLUME, "float64[:,::1]", BLOCKS, TABLES, BEAM, "uint8[:,:,::1]", "UniTuple(float64[::1], 2)", SCRATCH, "uint64"),
+    *(VOLUME, "float64[:,::1]", BLOCKS, TABLES, BEAM, "uint8[:,:,::1]", SOURCE, SCRATCH, "uint64"),
     *("int64", "int64", "float64[:,:,::1]", "float64[::1]"),
 )
-def _histories(volume, prims, blocks, tables, beam, regions, spectrum, scratch, key, first, last, images, deposit):
+def _histories(volume, prims, blocks, tables, beam, regions, source, scratch, key, first, last, images, deposit):
     rays, lengths, pieces, hits, found, rng = scratch
     work = lengths[0], lengths[1], lengths[2], pieces, hits, rays[2]
     parts = rays[0], rays[1], found, work
     for history in range(first, last):
         _start(rng, key, np.uint64(history))
-        _history(volume, prims, blocks, tables, beam, regions, spectrum, parts, rng, images, deposit)
+        _history(volume, prims, blocks, tables, beam, regions, source, parts, rng, images, deposit)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def _chunks(
-    histories, volume, prims, blocks, tables, beam, regions, spectrum, scratch, key, first, count, images, deposit
+    histories, volume, prims, blocks, tables, beam, regions, source, scratch, key, first, count, images, deposit
 ):  # fmt: skip
     rays, lengths, pieces, hits, found, rng = scratch
     for chunk in prange(CHUNKS):
         start, stop = first + chunk * count // CHUNKS, first + (chunk + 1) * count // CHUNKS
         mine = rays[chunk], lengths[chunk], pieces[chunk], hits[chunk], found[chunk], rng[chunk]
         _histories(
-            histories, volume, prims, blocks, tables, beam, regions, spectrum, mine, key, start, stop, images[chunk],
+            histories, volume, prims, blocks, tables, beam, regions, source, mine, key, start, stop, images[chunk],
             deposit[chunk],
         )  # fmt: skip
 
@@ -461,18 +485,19 @@ def _scratch(n_materials, n_prims, grid):
     )
 
 
-def transport(volume, prims, blocks, tables, beam, regions, spectrum, key, first, count, images, deposit):
+def transport(volume, prims, blocks, tables, beam, regions, source, key, first, count, images, deposit):
     """Follow histories first … first + count − 1 of the stream `key`, and add up what they leave.
 
     `volume` is (code, slot, pool, density, grid) of `ctsim.bricks.Bricks`; `prims` as in `ctsim.solids.pack`; `blocks`
     (kind, most, first, listed, frame) of `ctsim.montecarlo.world.Blocks`; `tables` (mu, klein, bound, form, 1/d_q);
-    `beam` (pose, pixels (v, u), detector normal times area in mm², absorbed signal by energy, distance of the source
-    from the detector's plane, or 0 for as many photons on every unit of its area); `regions` uint8 [z, y, x];
-    `spectrum` (cumulative weights, energies). `images` [chunk, order, v, u] gets the signal of photons scattered never,
-    once and more often; `deposit` [chunk, region] the absorbed energy (keV). Either may be empty.
+    `beam` (pose, pixels (v, u), detector normal times area in mm², mean and mean squared signal by energy, distance of
+    the source from the detector's plane, or 0 for as many photons on every unit of its area); `regions` uint8
+    [z, y, x]; `source` (cumulative weights, energies, intensity of each pixel (at most 1), thickness in mm of a layer
+    before each pixel, attenuation of that layer by energy; images float32 [v, u] or empty). `images` [chunk, plane, v,
+    u] gets the signals, see SQUARED; `deposit` [chunk, region] the absorbed energy (keV). Either may be empty.
     """
     scratch = _scratch(tables[0].shape[0], prims.shape[0], volume[4])
     _chunks(
-        _histories.address(), volume, prims, blocks, tables, beam, regions, spectrum, scratch, key, first, count,
+        _histories.address(), volume, prims, blocks, tables, beam, regions, source, scratch, key, first, count,
         images, deposit,
     )  # fmt: skip

@@ -34,7 +34,8 @@ def single_scatter(
     weights = {z: w / xrl.AtomicWeight(z) for z, w in which.mass_fractions.items()}
     arriving = per_sr / far**2 * np.exp(-_mu(which, energy) * _inside(places, -way, radius)) * volume
     out = np.zeros((2, *cells))
-    cosines = np.linspace(-1, 1, 2001)
+    halves = np.linspace(0, 1, 2001)  # of sin(θ/2): in the cosine forward scatter would be a spike
+    cosines = 1 - 2 * halves**2
     for j, i in np.ndindex(*cells):
         at = centre + ((i + 0.5) / cells[1] - 0.5) * e_u + ((j + 0.5) / cells[0] - 0.5) * e_v
         off = at - places
@@ -44,9 +45,10 @@ def single_scatter(
         angle = abs(off @ normal) / (cells[0] * cells[1] * length**2)
         leaving = _inside(places, off, radius)
         later = energy / (1 + energy / REST * (1 - cos))
-        mu_later = np.interp(cos, cosines, [_mu(which, energy / (1 + energy / REST * (1 - c))) for c in cosines])
-        compton = np.interp(cos, cosines, _compton(weights, energy, cosines))
-        rayleigh = np.interp(cos, cosines, _rayleigh(weights, energy, cosines))
+        half = np.sqrt((1 - cos) / 2)
+        mu_later = np.interp(half, halves, [_mu(which, energy / (1 + energy / REST * (1 - c))) for c in cosines])
+        compton = np.interp(half, halves, _compton(weights, energy, cosines))
+        rayleigh = np.interp(half, halves, _rayleigh(weights, energy, cosines))
         scale = 0.1 * which.density * arriving * angle
         out[0, j, i] = (scale * compton * later * np.exp(-mu_later * leaving)).sum()
         out[1, j, i] = (scale * rayleigh * energy * np.exp(-_mu(which, energy) * leaving)).sum()

@@ -1,0 +1,162 @@
+"""Scatter of level 3: photons of a few views, smoothed and interpolated, and what the simulator does with it."""
+
+import dataclasses
+
+import msgspec
+import numpy as np
+import pytest
+from test_montecarlo import ALL
+from test_simulate import GEOMETRY, phantom, run, scanner
+
+from ctsim.detector import Detector
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+from ctsim.montecarlo import series
+from ctsim.montecarlo.kernels.transport_cpu import CHUNKS, SINGLE, SQUARED
+from ctsim.montecarlo.series import scatter_series
+from ctsim.montecarlo.transport import PLANES, Source, scatter_image
+from ctsim.montecarlo.world import World
+from ctsim.noise import Noise
+from ctsim.scatter import Scatter
+from ctsim.settings import Simulation, Truth
+from ctsim.spectrum import Spectrum, Tube
+
+SIGMAS = 4.0
+MONO = Spectrum(energies=np.array([60.0]), weights=np.array([1.0]))
+
+
+def source(geometry=GEOMETRY, **more):
+    return Source(spectrum=MONO, detector=ALL, n_detector=geometry.n_detector, **more)
+
+
+def circle(**changes):
+    small = {"n_voxel": (8, 8, 8), "d_voxel": (1.0, 1.0, 1.0), "d_detector": (1.0, 1.0), "dso": 200.0, "dsd": 400.0}
+    return Geometry(**{**small, "n_detector": (60, 96), "n_views": 90, **changes})
+
+
+@pytest.mark.parametrize("arc", [360.0, 200.0])
+def test_waves_are_found_and_evaluated_exactly(monkeypatch, arc):
+    """Photons without noise from a field of few waves give that field in every pixel of every view."""
+    geometry = circle(arc_deg=arc)
+
+    def field(view, v, u):
+        """Intensity at the view (0 … 1) and the detector's place."""
+        turn = np.cos(2 * np.pi * view) + 0.3 * np.sin(4 * np.pi * view) if arc == 360 else np.cos(3 * np.pi * view)
+        return 5 + 0.5 * turn * np.cos(np.pi * u) + np.cos(2 * np.pi * v) * np.cos(3 * np.pi * u)
+
+    def told(world, source, pose, *, cells, histories, key, first=0):
+        view = told.view = (told.view + 1) % told.n
+        fine = [(np.arange(64 * n) + 0.5) / (64 * n) for n in cells]
+        values = field((view + 0.5) / told.n, fine[0][:, None], fine[1]).reshape(cells[0], 64, cells[1], 64)
+        images = np.zeros((CHUNKS, PLANES, *cells))
+        images[:, SINGLE] = values.mean((1, 3)) * histories / CHUNKS
+        images[:, SQUARED] = 2 * images[:, SINGLE]
+        return images
+
+    told.n, told.view = len(series._few(geometry.pose_array())), -1
+    assert told.n < 30
+    monkeypatch.setattr(series, "add_histories", told)
+    found = scatter_series(phantom(), source(geometry), geometry, tolerance=0.01)
+    assert found.error < 1e-9
+    v, u = ((np.arange(n) + 0.5) / n for n in geometry.n_detector)
+    for k in (0, 1, 44, 89):
+        expected = field((k + 0.5) / 90, v[:, None], u)
+        mean, squared = found.view(k)
+        # float32 beside the blocks' weights, 1 − σ²/Y, of 64² rays a cell: 2e-4
+        np.testing.assert_allclose(mean, expected, rtol=5e-4)
+        np.testing.assert_allclose(squared, 2 * expected, rtol=5e-4)
+
+
+def test_the_error_that_is_stated_is_the_error():
+    """White noise of known strength on a smooth field: by smoothing most of it goes, and what stays is known."""
+    rng = np.random.default_rng(5)
+    t, v, u = (np.arange(n, dtype=np.float64) for n in (24, 32, 32))
+    truth = rng.normal(size=(24, 32, 32)) * np.exp(-(t[:, None, None] + v[:, None] + u) / 2)
+    truth[0, 0, 0] = 3.0
+    for sigma in (0.003, 0.03):
+        off, stated = [], []
+        for _ in range(10):
+            halves = truth + sigma * np.sqrt(2) * rng.normal(size=(2, *truth.shape))
+            kept, error = series._smooth(halves, (t, v, u))
+            off.append(((kept * halves.mean(0) - truth) ** 2).sum() / 9)
+            stated.append(error**2)
+        raw = sigma**2 * truth.size / 9
+        assert np.mean(off) < raw / 8  # it is worth the trouble
+        assert np.mean(stated) == pytest.approx(np.mean(off), rel=0.3)
+
+
+def test_level_3_is_the_scatter_of_long_runs_behind_metal_too():
+    body, geometry = phantom(), msgspec.structs.replace(GEOMETRY, n_views=24)
+    found = scatter_series(body, source(geometry), geometry, tolerance=0.02, stream="one")
+    world, off, scale = World.of(body, 61.0), [], []
+    cells = series._cells(geometry)
+    for k in (0, 7, 15):
+        long = scatter_image(world, source(geometry), geometry.pose(k), cells=cells, histories=1_000_000, stream="two")
+        mine = found.view(k)[0].astype(np.float64)
+        factor = [n // c for n, c in zip(mine.shape, cells, strict=True)]
+        mine = mine.reshape(cells[0], factor[0], cells[1], factor[1]).mean((1, 3))
+        off.append(((mine - long.scatter) ** 2).mean() - (long.error**2).mean())
+        scale.append(long.scatter.mean())
+        total = np.sqrt((long.error**2).sum()) / long.scatter.sum()
+        assert mine.mean() == pytest.approx(long.scatter.mean(), rel=SIGMAS * np.hypot(total, found.error / 5))
+    assert found.error <= 0.02
+    assert np.sqrt(max(np.mean(off), 0)) / np.mean(scale) < 1.5 * found.error
+
+
+def test_intensity_and_layer_of_a_pixel():
+    """Half the photons behind a filter are as many as the filter lets through; scatter follows the primary photons."""
+    body = dataclasses.replace(phantom(), solids=())
+    world, n = World.of(body, 61.0), GEOMETRY.n_detector
+    run = {"cells": (3, 3), "histories": 400_000}
+    plain = scatter_image(world, source(), GEOMETRY.pose(0), **run)
+    gain = np.linspace(0.5, 2.0, n[0] * n[1], dtype=np.float32).reshape(n)
+    some = scatter_image(world, source(gain=gain), GEOMETRY.pose(0), **run)
+    cell = gain.reshape(3, n[0] // 3, 3, n[1] // 3).mean((1, 3))
+    sigma = np.sqrt(2.0 * 9 / 400_000 * plain.primary * cell)
+    assert abs(some.primary - plain.primary * cell)[plain.primary > 0.9].max() < SIGMAS * sigma.max()
+    layer = np.full(n, 2.0, np.float32)
+    behind = scatter_image(world, source(layer=layer, layer_material="Al"), GEOMETRY.pose(0), **run)
+    passed = np.exp(-2 * 0.0749)  # μ of aluminium at 60 keV, NIST: 0.2778 cm²/g · 2.699 g/cm³, per mm
+    assert behind.primary.mean() / plain.primary.mean() == pytest.approx(passed, rel=0.01)
+    assert behind.scatter.mean() / plain.scatter.mean() == pytest.approx(passed, rel=0.03)
+
+
+def test_the_squared_signal_of_photons_that_all_count_alike():
+    counting = dataclasses.replace(source(), detector=Detector(kind="counting", thickness=50.0, threshold=0.0))
+    image = scatter_image(World.of(phantom(), 61.0), counting, GEOMETRY.pose(0), cells=(4, 4), histories=20_000)
+    np.testing.assert_allclose(image.squared, image.scatter, rtol=1e-3)
+
+
+@pytest.mark.parametrize("tube", [Tube(), Tube(heel=True, anode_deg=20.0)])
+def test_the_simulator_adds_it_to_scan_and_twin_each_their_own(tube):
+    truth = Truth(noise_free=True, scatter_free=True)
+    geometry = msgspec.structs.replace(GEOMETRY, n_views=4)
+    machine = scanner(tube=tube, scatter=Scatter(level=3), geometry=geometry)
+    settings = Simulation(scatter_error=0.1)
+    plan, out = run(phantom(), machine, settings, truth)
+    assert plan.scatter_error == 0.1 and "10% of the scatter" in plan.text() and plan.to_dict()["scatter_error"] == 0.1
+    added = {}
+    for which in ("", "metal_free/"):
+        p, bare = out[f"{which}noise_free"].astype(np.float64), out[f"{which}scatter_free"].astype(np.float64)
+        added[which] = np.exp(-p) - np.exp(-bare)
+        assert (added[which] > 0).all()
+    assert abs(added[""] / added["metal_free/"] - 1).max() > 0.02  # metal takes scatter away, and makes some
+    _, other = run(phantom(), machine, settings, truth, first_view=2)
+    np.testing.assert_array_equal(other["counts"], out["counts"][2:])
+    np.testing.assert_array_equal(other["metal_free/counts"], out["metal_free/counts"][2:])
+
+
+def test_another_error_keeps_the_noise():
+    """Photon noise is drawn from the same stream, whatever precision the scatter has."""
+    geometry = msgspec.structs.replace(GEOMETRY, n_views=2)
+    machine = scanner(scatter=Scatter(level=3), geometry=geometry, noise=Noise())
+    (_, one), (_, two) = (run(phantom(), machine, Simulation(scatter_error=e), Truth(twin=False)) for e in (0.3, 0.1))
+    apart = one["counts"].astype(float) - two["counts"]
+    assert 0 < abs(apart).max() < 0.05 * one["counts"].max()
+
+
+def test_what_cannot_be_asked():
+    with pytest.raises(InputError, match=r"scatter.level must be 0, 1 or 3, got 2"):
+        Scatter(level=2)
+    with pytest.raises(InputError, match=r"fraction = 0.1 needs scatter.level = 1, got level 3"):
+        Scatter(level=3, fraction=0.1)
