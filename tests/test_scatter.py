@@ -38,7 +38,7 @@ def test_level_and_fraction_decide():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"level": 2}, "level must be 0 or 1"),
+        ({"level": 2}, "level must be 0, 1 or 3"),
         ({"level": 1, "fraction": 10.0}, "within"),
         ({"level": 1, "fraction": -0.1}, "within"),
         ({"level": 1, "fraction": float("nan")}, "within"),

@@ -132,18 +132,19 @@ def _smooth(
     """Return the weights of waves and the RMS error that stays, over the mean.
 
     `halves` [2, t, v, u] are the coefficients from either half of the photons, of waves whose mean square is 1. Noise,
+    `halves` [2, t, v, u] are the coefficients from either half of the photons, of waves whose mean square is 1. Noise,
     half the difference of the halves, has the same variance σ² in each. L waves of like frequencies, whose squares
-    add up to Y, get the weight max(0, 1 − L·σ²/Y) (James and Stein 1961). What stays is L·σ² times the weight, or
-    Y − L·σ² where the weight is 0.
+    add up to Y, get the weight max(0, 1 − L·σ²/Y) (James and Stein 1961). The error is L·σ² times the weight, which for
+    waves that hold nothing but noise is too much rather than too little.
     """
     mean, noise = halves.mean(0), float(((halves[0] - halves[1]) ** 2).mean()) / 4
     t, v, u = frequencies
     bands = np.stack(np.broadcast_arrays(_bands(t)[:, None, None], _bands(np.hypot(v[:, None], u))), -1)
     _, block = np.unique(bands.reshape(-1, 2), axis=0, return_inverse=True)
     expected = np.bincount(block.ravel()) * noise
-    found = np.bincount(block.ravel(), (mean**2).ravel())
-    weight = np.maximum(0.0, 1 - expected / np.maximum(found, 1e-300))
-    stays = np.where(weight > 0, expected * weight, np.maximum(found - expected, 0.0)).sum()
+    found = np.maximum(np.bincount(block.ravel(), (mean**2).ravel()), 1e-300)
+    weight = np.maximum(0.0, 1 - expected / found)
+    stays = (expected * weight).sum()
     level = mean[0, 0, 0]
     return weight[block].reshape(mean.shape), math.sqrt(stays) / level if level > 0 else 0.0
 
