@@ -1,5 +1,7 @@
 """Photon Monte Carlo against quadrature, the ray tracer and TG-195 (Sechopoulos et al. 2015, Med. Phys. 42, 5679)."""
 
+import dataclasses
+
 import numba
 import numpy as np
 import pytest
@@ -95,6 +97,14 @@ def test_a_body_in_three_pieces_of_grid_is_the_same_body():
     one, other = image(ball("water"), 60.0, 1_000_000), image(voxels, 60.0, 1_000_000)
     off = (one.scatter - other.scatter) / np.hypot(one.error, other.error)
     assert abs(off).max() < SIGMAS and not np.array_equal(one.scatter, other.scatter)
+
+
+def test_solids_reach_out_of_the_voxels():
+    """The same ball, around voxels that hold a part of it."""
+    small = dataclasses.replace(ball("water"), labels=np.zeros((8, 30, 20), np.uint8), off_origin=(3.0, -5.0, 8.0))
+    one, other = image(ball("water"), 60.0, 500_000), image(small, 60.0, 500_000)
+    assert abs((one.scatter - other.scatter) / np.hypot(one.error, other.error)).max() < SIGMAS
+    assert one.primary.mean() == pytest.approx(other.primary.mean(), abs=3e-3)
 
 
 def test_density_scales_attenuation():

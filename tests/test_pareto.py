@@ -339,7 +339,8 @@ def test_errors_are_those_of_p(bench):
     assert found["rms"] == pytest.approx(0.5 / math.sqrt((exact**2).sum()), rel=1e-4)
 
 
-def test_scatter_is_judged_with_scatter(bench):
+def test_scatter_is_judged_with_scatter(bench, monkeypatch):
+    monkeypatch.setattr(measure, "LONG", 0.05)
     off, on = (
         bench.run(Choice(group=pareto_suite.SCATTER, curve=pareto_suite.SCATTER, label=str(k), level=k))
         .marks[0]
@@ -354,7 +355,8 @@ def test_scatter_is_judged_with_scatter(bench):
 @pytest.mark.slow
 def test_simulator_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(host, "use_threads", lambda threads: None)
-    choices = "tolerances = [1e-4]\nsubrays = [4]\ngrids = [1.0]\nlevels = [0, 1]"
+    monkeypatch.setattr(measure, "LONG", 0.05)
+    choices = "tolerances = [1e-4]\nsubrays = [4]\ngrids = [1.0]\nlevels = [0, 1, 3]"
     path = suite_file(tmp_path, f"[simulator]\nside = 16\nviews = 2\n{choices}")
     assert pareto.main([str(tmp_path), "--suite", str(path), "--part", "simulator", "--repeats", "1"]) == 0
     text = capsys.readouterr().out
@@ -364,7 +366,7 @@ def test_simulator_end_to_end(tmp_path, monkeypatch, capsys):
     assert len(verdicts) == 3
     assert all(line.count("the front") == 2 for line in verdicts)
     # a scanner with scatter is simulated with it: no other level is as good
-    assert any(line.startswith("- Default scatter, level 1") and line.count("on the front") == 2 for line in verdicts)
+    assert any(line.startswith("- Default scatter, level 3") and line.count("on the front") == 2 for line in verdicts)
     assert "body in voxels, metal exact, 16³ labels" in text
 
 

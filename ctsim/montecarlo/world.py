@@ -12,7 +12,8 @@ from ctsim.solids import BOUND, pack
 from ctsim.types import Phantom
 
 MOST_BLOCKS = 32
-"""Blocks along an axis, at most."""
+"""Blocks along an axis of the voxels, at most."""
+MOST_AROUND = 32
 
 
 class Blocks(NamedTuple):
@@ -21,7 +22,7 @@ class Blocks(NamedTuple):
     `kind` [bz, by, bx] numbers the sets of voxel materials that occur; `most` [kind, energy] bounds the attenuation
     (1/mm) of a set between energies i and i + 1, solids left out. The solids that reach into block b are
     listed[first[b] : first[b + 1]], in paint order. `frame` is the low corner and the edges of a block (x, y, z; mm).
-    Solids are cut off where the grid of blocks ends.
+    There are blocks of air around the voxels where solids reach out of them, up to MOST_AROUND on a side.
     """
 
     kind: NDArray[np.int64]
@@ -52,14 +53,19 @@ class World(NamedTuple):
 def make_blocks(phantom: Phantom, prims: NDArray[np.float64], tables: Interactions) -> Blocks:
     """Cut a phantom into blocks."""
     edge = SIDE * max(2, -(-max(phantom.labels.shape) // (SIDE * MOST_BLOCKS)))
-    shape = tuple(-(-n // edge) for n in phantom.labels.shape)
+    inner = tuple(-(-n // edge) for n in phantom.labels.shape)
     n = np.array(phantom.labels.shape[::-1])
     d = np.array(phantom.d_voxel[::-1], np.float64)
     low, wide = np.array(phantom.off_origin[::-1], np.float64) - n * d / 2, edge * d
+    before, behind = _around(prims, low, low + wide * inner[::-1], wide)
+    low = low - before * wide
+    shape = tuple(int(b) for b in inner + (before + behind)[::-1])
     present = np.zeros((np.prod(shape), len(phantom.materials)), bool)
+    present[:, 0] = True
     scale = np.ones(np.prod(shape))
-    for b, (k, j, i) in enumerate(np.ndindex(*shape)):
-        part = tuple(slice(edge * c, edge * (c + 1)) for c in (k, j, i))
+    for at in np.ndindex(*inner):
+        b = np.ravel_multi_index(tuple(at + before[::-1]), shape)
+        part = tuple(slice(edge * c, edge * (c + 1)) for c in at)
         present[b, np.unique(phantom.labels[part])] = True
         if phantom.density is not None:
             scale[b] = max(1.0, float(phantom.density[part].max()))
@@ -77,6 +83,18 @@ def make_blocks(phantom: Phantom, prims: NDArray[np.float64], tables: Interactio
         listed=listed,
         frame=np.concatenate([low, wide]),
     )
+
+
+def _around(
+    prims: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], wide: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return how many blocks (x, y, z) solids reach out of the voxels, on the low side and on the high one."""
+    if not len(prims):
+        return np.zeros(3, np.int64), np.zeros(3, np.int64)
+    centre, radius = prims[:, BOUND][:, :3], prims[:, BOUND][:, 3:]
+    outs = (low - (centre - radius).min(0), (centre + radius).max(0) - high)
+    before, behind = (np.clip(np.ceil(out / wide), 0, MOST_AROUND).astype(np.int64) for out in outs)
+    return before, behind
 
 
 def _listed(

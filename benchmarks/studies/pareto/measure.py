@@ -27,11 +27,13 @@ from ctsim.benchmarks.scores.protocol import Truth, aligned_score, tissue_range,
 from ctsim.benchmarks.studies.methods.attempt import describe, run_here, scan_for, skip, warm_up
 from ctsim.benchmarks.studies.pareto import Flags, suite
 from ctsim.benchmarks.studies.pareto.finding import Mark, TimedRun
-from ctsim.benchmarks.studies.pareto.suite import EXACT, HIGHEST, SCATTER, Choice, Effort
+from ctsim.benchmarks.studies.pareto.suite import EXACT, SCATTER, Choice, Effort
+from ctsim.montecarlo.series import scatter_series
+from ctsim.montecarlo.transport import Source
 from ctsim.noise import Noise
 from ctsim.plan import Plan, make_plan
 from ctsim.reconstruct.watch import watch
-from ctsim.scatter import Scatter, open_fraction
+from ctsim.scatter import Scatter
 from ctsim.simulate import simulate_views
 from ctsim.store import StoredScan, open_scan
 from ctsim.types import Phantom, Scanner, Status
@@ -39,6 +41,7 @@ from ctsim.types import Phantom, Scanner, Status
 CHECKED = 2  # views that are compared with the reference
 FINER, FINEST = 16, 64
 """Of the reference: finer pixels along the side of a pixel, and rays in each of them."""
+LONG = 0.01  # RMS error of the reference's scatter: half of level 3's own
 CALM = 1e-4  # a pixel has no edge where |ΔP| of the central ray alone is smaller
 USUALLY = Choice(curve=EXACT, label="default")
 _WARM: set[tuple[Hashable, ...]] = set()
@@ -105,12 +108,12 @@ class SimulatorBench:
         views = [images["noise_free"] for _, images in simulate_views(plan, phantom, scanner)]
         seconds = time.perf_counter() - start
         found = np.stack([views[k] for k in self.checked])
-        s = open_fraction(Scatter(level=HIGHEST), scanner.geometry) if choice.curve == SCATTER else 0.0
+        s = self.scatter if choice.curve == SCATTER else 0.0
         label = f"{choice.label}, {len(plan.rule.energies)} energies"
         mark = Mark(label=label, seconds=seconds, values=self.errors(found, s), default=choice.default)
         return TimedRun(marks=(mark,))
 
-    def errors(self, p: NDArray[np.float32], scatter: float = 0.0) -> dict[str, float]:
+    def errors(self, p: NDArray[np.float32], scatter: NDArray[np.float32] | float = 0.0) -> dict[str, float]:
         """Compare P of the checked views with the reference, to which `scatter` (S/I0) is added.
 
         `rms` is relative; `worst` is the greatest |ΔP|, `off_edges` the greatest in pixels without an edge.
@@ -128,6 +131,14 @@ class SimulatorBench:
             for finer, rays in ((FINER, FINEST), (1, 1))
         )
         return exact, np.abs(central - exact) < CALM
+
+    @functools.cached_property
+    def scatter(self) -> NDArray[np.float32]:
+        """S/I0 of the checked views, by a Monte Carlo of a stream of its own."""
+        plan, phantom, scanner = self._plan(USUALLY)
+        source = Source(spectrum=plan.spectrum, detector=scanner.detector, n_detector=scanner.geometry.n_detector)
+        series = scatter_series(phantom, source, scanner.geometry, tolerance=LONG, stream="reference")
+        return np.stack([series.view(k)[0] for k in self.checked])
 
     def _plan(self, choice: Choice) -> tuple[Plan, Phantom, Scanner]:
         """Plan a choice once, untimed. With a `grid` the body, and with `metal` the metal too, are voxels."""

@@ -19,7 +19,7 @@ NAME = "pareto.toml"
 USUAL = 1.0  # label voxels per pixel along an axis; the bundled suites have 0.5 to 1.2
 EXACT, BODY, VOXELS, SCATTER = "exact solids", "body in voxels, metal exact", "all in voxels", "scatter"
 Count = Annotated[int, msgspec.Meta(ge=1)]
-Level = Literal[0, 1]  # of scatter
+Level = Literal[0, 1, 3]  # of scatter
 HIGHEST = max(get_args(Level))
 
 
