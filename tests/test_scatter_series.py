@@ -85,6 +85,7 @@ def test_the_error_that_is_stated_is_no_less_than_the_error():
         assert 0.8 < np.mean(stated) / np.mean(off) < 4
 
 
+@pytest.mark.slow
 def test_level_3_is_the_scatter_of_long_runs_behind_metal_too():
     body, geometry = phantom(), msgspec.structs.replace(GEOMETRY, n_views=24)
     found = scatter_series(body, source(geometry), geometry, tolerance=0.02, stream="one")
