@@ -20,6 +20,8 @@ class Scatter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """0: none. 1: one constant in every pixel. 3: by Monte Carlo, for this object with and without its metal."""
     fraction: Annotated[float, msgspec.Meta(ge=0, lt=10)] | None = None
     """The constant as a share of the open field, instead of the geometry's; needs level 1."""
+    grid_ratio: Annotated[float, msgspec.Meta(gt=0, le=50)] | None = None
+    """Height over gap of a focused anti-scatter grid; its thin strips along v stop what hits them. Needs level 3."""
 
     def __post_init__(self) -> None:
         if self.level not in (0, 1, 3):
@@ -28,6 +30,10 @@ class Scatter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
             raise InputError(f"scatter.fraction must be within [0, 10) of the open field, got {self.fraction}")
         if self.fraction is not None and self.level != 1:
             raise InputError(f"scatter.fraction = {self.fraction} needs scatter.level = 1, got level {self.level}")
+        if self.grid_ratio is not None and not 0 < self.grid_ratio <= 50:
+            raise InputError(f"scatter.grid_ratio must be within (0, 50], got {self.grid_ratio}")
+        if self.grid_ratio is not None and self.level != 3:
+            raise InputError(f"scatter.grid_ratio = {self.grid_ratio} needs scatter.level = 3, got level {self.level}")
 
 
 def constant_fraction(geometry: Geometry) -> float:

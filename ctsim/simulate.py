@@ -160,6 +160,7 @@ class _Simulator:
             gain=self.beam.gain,
             layer=self.beam.layer,
             layer_material=self.beam.layer_material,
+            grid_ratio=self.scanner.scatter.grid_ratio or 0.0,
         )
         return scatter_series(
             body, source, self.geometry, tolerance=self.plan.settings.scatter_error, stream=self.plan.stream_id

@@ -197,3 +197,20 @@ def test_tg195_case_4_computed_tomography(wide, expected):
     )
     off = (found[1:] * 1e3 - expected) / np.hypot(error[1:] * 1e3, 0.005 * np.array(expected))
     assert abs(off).max() < SIGMAS, (found[1:] * 1e3 / expected - 1, off)
+
+
+def test_a_focused_grid_stops_what_comes_from_the_side():
+    """Photons from a speck in the middle: each cell's share follows from two directions, those of speck and source."""
+    speck, cells, ratio = ball("water", radius=0.5, n=8), (1, 60), 6.0
+    world, run = World.of(speck, 61.0), {"cells": cells, "histories": 2_000_000}
+    small = np.array([250.0, 0, 0, -50, 0, 0, 0, 1, 0, 0, 0, 1])  # 300 mm from source to detector, 50 from the speck
+    plain = scatter_image(world, source(60.0, (4, 60)), small, **run)
+    behind = scatter_image(world, source(60.0, (4, 60), grid_ratio=ratio), small, **run)
+    u = (np.arange(6000) + 0.5) / 100 - 30
+    share = np.maximum(0, 1 - ratio * abs(u / 50 - u / 300)).reshape(60, 100).mean(1)
+    # the same photons in both: what differs is where in a cell of 1 mm they arrive, and the speck's width of 1 mm
+    assert behind.scatter.sum() == pytest.approx((plain.scatter[0] * share).sum(), rel=0.03)
+    middle = share > 0.5
+    np.testing.assert_allclose(behind.scatter[0, middle], (plain.scatter[0] * share)[middle], rtol=0.1)
+    assert behind.scatter[0, 0] == 0 and share.max() > 0.9
+    np.testing.assert_array_equal(behind.primary, plain.primary)

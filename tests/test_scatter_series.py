@@ -159,3 +159,18 @@ def test_what_cannot_be_asked():
         Scatter(level=2)
     with pytest.raises(InputError, match=r"fraction = 0.1 needs scatter.level = 1, got level 3"):
         Scatter(level=3, fraction=0.1)
+    with pytest.raises(InputError, match=r"grid_ratio = 8 needs scatter.level = 3, got level 1"):
+        Scatter(level=1, grid_ratio=8)
+    with pytest.raises(InputError, match=r"grid_ratio must be within \(0, 50\], got -1"):
+        Scatter(level=3, grid_ratio=-1)
+
+
+def test_a_grid_takes_scatter_away_and_leaves_the_rest():
+    geometry = msgspec.structs.replace(GEOMETRY, n_views=2)
+    truth = Truth(twin=False, noise_free=True, scatter_free=True)
+    added = []
+    for ratio in (None, 10.0):
+        machine = scanner(scatter=Scatter(level=3, grid_ratio=ratio), geometry=geometry)
+        _, out = run(phantom(), machine, Simulation(scatter_error=0.2), truth)
+        added.append(np.exp(-out["noise_free"]) - np.exp(-out["scatter_free"]))
+    assert 0.02 < added[1].mean() / added[0].mean() < 0.6

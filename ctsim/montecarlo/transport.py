@@ -25,7 +25,8 @@ class Source:
 
     As many photons start to each pixel, or into each solid angle if `isotropic`. `gain` and `layer`, float32 [v, u],
     are the intensity of a pixel and the mm of `layer_material` before it, as of a bow-tie filter. The detector takes
-    photons from all sides as it takes those that hit it head-on.
+    photons from all sides as it takes those that hit it head-on. `grid_ratio`, if positive, is that of a focused grid
+    before it, as `ctsim.scatter.Scatter` says.
     """
 
     spectrum: Spectrum
@@ -35,6 +36,7 @@ class Source:
     gain: NDArray[np.float32] | None = None
     layer: NDArray[np.float32] | None = None
     layer_material: str | None = None
+    grid_ratio: float = 0.0
 
     @property
     def most(self) -> float:
@@ -157,7 +159,10 @@ def _run(
     transport_cpu.transport(
         tuple(world.bricks[:5]), world.prims, tuple(world.blocks),
         (tables.mu, tables.klein, tables.bound, tables.form, 1.0 / tables.d_q),
-        (np.array(pose), np.array([n_v, n_u], np.float64), normal, signals, nearest if source.isotropic else 0.0),
+        (
+            np.array(pose), np.array([n_v, n_u], np.float64), normal, signals, nearest if source.isotropic else 0.0,
+            float(source.grid_ratio),
+        ),
         np.zeros((1, 1, 1), np.uint8) if regions is None else regions,
         (np.cumsum(spectrum.weights), np.array(spectrum.energies), gain, layer, stops),
         key, first, histories,

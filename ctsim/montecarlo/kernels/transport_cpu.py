@@ -293,10 +293,29 @@ def _aim(ray, way, x, y, z):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
+def _grid(beam, way, u, v):
+    """Return the share of photons that the anti-scatter grid lets pass: 1 for the source's own direction."""
+    pose, extent, normal, _, _, ratio = beam
+    if ratio <= 0:
+        return 1.0
+    a, b = (u - 0.5) * extent[1], (v - 0.5) * extent[0]
+    along, towards, seen, far, step, area = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(3):
+        from_source = pose[3 + k] + a * pose[6 + k] + b * pose[9 + k] - pose[k]
+        along += way[3 + k] * pose[6 + k]
+        towards += way[3 + k] * normal[k]
+        seen += from_source * pose[6 + k]
+        far += from_source * normal[k]
+        step += pose[6 + k] * pose[6 + k]
+        area += normal[k] * normal[k]
+    return max(0.0, 1.0 - ratio * abs(along / towards - seen / far) * math.sqrt(area / step))
+
+
+@njit(cache=True, error_model="numpy", inline="always")
 def _force(volume, prims, tables, beam, m, energy, order, ray, way, work, rng, images):
     """Score what a Compton collision sends to a random place of the detector, on average over all its outcomes."""
     mu, klein, bound, _, per_q = tables
-    pose, extent, normal, signals, _ = beam
+    pose, extent, normal, signals, _, _ = beam
     u, v = _uniform(rng), _uniform(rng)
     a, b = (u - 0.5) * extent[1], (v - 0.5) * extent[0]
     _aim(
@@ -315,14 +334,16 @@ def _force(volume, prims, tables, beam, m, energy, order, ray, way, work, rng, i
     law *= _bound(bound, m, energy / HC * math.sqrt(max(0.5 * (1.0 - cos), 0.0)), per_q) / whole
     slant = abs(way[3] * normal[0] + way[4] * normal[1] + way[5] * normal[2])  # detector area times cos, in mm²
     share = law * slant / (way[6] * way[6])
-    tau = _depth(volume, prims, mu, later, way, work)
-    _score(images, order, v, u, share * math.exp(-tau) / COMPTON, signals, later)
+    share *= _grid(beam, way, u, v)
+    if share > 0:
+        tau = _depth(volume, prims, mu, later, way, work)
+        _score(images, order, v, u, share * math.exp(-tau) / COMPTON, signals, later)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _reach(volume, prims, tables, beam, energy, order, ray, way, work, images):
     """Score a photon at the place of the detector that it flies to, by its chance to get there."""
-    pose, extent, normal, signals, _ = beam
+    pose, extent, normal, signals, _, _ = beam
     towards = ray[3] * normal[0] + ray[4] * normal[1] + ray[5] * normal[2]
     if abs(towards) < 1e-9:
         return
@@ -341,8 +362,10 @@ def _reach(volume, prims, tables, beam, energy, order, ray, way, work, images):
         for k in range(6):
             way[k] = ray[k]
         way[6] = length
-        tau = _depth(volume, prims, tables[0], energy, way, work)
-        _score(images, order, v, u, math.exp(-tau) / RAYLEIGH, signals, energy)
+        share = _grid(beam, way, u, v) / RAYLEIGH
+        if share > 0:
+            tau = _depth(volume, prims, tables[0], energy, way, work)
+            _score(images, order, v, u, share * math.exp(-tau), signals, energy)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -362,7 +385,7 @@ def _scatter_coherently(volume, prims, tables, beam, m, energy, order, ray, way,
 def _history(volume, prims, blocks, tables, beam, regions, source, scratch, rng, images, deposit):
     """Follow one photon from the source until it is absorbed or leaves."""
     mu, _, bound, _, per_q = tables
-    pose, extent, _, signals, nearest = beam
+    pose, extent, _, signals, nearest, _ = beam
     ray, way, found, work = scratch
     cumulative, energies, gain, layer, stops = source
     wanted = _uniform(rng) * cumulative[-1]
@@ -434,7 +457,7 @@ def _region(regions, grid, ray):
 VOLUME = "Tuple((uint16[:,:,:,::1], int32[:,:,::1], uint8[::1], float32[::1], float64[::1]))"
 BLOCKS = "Tuple((int64[:,:,::1], float32[:,::1], int64[::1], int64[::1], float64[::1]))"
 TABLES = "Tuple((float32[:,:,::1], float32[:,::1], float32[:,::1], float64[:,::1], float64))"
-BEAM = "Tuple((float64[::1], float64[::1], float64[::1], float64[:,::1], float64))"
+BEAM = "Tuple((float64[::1], float64[::1], float64[::1], float64[:,::1], float64, float64))"
 SOURCE = "Tuple((float64[::1], float64[::1], float32[:,::1], float32[:,::1], float64[::1]))"
 
 SCRATCH = (
@@ -491,10 +514,11 @@ def transport(volume, prims, blocks, tables, beam, regions, source, key, first, 
     `volume` is (code, slot, pool, density, grid) of `ctsim.bricks.Bricks`; `prims` as in `ctsim.solids.pack`; `blocks`
     (kind, most, first, listed, frame) of `ctsim.montecarlo.world.Blocks`; `tables` (mu, klein, bound, form, 1/d_q);
     `beam` (pose, pixels (v, u), detector normal times area in mm², mean and mean squared signal by energy, distance of
-    the source from the detector's plane, or 0 for as many photons on every unit of its area); `regions` uint8
-    [z, y, x]; `source` (cumulative weights, energies, intensity of each pixel (at most 1), thickness in mm of a layer
-    before each pixel, attenuation of that layer by energy; images float32 [v, u] or empty). `images` [chunk, plane, v,
-    u] gets the signals, see SQUARED; `deposit` [chunk, region] the absorbed energy (keV). Either may be empty.
+    the source from the detector's plane, or 0 for as many photons on every unit of its area, ratio of the grid or 0);
+    `regions` uint8 [z, y, x]; `source` (cumulative weights, energies, intensity of each pixel (at most 1), thickness in
+    mm of a layer before each pixel, attenuation of that layer by energy; images float32 [v, u] or empty). `images`
+    [chunk, plane, v, u] gets the signals, see SQUARED; `deposit` [chunk, region] the absorbed energy (keV). Either may
+    be empty.
     """
     scratch = _scratch(tables[0].shape[0], prims.shape[0], volume[4])
     _chunks(
