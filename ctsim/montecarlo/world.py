@@ -11,8 +11,9 @@ from ctsim.montecarlo.tables import Interactions
 from ctsim.solids import BOUND, pack
 from ctsim.types import Phantom
 
-MOST_BLOCKS = 32
-"""Blocks along an axis of the voxels, at most."""
+LEAST_BRICKS, MOST_BLOCKS = 4, 32
+"""Bricks along a block's edge, at least, and blocks along an axis of the voxels, at most. Smaller blocks have tighter
+bounds but more faces to cross: 2 bricks were up to a third slower for bodies of one material, and 8 for teeth."""
 MOST_AROUND = 32
 
 
@@ -52,7 +53,7 @@ class World(NamedTuple):
 
 def make_blocks(phantom: Phantom, prims: NDArray[np.float64], tables: Interactions) -> Blocks:
     """Cut a phantom into blocks."""
-    edge = SIDE * max(2, -(-max(phantom.labels.shape) // (SIDE * MOST_BLOCKS)))
+    edge = SIDE * max(LEAST_BRICKS, -(-max(phantom.labels.shape) // (SIDE * MOST_BLOCKS)))
     inner = tuple(-(-n // edge) for n in phantom.labels.shape)
     n = np.array(phantom.labels.shape[::-1])
     d = np.array(phantom.d_voxel[::-1], np.float64)

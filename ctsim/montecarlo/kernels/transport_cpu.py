@@ -66,15 +66,21 @@ def _label(code, slot, pool, density, grid, x, y, z):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _crossed(prims, first, listed, block, ray, start, end, pair, hits):
-    """List the parts (enter, leave, material) of a ray between start and end in a block's solids; return how many."""
-    n = 0
+def _crossed(prims, first, listed, block, ray, start, pair, seen, hits, n):
+    """Add the parts (enter, leave, number, material) of a ray beyond `start` in a block's solids to the n known ones.
+
+    Each solid is intersected once in a flight, however many blocks it reaches into: `seen` marks those that were.
+    """
     for k in range(first[block], first[block + 1]):
-        prim = prims[listed[k]]
+        number = listed[k]
+        if seen[number]:
+            continue
+        seen[number] = 1
+        prim = prims[number]
         for i in range(intersect(prim, ray[0], ray[1], ray[2], ray[3], ray[4], ray[5], pair)):
-            enter, leave = max(pair[2 * i], start), min(pair[2 * i + 1], end)
+            enter, leave = max(pair[2 * i], start), pair[2 * i + 1]
             if leave > enter:
-                hits[n, 0], hits[n, 1], hits[n, 2] = enter, leave, prim[1]
+                hits[n, 0], hits[n, 1], hits[n, 2], hits[n, 3] = enter, leave, number, prim[1]
                 n += 1
     return n
 
@@ -82,10 +88,11 @@ def _crossed(prims, first, listed, block, ray, start, end, pair, hits):
 @njit(cache=True, error_model="numpy", inline="always")
 def _within(hits, n, t, end):
     """Return the material of the solid painted last at t, 0 where there is none, and where that ends at the latest."""
-    m, until = 0, end
+    m, until, last = 0, end, -1.0
     for k in range(n):
         if hits[k, 0] <= t < hits[k, 1]:
-            m = np.int64(hits[k, 2])
+            if hits[k, 2] > last:
+                last, m = hits[k, 2], np.int64(hits[k, 3])
             until = min(until, hits[k, 1])
         elif hits[k, 0] > t:
             until = min(until, hits[k, 0])
@@ -93,7 +100,7 @@ def _within(hits, n, t, end):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _fly(volume, prims, blocks, mu, energy, ray, pair, hits, rng, found):
+def _fly(volume, prims, blocks, mu, energy, ray, pair, seen, hits, rng, found):
     """Move a photon to its next collision; fill `found` with the attenuations, return the material, -1 if it leaves."""
     kind, most, first, listed, frame = blocks
     code, slot, pool, density, grid = volume
@@ -118,12 +125,13 @@ def _fly(volume, prims, blocks, mu, energy, ray, pair, hits, rng, found):
     i = int(place)
     part = np.float32(place - i)
     left = -math.log(_uniform(rng))
+    seen[:] = 0
+    n = 0
     while True:
         near = min(tx, min(ty, tz))
         block = (bz * my + by) * mx + bx
-        n = 0
         if first[block + 1] > first[block]:
-            n = _crossed(prims, first, listed, block, ray, t, near, pair, hits)
+            n = _crossed(prims, first, listed, block, ray, t, pair, seen, hits, n)
         while t < near:
             m, until = _within(hits, n, t, near)
             if m > 0:
@@ -386,7 +394,7 @@ def _history(volume, prims, blocks, tables, beam, regions, source, scratch, rng,
     """Follow one photon from the source until it is absorbed or leaves."""
     mu, _, bound, _, per_q = tables
     pose, extent, _, signals, nearest, _ = beam
-    ray, way, found, work = scratch
+    ray, way, found, seen, work = scratch
     cumulative, energies, gain, layer, stops = source
     wanted = _uniform(rng) * cumulative[-1]
     energy = energies[min(np.searchsorted(cumulative, wanted, side="right"), energies.size - 1)]
@@ -413,7 +421,7 @@ def _history(volume, prims, blocks, tables, beam, regions, source, scratch, rng,
             return
     order = 0
     while True:
-        m = _fly(volume, prims, blocks, mu, energy, ray, work[5], work[4], rng, found)
+        m = _fly(volume, prims, blocks, mu, energy, ray, work[5], seen, work[4], rng, found)
         if m < 0:
             if order == 0 and images.size > 0:
                 rows, columns = images.shape[1:]
@@ -460,8 +468,8 @@ TABLES = "Tuple((float32[:,:,::1], float32[:,::1], float32[:,::1], float64[:,::1
 BEAM = "Tuple((float64[::1], float64[::1], float64[::1], float64[:,::1], float64, float64))"
 SOURCE = "Tuple((float64[::1], float64[::1], float32[:,::1], float32[:,::1], float64[::1]))"
 
-SCRATCH = (
-    "Tuple((float64[:,::1], float64[:,::1], float64[:,::1], float64[:,::1], float32[::1], uint64[::1]))"  # of a chunk
+SCRATCH = (  # of a chunk
+    "Tuple((float64[:,::1], float64[:,::1], float64[:,::1], float64[:,::1], float32[::1], uint8[::1], uint64[::1]))"
 )
 
 
@@ -470,9 +478,9 @@ SCRATCH = (
     *("int64", "int64", "float64[:,:,::1]", "float64[::1]"),
 )
 def _histories(volume, prims, blocks, tables, beam, regions, source, scratch, key, first, last, images, deposit):
-    rays, lengths, pieces, hits, found, rng = scratch
+    rays, lengths, pieces, hits, found, seen, rng = scratch
     work = lengths[0], lengths[1], lengths[2], pieces, hits, rays[2]
-    parts = rays[0], rays[1], found, work
+    parts = rays[0], rays[1], found, seen, work
     for history in range(first, last):
         _start(rng, key, np.uint64(history))
         _history(volume, prims, blocks, tables, beam, regions, source, parts, rng, images, deposit)
@@ -482,10 +490,10 @@ def _histories(volume, prims, blocks, tables, beam, regions, source, scratch, ke
 def _chunks(
     histories, volume, prims, blocks, tables, beam, regions, source, scratch, key, first, count, images, deposit
 ):  # fmt: skip
-    rays, lengths, pieces, hits, found, rng = scratch
+    rays, lengths, pieces, hits, found, seen, rng = scratch
     for chunk in prange(CHUNKS):
         start, stop = first + chunk * count // CHUNKS, first + (chunk + 1) * count // CHUNKS
-        mine = rays[chunk], lengths[chunk], pieces[chunk], hits[chunk], found[chunk], rng[chunk]
+        mine = rays[chunk], lengths[chunk], pieces[chunk], hits[chunk], found[chunk], seen[chunk], rng[chunk]
         _histories(
             histories, volume, prims, blocks, tables, beam, regions, source, mine, key, start, stop, images[chunk],
             deposit[chunk],
@@ -502,8 +510,9 @@ def _scratch(n_materials, n_prims, grid):
         np.empty((CHUNKS, 3, 8)),
         np.empty((CHUNKS, 3, n_materials)),
         np.empty((CHUNKS, int(grid[:3].sum()) + 8, 3)),
-        np.empty((CHUNKS, 2 * n_prims + 1, 3)),
+        np.empty((CHUNKS, 2 * n_prims + 1, 4)),
         np.empty((CHUNKS, 3), np.float32),
+        np.empty((CHUNKS, n_prims), np.uint8),
         np.empty((CHUNKS, 2), np.uint64),
     )
 
