@@ -12,6 +12,7 @@ import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ctsim.benchmarks import suites
 from ctsim.errors import InputError
 from ctsim.phantoms.recipes import NAMES
 from ctsim.phantoms.scanners import MACHINES, ScannerSettings, preset
@@ -423,3 +424,9 @@ def check_refusal(plain: dict, path: str, value) -> None:
     with pytest.raises(InputError) as caught:
         parse_suite(tomli_w.dumps(spoilt), "x.toml")
     assert key in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_keys_that_came_later_leave_ids_as_they_were():
+    """The ids, which name noise streams, are those of the version before these keys."""
+    scene = suites.load("core-scatter")[0]
+    assert (scene_id(scene), stream_id(scene)) == ("2a2888775068", "ddb28ff3c9ea")
