@@ -131,6 +131,13 @@ class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             return np.asarray(self.poses[view], np.float64)
         return self._circle(self.angles[view : view + 1])[0]
 
+    def poses_between(self, views: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return poses at fractional views [n], as `pose_array`: on the circle, or between given poses on a line."""
+        known = np.arange(self.n_views)
+        if self.poses is None:
+            return self._circle(np.interp(views, known, self.angles))
+        return np.stack([np.interp(views, known, column) for column in self.pose_array().T], 1)
+
     def _circle(self, a: NDArray[np.float64]) -> NDArray[np.float64]:
         cos, sin, zero = np.cos(a), np.sin(a), np.zeros_like(a)
         e_r = np.stack([cos, sin, zero], 1)

@@ -53,7 +53,7 @@ def test_waves_are_found_and_evaluated_exactly(monkeypatch, arc):
         images[:, SQUARED] = 2 * images[:, SINGLE]
         return images
 
-    told.n, told.view = len(series._few(geometry.pose_array())), -1
+    told.n, told.view = len(series._few(geometry)), -1
     assert told.n < 30
     monkeypatch.setattr(series, "add_histories", told)
     found = scatter_series(phantom(), source(geometry), geometry, tolerance=0.01)
@@ -174,3 +174,22 @@ def test_a_grid_takes_scatter_away_and_leaves_the_rest():
         _, out = run(phantom(), machine, Simulation(scatter_error=0.2), truth)
         added.append(np.exp(-out["noise_free"]) - np.exp(-out["scatter_free"]))
     assert 0.02 < added[1].mean() / added[0].mean() < 0.6
+
+
+def test_photons_are_followed_from_poses_of_the_orbit():
+    """Not from a chord between two views, which is nearer; given poses that jump are all used."""
+    geometry = circle()
+    poses = series._few(geometry)
+    assert len(poses) == 24
+    np.testing.assert_allclose(np.linalg.norm(poses[:, :3], axis=1), geometry.dso, rtol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(poses[:, 6:9], axis=1), geometry.d_detector[1], rtol=1e-12)
+    given = geometry.pose_array()
+    jumps = circle(poses=tuple(map(tuple, np.concatenate([given[:45], given[::-1][:45]]))))
+    assert len(series._few(jumps)) == 90
+
+
+def test_an_error_that_is_not_reached_is_said(monkeypatch):
+    monkeypatch.setattr(series, "MOST", series.FIRST)
+    geometry = msgspec.structs.replace(GEOMETRY, n_views=2)
+    with pytest.raises(InputError, match=r"simulation.scatter_error: 4.0e\+04 photons reach .* not 0.001; expected"):
+        scatter_series(phantom(), source(geometry), geometry, tolerance=0.001)

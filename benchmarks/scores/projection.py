@@ -106,7 +106,7 @@ def _simulated(scene: Any, geometry: Geometry, stored: StoredScan) -> HeldOut:
     size = (1, 2 * MARGIN + 1, 2 * MARGIN + 1)
     near = ndimage.maximum_filter(trace.astype(np.uint8), size, mode="constant", cval=0) > 0
     angles = geometry.angles_deg or ()
-    scatter = "scatter included, " if plan.scatter_fraction else ""
+    scatter = "scatter included, " if scanner.scatter.level else ""
     return HeldOut(
         geometry=geometry,
         truths={

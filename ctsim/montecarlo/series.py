@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.montecarlo.kernels.transport_cpu import CHUNKS, MULTIPLE, SINGLE, SQUARED
 from ctsim.montecarlo.transport import Source, add_histories
@@ -57,9 +58,14 @@ def scatter_series(
 
     Images are parted into waves over the views, rows and columns, and waves that hold little more than noise are
     weakened (see `_smooth`). The noise is known, since the photons come in two halves.
+
+    Raises
+    ------
+    InputError
+        When the most photons that are followed do not reach `tolerance`.
     """
     world = World.of(phantom, source.spectrum.e_max)
-    poses, cells = _few(geometry.pose_array()), _cells(geometry)
+    poses, cells = _few(geometry), _cells(geometry)
     sizes = (len(poses), *cells)
     periodic = (geometry.is_full_turn, False, False)
     bases, frequencies = zip(
@@ -80,7 +86,12 @@ def scatter_series(
         done = wanted
         waves = np.einsum("hqtvu,ta,vb,uc->hqabc", halves * (2 / done), *bases, optimize=True) / norms
         kept, error = _smooth(waves[:, 0] * np.sqrt(norms / math.prod(sizes)), frequencies)
-        if error <= tolerance or done >= MOST:
+        if error > tolerance and done >= MOST:
+            raise InputError(
+                f"simulation.scatter_error: {done * len(poses):.1e} photons reach {error:.2g} of the scatter, "
+                f"not {tolerance:g}; expected at least {error:.2g}"
+            )
+        if error <= tolerance:
             series = waves.mean(0) * kept
             # a cell holds the average of a wave over its width
             series /= np.multiply.outer(*(np.sinc(np.arange(n) / (2 * n)) for n in cells))
@@ -94,18 +105,16 @@ def _cells(geometry: Geometry) -> tuple[int, int]:
     return n_v, n_u
 
 
-def _few(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def _few(geometry: Geometry) -> NDArray[np.float64]:
     """Return the poses from which photons are followed: those at the middles of equal parts of the views."""
+    poses = geometry.pose_array()
     ways = poses[:, :3] - poses[:, 3:6]
     ways /= np.linalg.norm(ways, axis=1)[:, None]
-    turned = np.arccos(np.clip((ways[1:] * ways[:-1]).sum(1), -1, 1)).sum()
-    n = max(LEAST_VIEWS, math.ceil(math.degrees(turned) / STEP_DEG))
-    if 2 * n >= len(poses):
+    turned = np.degrees(np.arccos(np.clip((ways[1:] * ways[:-1]).sum(1), -1, 1)))
+    n = max(LEAST_VIEWS, math.ceil(turned.sum() / STEP_DEG))
+    if 2 * n >= len(poses) or turned.max() > STEP_DEG:
         return poses
-    place = _middles(n) * len(poses) - 0.5
-    low = place.astype(np.int64)
-    part = (place - low)[:, None]
-    return (1 - part) * poses[low] + part * poses[low + 1]
+    return geometry.poses_between(_middles(n) * len(poses) - 0.5)
 
 
 def _middles(n: int) -> NDArray[np.float64]:
@@ -131,7 +140,6 @@ def _smooth(
 ) -> tuple[NDArray[np.float64], float]:
     """Return the weights of waves and the RMS error that stays, over the mean.
 
-    `halves` [2, t, v, u] are the coefficients from either half of the photons, of waves whose mean square is 1. Noise,
     `halves` [2, t, v, u] are the coefficients from either half of the photons, of waves whose mean square is 1. Noise,
     half the difference of the halves, has the same variance σ² in each. L waves of like frequencies, whose squares
     add up to Y, get the weight max(0, 1 − L·σ²/Y) (James and Stein 1961). The error is L·σ² times the weight, which for
