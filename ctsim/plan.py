@@ -21,7 +21,9 @@ from ctsim.project import Response, Tracer
 from ctsim.quadrature import EnergyRule, energy_rule, full_rule
 from ctsim.scatter import open_fraction
 from ctsim.settings import Simulation, Truth
+from ctsim.shadow import box_corners, primitive_corners
 from ctsim.spectrum import Spectrum, spectrum
+from ctsim.spot import SubSources, magnification, sub_sources
 from ctsim.survey import survey, trial
 from ctsim.types import Phantom, Scanner
 
@@ -58,7 +60,8 @@ class Plan:
     `materials` are the ones that rays meet, air first. In P = −ln(signal/open), `error` is the greatest found of the
     energy quadrature and `edge_error` is the largest found in eight windows at edges of inserts, in one view (see
     `ctsim.survey`); `scatter_error` is the RMS error of scatter by Monte Carlo over its mean, None for other scatter;
-    `scatter_fraction` is the constant of level 1, whose error is not known. `l0` is the median water-equivalent path of
+    `scatter_fraction` is the constant of level 1, whose error is not known. `spot` holds the points of a focal spot of
+    finite size; `edge_error` is that of each point. `l0` is the median water-equivalent path of
     the body in mm. `memory_bytes` estimates the arrays;
     Python and its libraries take a quarter of a gigabyte more. `notes` are those of `ctsim.notes`.
     """
@@ -75,6 +78,7 @@ class Plan:
     scatter_fraction: float
     scatter_error: float | None
     edge_error: float
+    spot: SubSources | None
     n_rays: int
     seconds: float
     flops: float
@@ -114,6 +118,8 @@ class Plan:
         }
         if self.scatter_error is not None:
             told["scatter_error"] = self.scatter_error
+        if self.spot is not None:
+            told["sub_sources"], told["spot_error"] = list(self.spot.grid), self.spot.error
         if self.notes:
             told["notes"] = list(self.notes)
         return told
@@ -127,10 +133,11 @@ class Plan:
                 skipped.setdefault(stage.reason, []).append(stage.name)
         edges = f", {self.edge_error:.0e} (worst edge pixel looked at)" if self.edge_error else ""
         scatter = f", {self.scatter_error:.0%} of the scatter" if self.scatter_error else ""
+        spot = f", {self.spot.error:.0e} of the step (focal spot)" if self.spot else ""
         lines = {
             "does": does,
             "skips": "; ".join(f"{reason}: {', '.join(names)}" for reason, names in skipped.items()),
-            "error": f"{self.error:.0e} (energies){edges}{scatter}",
+            "error": f"{self.error:.0e} (energies){edges}{spot}{scatter}",
             "takes": f"{human_time(self.seconds)}, {human_bytes(self.disk_bytes)} on disk, "
             f"{human_bytes(self.memory_bytes)} of memory, {self.n_rays / 1e6:.3g} M rays, {self.flops / 1e9:.2g} Gflop",
         }
@@ -155,17 +162,19 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
     seen = Response.of(rule, tracer.materials)
     tried = trial(tracer, scanner.geometry, seen, settings=simulation, twin=twin)
     outputs = _outputs(phantom, scanner, truth, present)
+    spot = _spot(tracer, scanner, simulation)
     n_rays, n_voxels = int(np.prod(scanner.geometry.shape)), int(np.prod(scanner.geometry.n_voxel))
     draws = n_rays * (2 if twin else 1) * (scanner.noise.model != "none")
     disk = _disk_bytes(outputs, scanner.geometry, twin)
     scatter_error = simulation.scatter_error if scanner.scatter.level == 3 else None
     scatter = 0.0 if scatter_error is None else SCATTER_SECONDS * (SCATTER_ERROR / scatter_error) ** 2
     passes = 2 if scanner.noise.model == "tigre" else 1  # the first finds the scan's largest P
+    passes *= 1 if spot is None else len(spot.weights)
     return Plan(
         stream_id=stream_id,
         settings=simulation,
         truth=truth,
-        stages=_stages(phantom, scanner, truth, present, rule),
+        stages=_stages(phantom, scanner, truth, present, rule) + _blurs(scanner, spot),
         outputs=outputs,
         materials=present,
         rule=rule,
@@ -174,6 +183,7 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
         scatter_fraction=open_fraction(scanner.scatter, scanner.geometry),
         scatter_error=scatter_error,
         edge_error=tried.edge_error,
+        spot=spot,
         n_rays=n_rays,
         seconds=passes * scanner.geometry.n_views * tried.seconds
         + draws * NOISE_SECONDS / numba.get_num_threads()
@@ -199,6 +209,16 @@ def _rule(
         thickest[bowtie.material] = thickest.get(bowtie.material, 0.0) + max(bowtie.center, bowtie.edge)
     met = [m for m in thickest if m != "air"]
     return energy_rule(source, scanner.detector, met, [thickest[m] for m in met], simulation.tolerance)
+
+
+def _spot(tracer: Tracer, scanner: Scanner, simulation: Simulation) -> SubSources | None:
+    """Return the points of the focal spot for the part of the object that is nearest to the source."""
+    if scanner.tube.focal_spot is None:
+        return None
+    low, high = tracer.bricks.box[:3], tracer.bricks.box[3:]
+    body = box_corners(low, high)[: int(low[0] <= high[0])]
+    points = np.concatenate([body, primitive_corners(tracer.prims)]).reshape(-1, 3)
+    return sub_sources(scanner.tube.focal_spot, magnification(scanner.geometry, points), simulation.spot_error)
 
 
 def _check_bowtie(scanner: Scanner, rule: EnergyRule) -> None:
@@ -289,3 +309,9 @@ def _stages(
         reason = "not asked" if not asked else ("" if metal else "no metal")
         stages.append(Stage(name=name, runs=not reason, reason=reason))
     return tuple(stages)
+
+
+def _blurs(scanner: Scanner, spot: SubSources | None) -> tuple[Stage, ...]:
+    """Return the stages that make a scan less sharp."""
+    points = "" if spot is None else f"{spot.grid[0]} x {spot.grid[1]} sub-sources"
+    return (Stage(name="focal spot", runs=spot is not None, reason=points or "off"),)

@@ -19,6 +19,8 @@ class Simulation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """Largest number of rays that first measure a pixel on the edge of a solid; 1: central rays only."""
     edge_tolerance: Annotated[float, msgspec.Meta(ge=1e-3)] = 0.03
     """Estimated error in P above which such a pixel gets up to 16 times as many rays; infinity: never."""
+    spot_error: Annotated[float, msgspec.Meta(ge=1e-4, le=0.5)] = 0.02
+    """Largest error at an edge, as a share of its step, of a focal spot made of points."""
     scatter_error: Annotated[float, msgspec.Meta(ge=0.002, le=0.5)] = 0.02
     """RMS error of Monte Carlo scatter (level 3) over its mean, at which no more photons are followed."""
     skip: bool = True

@@ -69,6 +69,13 @@ def row_spans(shadows: NDArray[np.int64], n_u: int) -> NDArray[np.int64]:
     return out
 
 
+def join(one: NDArray[np.int64], other: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the columns (from, to) of each row that hold those of both `row_spans` [v, 2]."""
+    both = np.stack([np.minimum(one[:, 0], other[:, 0]), np.maximum(one[:, 1], other[:, 1])], 1)
+    empty = [(spans[:, 0] >= spans[:, 1])[:, None] for spans in (one, other)]
+    return np.where(empty[0], other, np.where(empty[1], one, both))
+
+
 def inflate(prims: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """Grow the primitives that can hide within a pixel by its half diagonal; mark the others with kind −1.
 

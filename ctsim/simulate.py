@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.detector import response
+from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.montecarlo.series import ScatterSeries, scatter_series
 from ctsim.montecarlo.transport import Source
@@ -21,7 +22,7 @@ from ctsim.plan import Plan
 from ctsim.project import Response, Tracer, path_lengths, transmit
 from ctsim.quadrature import effective_weights
 from ctsim.rng import stream_key
-from ctsim.shadow import row_spans
+from ctsim.shadow import join, row_spans
 from ctsim.spectrum import bowtie_thickness, heel_factor
 from ctsim.types import Phantom, Scanner
 from ctsim.voxelise import attenuation_volume, label_volume, metal_mask
@@ -115,18 +116,37 @@ class _Simulator:
 
     def _signals(self, k: int) -> tuple[Moments, Moments | None, NDArray[np.int64] | None]:
         """Noise-free moments of the scan and of its twin, and the columns of each row in which these can differ."""
-        self.tracer.background(self.geometry, k, self.lengths)  # serves the scan, its twin and the path lengths
+        spot = self.plan.spot
+        if spot is None:
+            return self._seen(self.geometry, k)
+        geometry = spot.geometry(self.geometry, k)
+        twins = 2 if "metal_free/counts" in self.names else 1
+        sums, spans = np.zeros((twins, 2, *self.geometry.n_detector)), None
+        for j, weight in enumerate(spot.weights):
+            *images, found = self._seen(geometry, j)
+            sums += weight * np.stack([pair for pair in images if pair is not None])
+            spans = found if spans is None or found is None else join(spans, found)
+        scan, *twin = sums.astype(np.float32)
+        return (scan[0], scan[1]), (twin[0][0], twin[0][1]) if twin else None, spans
+
+    def _cross(self, geometry: Geometry, k: int) -> None:
+        """Fill `lengths` with what the central rays of a view cross but for solids."""
+        self.tracer.background(geometry, k, self.lengths)  # serves the scan, its twin and the path lengths
         if self.beam.layer is not None:
             self.lengths[-1] += self.beam.layer
-        scan = self._transmit(self.tracer, k)
+
+    def _seen(self, geometry: Geometry, k: int) -> tuple[Moments, Moments | None, NDArray[np.int64] | None]:
+        """Return what `_signals` does, of a point source."""
+        self._cross(geometry, k)
+        scan = self._transmit(self.tracer, geometry, k)
         if "metal_free/counts" not in self.names:
             return scan, None, None
         if not self.plan.settings.skip:
-            return scan, self._transmit(self.bare, k), None
+            return scan, self._transmit(self.bare, geometry, k), None
         # only pixels in the metal's shadow can differ
-        shape = self.geometry.n_detector
-        spans = row_spans(self.tracer.shadows(self.geometry.pose(k), shape)[:, self.tracer.metal], shape[1])
-        return scan, self._transmit(self.bare, k, (scan[0].copy(), scan[1].copy(), spans)), spans
+        shape = geometry.n_detector
+        spans = row_spans(self.tracer.shadows(geometry.pose(k), shape)[:, self.tracer.metal], shape[1])
+        return scan, self._transmit(self.bare, geometry, k, (scan[0].copy(), scan[1].copy(), spans)), spans
 
     def _largest_p(self) -> list[float]:
         """Largest P that is read without noise in all views: of the scan and of its twin."""
@@ -137,10 +157,12 @@ class _Simulator:
                     largest[which] = max(largest[which], largest_p(self._lit(moments, k, which)[0]))
         return largest
 
-    def _transmit(self, tracer: Tracer, k: int, out: tuple[Image, Image, NDArray] | None = None) -> tuple[Image, Image]:
+    def _transmit(
+        self, tracer: Tracer, geometry: Geometry, k: int, out: tuple[Image, Image, NDArray] | None = None
+    ) -> tuple[Image, Image]:
         return transmit(
             tracer,
-            self.geometry,
+            geometry,
             k,
             self.response,
             subrays=self.plan.settings.subrays,
@@ -209,6 +231,8 @@ class _Simulator:
         energies = self.plan.truth.mono_kev
         if not wanted and not energies:
             return {}
+        if self.plan.spot is not None:
+            self._cross(self.geometry, k)  # the rays from the spot's centre
         lengths = path_lengths(self.tracer, self.geometry, k, self.lengths)[: len(self.plan.materials)]
         metal = lengths[self.metal[: len(lengths)]].sum(0)
         all_paths = {"trace": (metal > 0).astype(np.uint8), "metal_path": metal, "paths": lengths[1:]}

@@ -35,7 +35,7 @@ FIRST_KEYS: dict[str, frozenset[str]] = {
         "Noise": "model electronic adc_bits adc_fill pedestal n_flats fixed_pattern pattern_residual dead_fraction",
         "Scatter": "level fraction",
         "Truth": "twin noise_free scatter_free mono_kev trace metal_path paths",
-        "Simulation": "tolerance subrays edge_tolerance scatter_error skip",
+        "Simulation": "tolerance subrays edge_tolerance skip",
     }.items()
 }
 """The keys of each struct that are part of every id."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry, crosswise
 from ctsim.manifest import is_reserved
+from ctsim.phantoms.identity import identity
 from ctsim.phantoms.recipes import AnyRecipe, build_recipe
 from ctsim.phantoms.scanners import REACH, ScannerSettings
 from ctsim.phantoms.suites import NULL, decode, parse_toml, read_toml, scenes_of
@@ -76,7 +77,7 @@ def build(scene: Scene) -> Phantom:
 
 
 def scene_id(scene: Scene) -> str:
-    """Return 12 hexadecimal digits of the SHA-256 of everything the scene says."""
+    """Return 12 hexadecimal digits of the SHA-256 of what the scene says (see `ctsim.phantoms.identity`)."""
     return _digest(scene, ())
 
 
@@ -88,23 +89,14 @@ def stream_id(scene: Scene) -> str:
     return _digest(scene, ("truth", "simulation"))
 
 
-# keys that came later, with the value that leaves a scene as it was: ids, and with them noise, stay
-_LATER = {"scanner.scatter.grid_ratio": None, "simulation.scatter_error": 0.02}
-
-
 def _digest(scene: Scene, without: tuple[str, ...]) -> str:
     # decoding turns 60 into 60.0 where a float is meant, so equal scenes have equal text; key by key, for the whole
     # would be checked again, which takes a hundred times as long
     kept = {
-        name: msgspec.to_builtins(msgspec.convert(msgspec.to_builtins(getattr(scene, name)), kind))
+        name: identity(msgspec.convert(msgspec.to_builtins(getattr(scene, name)), kind))
         for name, kind in _kinds().items()
         if name not in without
     }
-    for path, default in _LATER.items():
-        *tables, key = path.split(".")
-        table = functools.reduce(lambda found, name: (found or {}).get(name), tables, kept)
-        if table is not None and table[key] == default:
-            del table[key]
     if "sha256" in kept["phantom"]:  # the file is known by its content, wherever it lies
         del kept["phantom"]["path"]
     return hashlib.sha256(msgspec.json.encode(kept, order="deterministic")).hexdigest()[:12]
