@@ -17,6 +17,7 @@ from scipy.special import expn
 
 from ctsim.errors import InputError
 from ctsim.materials import E_MIN, attenuation, compton, k_shell, k_vacancies, photoelectric
+from ctsim.panel import Blur, Lag, check_lag
 
 _SLAB = {"gos": "GOS", "csi": "CsI", "ideal": "GOS", "counting": "CdTe@5.85"}
 _DEPTHS = 24  # Gauss–Legendre nodes over the depth of the first interaction, in its own probability
@@ -26,7 +27,7 @@ class Detector(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """A detector.
 
     "gos" and "csi" integrate energy, with K-escape. "ideal" integrates E(1 − exp(−μt)) of GOS, for comparison.
-    "counting" counts photons that deposit more than `threshold` in CdTe.
+    "counting" counts photons that deposit more than `threshold` in CdTe; it has neither blur nor lag.
     """
 
     kind: Literal["gos", "csi", "ideal", "counting"] = "gos"
@@ -35,6 +36,10 @@ class Detector(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Its thickness in mm."""
     threshold: float = 15.0
     """Threshold of "counting" in keV."""
+    blur: Blur | None = None
+    """How light spreads over the panel; it blurs the signal and its photon noise."""
+    lag: tuple[Lag, ...] = ()
+    """Parts of the signal that come in later views."""
 
     def __post_init__(self) -> None:
         if self.kind not in _SLAB:
@@ -43,6 +48,9 @@ class Detector(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             raise InputError(f"detector: thickness must be within [1e-6, 100] mm, got {self.thickness}")
         if not (math.isfinite(self.threshold) and self.threshold >= 0):
             raise InputError(f"detector: threshold must be at least 0 keV, got {self.threshold}")
+        check_lag(self.lag)
+        if self.kind == "counting" and (self.blur is not None or self.lag):
+            raise InputError('detector: "counting" has no light; expected neither blur nor lag with it')
 
 
 def response(detector: Detector, energies: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

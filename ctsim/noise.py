@@ -1,6 +1,7 @@
 """What the detector writes: photon noise, electronic noise, fixed pattern, ADC, flat field."""
 
 import math
+from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -154,6 +155,39 @@ def detect(
     return out
 
 
+def photons(
+    m1: NDArray[Any],
+    m2: NDArray[Any],
+    *,
+    noise: Noise,
+    i0: float,
+    key: np.uint64,
+    known: tuple[NDArray[np.float32], NDArray[np.int64]] | None = None,
+) -> NDArray[np.float32]:
+    """Draw the signal of one view's photons, [v, u], in photons of the open field: what `detect` reads out.
+
+    Arguments as in `detect`; `known` holds signals.
+    """
+    bare = msgspec.structs.replace(noise, electronic=0.0, adc_bits=None)
+    return detect(m1, m2, noise=bare, i0=i0, key=key, known=known)
+
+
+def read_out(
+    drawn: NDArray[np.float32], *, noise: Noise, i0: float, key: np.uint64, pattern: NDArray[np.float32] | None = None
+) -> NDArray[Any]:
+    """Return what the detector writes of a signal [v, u] in photons of the open field.
+
+    It is `detect` of the `photons` of one stream, but for the rounding of these to float32.
+    """
+    if noise.model != "compound":
+        return drawn if pattern is None else (_read(drawn / np.float32(i0), pattern) * i0).astype(noise.dtype)
+    gains = _NO_PATTERN if pattern is None else pattern
+    out = np.empty(drawn.shape, noise.dtype)
+    scale = (float(i0), noise.electronic, noise.gain(i0), noise.dark, float(noise.full_scale))
+    noise_cpu.read_out(drawn, gains, *scale, np.uint64(key), out)
+    return out
+
+
 def _read(signal: NDArray[Any], pattern: NDArray[np.float32]) -> NDArray[Any]:
     """Return what pixels with a pattern read of a mean signal relative to the open field."""
     return signal * pattern[0] * (1 + pattern[1] * np.maximum(1 - signal, 0))
@@ -197,19 +231,25 @@ def flat_field(
     i0: float,
     scene_id: str,
     pattern: NDArray[np.float32] | None = None,
+    spread: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None,
 ) -> NDArray[np.float32]:
     """Return the open-field image in counts, pedestal included, float32 [v, u].
 
     `open_field` is the signal and second moment (m1, m2) [v, u] without an object. The image is the mean of
     `noise.n_flats` views of it through the same detector, or exact when that is 0 and for the models
-    "tigre" and "none". A dead pixel reads exactly `noise.dark`.
+    "tigre" and "none". A dead pixel reads exactly `noise.dark`. `spread` is what happens to the light of each view.
     """
     m1, m2 = open_field
     if noise.n_flats == 0 or noise.model != "compound":
+        m1 = m1 if spread is None else spread(m1)
         gains = m1 if pattern is None else _read(m1, pattern)
         return (noise.dark + noise.gain(i0) * gains).astype(np.float32)
     total = np.zeros(m1.shape)
     for k in range(noise.n_flats):
         key = rng.stream_key(scene_id, "flat", k)
-        total += detect(m1, m2, noise=noise, i0=i0, key=key, pattern=pattern)
+        if spread is None:
+            total += detect(m1, m2, noise=noise, i0=i0, key=key, pattern=pattern)
+        else:
+            drawn = spread(photons(m1, m2, noise=noise, i0=i0, key=key))
+            total += read_out(drawn, noise=noise, i0=i0, key=key, pattern=pattern)
     return (total / noise.n_flats).astype(np.float32)

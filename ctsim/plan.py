@@ -4,6 +4,7 @@ A short survey (`ctsim.survey`) tells how thick the materials are that are met, 
 reach the tolerance, how long a view takes on this machine and how good the edges of the inserts are.
 """
 
+import math
 from dataclasses import dataclass
 
 import msgspec
@@ -17,6 +18,7 @@ from ctsim.geometry import Geometry
 from ctsim.human import human_bytes, human_time
 from ctsim.materials import attenuation
 from ctsim.notes import metal_notes
+from ctsim.panel import response as lag_response
 from ctsim.project import Response, Tracer
 from ctsim.quadrature import EnergyRule, energy_rule, full_rule
 from ctsim.scatter import open_fraction
@@ -119,7 +121,7 @@ class Plan:
         if self.scatter_error is not None:
             told["scatter_error"] = self.scatter_error
         if self.spot is not None:
-            told["sub_sources"], told["spot_error"] = list(self.spot.grid), self.spot.error
+            told["sub_sources"], told["spot_error"] = len(self.spot.weights), self.spot.error
         if self.notes:
             told["notes"] = list(self.notes)
         return told
@@ -192,7 +194,7 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
         + disk * WRITE_SECONDS,
         flops=float(n_rays) * len(rule.energies) * (2 * len(present) + 16),
         disk_bytes=disk,
-        memory_bytes=_memory_bytes(phantom, scanner.geometry),
+        memory_bytes=_memory_bytes(phantom, scanner.geometry) + _lag_bytes(scanner, outputs),
         notes=metal_notes(phantom, scanner.geometry, seen, simulation.subrays),
     )
 
@@ -213,12 +215,13 @@ def _rule(
 
 def _spot(tracer: Tracer, scanner: Scanner, simulation: Simulation) -> SubSources | None:
     """Return the points of the focal spot for the part of the object that is nearest to the source."""
-    if scanner.tube.focal_spot is None:
+    tube, tolerance = scanner.tube, simulation.spot_error
+    if tube.focal_spot is None and tube.off_focal is None:
         return None
     low, high = tracer.bricks.box[:3], tracer.bricks.box[3:]
     body = box_corners(low, high)[: int(low[0] <= high[0])]
     points = np.concatenate([body, primitive_corners(tracer.prims)]).reshape(-1, 3)
-    return sub_sources(scanner.tube.focal_spot, magnification(scanner.geometry, points), simulation.spot_error)
+    return sub_sources(tube.focal_spot, magnification(scanner.geometry, points), tolerance, tube.off_focal)
 
 
 def _check_bowtie(scanner: Scanner, rule: EnergyRule) -> None:
@@ -279,6 +282,12 @@ def _memory_bytes(phantom: Phantom, geometry: Geometry) -> int:
     return phantom.labels.size + max(PLANNING_BYTES + 3 * phantom.labels.size + view, volumes)
 
 
+def _lag_bytes(scanner: Scanner, outputs: tuple[Output, ...]) -> int:
+    """Bytes of the earlier views that a panel with lag remembers of each stack that it acts on."""
+    stacks = sum(o.name.endswith(("counts", "noise_free", "scatter_free")) for o in outputs)
+    return 4 * (lag_response(scanner.detector.lag).size - 1) * stacks * int(np.prod(scanner.geometry.n_detector))
+
+
 def _stages(
     phantom: Phantom, scanner: Scanner, truth: Truth, present: tuple[str, ...], rule: EnergyRule
 ) -> tuple[Stage, ...]:
@@ -312,6 +321,16 @@ def _stages(
 
 
 def _blurs(scanner: Scanner, spot: SubSources | None) -> tuple[Stage, ...]:
-    """Return the stages that make a scan less sharp."""
-    points = "" if spot is None else f"{spot.grid[0]} x {spot.grid[1]} sub-sources"
-    return (Stage(name="focal spot", runs=spot is not None, reason=points or "off"),)
+    """Return the stages that make a scan less sharp or its field less even."""
+    tube, detector = scanner.tube, scanner.detector
+    points = around = ""
+    if spot is not None:
+        points = f"{spot.grid[0]} x {spot.grid[1]} sub-sources"
+        around = f"{len(spot.weights) - math.prod(spot.grid)} sub-sources"
+    widths = [] if detector.blur is None else [detector.blur.fwhm, detector.blur.tail_fwhm]
+    light = " and ".join(f"{width:g} mm" for width in widths if width is not None)
+    late = f"of the last {lag_response(detector.lag).size - 1} views" if detector.lag else ""
+    found = (("falloff", tube.falloff, ""), ("focal spot", tube.focal_spot is not None, points))
+    found += (("off-focal", tube.off_focal is not None, around),)
+    found += (("detector blur", bool(widths), light), ("lag", bool(late), late))
+    return tuple(Stage(name=name, runs=runs, reason=why if runs else "off") for name, runs, why in found)

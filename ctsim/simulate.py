@@ -1,7 +1,7 @@
 """Carry out a plan: counts and the ground truth asked for, view by view.
 
-Nothing here grows with the number of views. A view depends on its own index only, so a run that was
-interrupted goes on where it stopped and gives the same bytes.
+Nothing here grows with the number of views. A view depends on its own index only, and with lag on that of a few views
+before it, which are made again where a run that was interrupted goes on. It gives the same bytes.
 """
 
 import math
@@ -17,7 +17,8 @@ from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.montecarlo.series import ScatterSeries, scatter_series
 from ctsim.montecarlo.transport import Source
-from ctsim.noise import detect, detect_tigre, flat_field, largest_p, pixel_pattern
+from ctsim.noise import detect, detect_tigre, flat_field, largest_p, photons, pixel_pattern, read_out
+from ctsim.panel import Panel
 from ctsim.plan import Plan
 from ctsim.project import Response, Tracer, path_lengths, transmit
 from ctsim.quadrature import effective_weights
@@ -29,6 +30,7 @@ from ctsim.voxelise import attenuation_volume, label_volume, metal_mask
 
 Image = NDArray[np.float32]
 Moments = tuple[Image, Image]
+TWIN = "metal_free/"
 REFERENCE_KEV = 50.0  # centre of 10–90 keV
 
 
@@ -67,6 +69,10 @@ def _beam(plan: Plan, scanner: Scanner) -> _Beam:
     if tube.heel:
         # the anode–cathode axis is the rotation axis, so the heel runs along v
         gain = np.repeat(heel_factor(tube, np.arctan2(v, geometry.dsd))[:, None], n_u, 1).astype(np.float32)
+    if tube.falloff:
+        # 1/r² and the cosine of the slant, over those at the foot of the perpendicular from the source
+        slant = np.cos(np.arctan(np.hypot(v[:, None], u) / geometry.dsd)) ** 3
+        gain = (slant if gain is None else gain * slant).astype(np.float32)
     shape, w1, w2 = (n_v, n_u), float(plan.rule.w1.sum()), float(plan.rule.w2.sum())
     open1, open2 = np.full(shape, w1, np.float32), np.full(shape, w2, np.float32)
     if tube.bowtie is not None:
@@ -77,6 +83,14 @@ def _beam(plan: Plan, scanner: Scanner) -> _Beam:
         open1 = np.tensordot(plan.rule.w1, passed, 1).astype(np.float32)
         open2 = np.tensordot(plan.rule.w2, passed, 1).astype(np.float32)
     return _Beam(gain=gain, layer=layer, layer_material=name, open1=open1, open2=open2)
+
+
+def _panel(scanner: Scanner) -> Panel | None:
+    """Return the panel where its light spreads or comes late."""
+    detector = scanner.detector
+    if detector.blur is None and not detector.lag:
+        return None
+    return Panel(detector.blur, detector.lag, scanner.geometry.d_detector)
 
 
 class _Simulator:
@@ -92,6 +106,10 @@ class _Simulator:
         self.pattern = pixel_pattern(self.geometry.n_detector, noise=scanner.noise, scene_id=plan.stream_id)
         self.metal = np.array([any(s.metal and s.material == m for s in body.solids) for m in self.tracer.materials])
         self.names = {o.name for o in plan.outputs}
+        self.panel = _panel(scanner)
+        beam = self.beam
+        opened = beam.open1, beam.open1 if beam.gain is None else beam.open1 * beam.gain
+        self.opened, self.lit_open = opened if self.panel is None else map(self.panel.spread, opened)
         self.lengths = np.zeros((len(self.tracer.materials), *self.geometry.n_detector), np.float32)
 
         self.scatter = [self._scatter(body)]
@@ -99,19 +117,24 @@ class _Simulator:
             self.scatter.append(self._scatter(body.without_metal()))
         self.largest = self._largest_p() if scanner.noise.model == "tigre" else [math.nan] * 2
 
+    @property
+    def frames(self) -> int:
+        """How many earlier views a view depends on."""
+        return 0 if self.panel is None else self.panel.frames
+
     def view(self, k: int) -> dict[str, NDArray]:
-        """Everything the plan wants of view k."""
+        """Everything the plan wants of view k. With lag, views come in order."""
         scan, twin, spans = self._signals(k)
         lit = self._lit(scan, k, 0)
         out = self._images(scan, lit)
-        out["counts"] = self._counts(lit, k, self.largest[0])
+        out["counts"], drawn = self._counts(lit, k, 0)
         if twin is not None:
             lit = self._lit(twin, k, 1)
-            images = self._images(twin, lit)
+            images = self._images(twin, lit, TWIN)
             # scatter of its own makes every pixel of the twin another
-            known = None if spans is None or self.scatter[1] else (out["counts"].copy(), spans)
-            images["counts"] = self._counts(lit, k, self.largest[1], known)
-            out |= {f"metal_free/{name}": image for name, image in images.items()}
+            known = None if spans is None or self.scatter[1] else (drawn.copy(), spans)
+            images["counts"], _ = self._counts(lit, k, 1, known)
+            out |= {f"{TWIN}{name}": image for name, image in images.items()}
         return out | self._paths(k)
 
     def _signals(self, k: int) -> tuple[Moments, Moments | None, NDArray[np.int64] | None]:
@@ -202,28 +225,41 @@ class _Simulator:
             m1, m2 = m1 + np.float32(s), m2 + np.float32(s * self.plan.rule.w2.sum())
         return m1, m2
 
-    def _images(self, moments: Moments, lit: Moments) -> dict[str, NDArray]:
+    def _images(self, moments: Moments, lit: Moments, prefix: str = "") -> dict[str, NDArray]:
         """Return the noise-free images that were asked for, of the moments without and with scatter."""
         m1, out = moments[0], {}
         if "scatter_free" in self.names:
-            out["scatter_free"] = -np.log(m1 / self.beam.open1)
+            out["scatter_free"] = -np.log(self._read(f"{prefix}scatter_free", m1) / self.opened)
         if "noise_free" in self.names:
-            seen, opened = lit[0], self.beam.open1
+            seen, opened = self._read(f"{prefix}noise_free", lit[0]), self.lit_open
             if self.beam.gain is not None:
                 # behind the anode there is no open field to divide by: what the primary alone would give
-                seen, opened = np.where(self.beam.gain > 0, (seen, opened * self.beam.gain), (m1, opened))
+                seen, opened = np.where(self.beam.gain > 0, (seen, opened), (m1, self.beam.open1))
             out["noise_free"] = -np.log(seen / opened)
         return out
 
+    def _read(self, name: str, image: Image) -> Image:
+        """Return what the panel makes of the next image of a stack."""
+        return image if self.panel is None else self.panel.see(name, image)
+
     def _counts(
-        self, moments: Moments, k: int, largest: float, known: tuple[NDArray, NDArray[np.int64]] | None = None
-    ) -> NDArray:
-        """Draw the counts; `known` = (counts, spans) are counts to be drawn again in those columns only."""
+        self, moments: Moments, k: int, which: int, known: tuple[NDArray, NDArray[np.int64]] | None = None
+    ) -> tuple[NDArray, NDArray]:
+        """Draw the counts of the scan (0) or its twin (1); return them, and what was drawn before the panel acted.
+
+        `known` = (drawn, spans) are to be drawn again in those columns only.
+        """
         m1, m2 = moments
         key, noise, i0 = stream_key(self.plan.stream_id, "view", k), self.scanner.noise, self.scanner.i0
         if noise.model == "tigre":
-            return detect_tigre(m1, top=largest, noise=noise, i0=i0, key=key)
-        return detect(m1, m2, noise=noise, i0=i0, key=key, pattern=self.pattern, known=known)
+            counts = detect_tigre(m1, top=self.largest[which], noise=noise, i0=i0, key=key)
+            return counts, counts
+        if self.panel is None:
+            counts = detect(m1, m2, noise=noise, i0=i0, key=key, pattern=self.pattern, known=known)
+            return counts, counts
+        drawn = photons(m1, m2, noise=noise, i0=i0, key=key, known=known)
+        seen = self.panel.see(f"{TWIN if which else ''}counts", drawn)
+        return read_out(seen, noise=noise, i0=i0, key=key, pattern=self.pattern), drawn
 
     def _paths(self, k: int) -> dict[str, NDArray]:
         """Images made from path lengths along the central rays."""
@@ -260,6 +296,8 @@ def simulate_views(
     if first_view == scanner.geometry.n_views:
         return  # a pass over all views, as TIGRE's noise takes, would be for nothing
     simulator = _Simulator(plan, phantom, scanner)
+    for k in range(max(0, first_view - simulator.frames), first_view):
+        simulator.view(k)  # light of earlier views comes in later ones
     for k in range(first_view, scanner.geometry.n_views):
         yield k, simulator.view(k)
 
@@ -269,12 +307,14 @@ def flat_image(plan: Plan, scanner: Scanner) -> Image:
     beam = _beam(plan, scanner)
     gain = 1.0 if beam.gain is None else beam.gain
     pattern = pixel_pattern(scanner.geometry.n_detector, noise=scanner.noise, scene_id=plan.stream_id)
+    panel = _panel(scanner)
     return flat_field(
         (beam.open1 * np.float32(gain), beam.open2 * np.float32(gain)),
         noise=scanner.noise,
         i0=scanner.i0,
         scene_id=plan.stream_id,
         pattern=pattern,
+        spread=None if panel is None else panel.spread,
     )
 
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctsim import anode
 from ctsim.errors import InputError
 from ctsim.materials import E_MIN, attenuation, mass_energy_transfer, material
-from ctsim.spot import FocalSpot
+from ctsim.spot import FocalSpot, OffFocal
 
 TABLE_KVP = (20.0, 300.0)
 _TABLE_ANGLE_DEG = (1.0, 40.0)
@@ -83,8 +83,12 @@ class Tube(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Include the anode's heel."""
     bowtie: Bowtie | None = None
     """A bow-tie filter."""
+    falloff: bool = False
+    """Include 1/r² and the slant at which pixels off the centre are hit."""
     focal_spot: FocalSpot | None = None
     """A focal spot of finite size, instead of a point."""
+    off_focal: OffFocal | None = None
+    """Radiation from around the focal spot."""
 
     def __post_init__(self) -> None:
         if self.model not in ("table", "finkelshtein-pavlova", "spekpy", "mono"):

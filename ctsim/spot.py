@@ -18,7 +18,7 @@ from scipy.special import ndtr
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry, Pair, few_views
 
-LARGEST = 20.0  # mm, of a spot
+LARGEST, WIDEST = 20.0, 50.0  # mm, of a spot and of what is around it
 MOST_POINTS = 64  # along an axis
 FWHM = 2 * math.sqrt(2 * math.log(2))  # of a Gaussian, over its standard deviation
 
@@ -49,6 +49,21 @@ class FocalSpot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
             _check_weights(self.weights)
 
 
+class OffFocal(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Radiation from around the focal spot: an even Gaussian that no collimator limits."""
+
+    share: float
+    """Its share of the intensity, above 0 and at most 0.5."""
+    fwhm: float
+    """Full width at half maximum in mm, above 0 and at most 50."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.share <= 0.5:
+            raise InputError(f"off_focal: share must be within (0, 0.5], got {self.share}")
+        if not 0 < self.fwhm <= WIDEST:
+            raise InputError(f"off_focal: fwhm must be within (0, {WIDEST:g}] mm, got {self.fwhm}")
+
+
 def _check_weights(weights: tuple[tuple[float, ...], ...]) -> None:
     rows = {len(row) for row in weights}
     if len(rows) != 1 or not 1 <= min(rows) <= MOST_POINTS or len(weights) > MOST_POINTS:
@@ -62,8 +77,9 @@ def _check_weights(weights: tuple[tuple[float, ...], ...]) -> None:
 class SubSources:
     """The points of a focal spot: `offsets` [n, 2] (v, u) in mm from its centre and `weights` [n] that add up to 1.
 
-    `grid` is how many there are along v and u. `error` is the largest error of the signal at a straight edge along
-    the detector's rows or columns, as a share of the edge's step; at an oblique edge it is at most √2 times that.
+    `grid` is how many of the focal spot there are along v and u; those of off-focal radiation follow. `error` is the
+    largest error of the signal at a straight edge along the detector's rows or columns, as a share of the edge's step;
+    at an oblique edge it is at most √2 times that.
     """
 
     offsets: NDArray[np.float64]
@@ -93,12 +109,34 @@ def magnification(geometry: Geometry, points: NDArray[np.float64]) -> Pair:
     return penumbra / float(np.linalg.norm(e_v, axis=1).min()), penumbra / float(np.linalg.norm(e_u, axis=1).min())
 
 
-def sub_sources(spot: FocalSpot, pixels: Pair, tolerance: float) -> SubSources:
-    """Part a spot into the fewest points whose error, see `SubSources`, is at most `tolerance`.
+def sub_sources(
+    spot: FocalSpot | None, pixels: Pair, tolerance: float, off_focal: OffFocal | None = None
+) -> SubSources:
+    """Part a spot, a point if None, into the fewest points whose error, see `SubSources`, is at most `tolerance`.
 
-    `pixels` (v, u) is the penumbra of 1 mm of the spot (`magnification`). Raises InputError where that takes more than
-    `MOST_POINTS` along an axis.
+    `pixels` (v, u) is the penumbra of 1 mm of the spot (`magnification`). Off-focal radiation gets points of its own;
+    half the tolerance is theirs. Raises InputError where an axis takes more than `MOST_POINTS`.
     """
+    if off_focal is None:
+        return _point() if spot is None else _parted(spot, pixels, tolerance)
+    around = FocalSpot(size=(off_focal.fwhm,) * 2)
+    share, half = off_focal.share, tolerance / 2
+    main = _point() if spot is None else _parted(spot, pixels, half / (1 - share))
+    wide = _parted(around, pixels, half / share)
+    return SubSources(
+        offsets=np.concatenate([main.offsets, wide.offsets]),
+        weights=np.concatenate([(1 - share) * main.weights, share * wide.weights]),
+        grid=main.grid,
+        error=(1 - share) * main.error + share * wide.error,
+    )
+
+
+def _point() -> SubSources:
+    return SubSources(offsets=np.zeros((1, 2)), weights=np.ones(1), grid=(1, 1), error=0.0)
+
+
+def _parted(spot: FocalSpot, pixels: Pair, tolerance: float) -> SubSources:
+    """Part one spot; see `sub_sources`."""
     sides = [_fewest(spot, axis, spot.size[axis] * pixels[axis], tolerance) for axis in (0, 1)]
     (v, w_v, error_v), (u, w_u, error_u) = sides
     if spot.weights is None:

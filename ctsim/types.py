@@ -88,10 +88,19 @@ class Scanner(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
             raise InputError(
                 f"detector.threshold must be below tube.kvp = {self.tube.kvp} keV, got {self.detector.threshold}"
             )
-        if (self.tube.heel or self.tube.bowtie) and self.noise.model == "tigre":
-            raise InputError("noise.model = 'tigre' knows P only: expected neither tube.heel nor tube.bowtie with it")
-        if (self.tube.heel or self.tube.bowtie) and self.geometry.poses is not None:
-            raise InputError("tube.heel and tube.bowtie need a circular orbit, but geometry.poses is given")
+        tube, panel = self.tube, self.detector
+        if (tube.heel or tube.bowtie or tube.falloff) and self.noise.model == "tigre":
+            raise InputError(
+                "noise.model = 'tigre' knows P only: expected neither tube.heel, tube.bowtie nor tube.falloff with it"
+            )
+        if (panel.blur or panel.lag) and self.noise.model == "tigre":
+            raise InputError(
+                "noise.model = 'tigre' has independent pixels: expected neither detector.blur nor detector.lag with it"
+            )
+        if (tube.heel or tube.bowtie or tube.falloff) and self.geometry.poses is not None:
+            raise InputError(
+                "tube.heel, tube.bowtie and tube.falloff need a circular orbit, but geometry.poses is given"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -90,7 +90,7 @@ def test_absurd_numbers_are_refused_by_name(changes: dict) -> None:
 )
 def test_heel_and_bowtie_need_a_circular_orbit(tube: Tube) -> None:
     assert Scanner(geometry=GEOMETRY, tube=tube) and Scanner(geometry=with_(poses=posed({})))
-    with pytest.raises(InputError, match=r"tube\.heel and tube\.bowtie need a circular orbit.*geometry\.poses"):
+    with pytest.raises(InputError, match=r"tube\.bowtie and tube\.falloff need a circular orbit.*geometry\.poses"):
         Scanner(geometry=with_(poses=posed({})), tube=tube)
 
 

@@ -146,7 +146,9 @@ def test_a_later_key_is_part_of_an_id_only_where_it_is_used() -> None:
 def test_the_defaults_of_later_keys_stay() -> None:
     """An id without such a key means its default: a new key is added here, and no entry ever changes."""
     known = {
-        "Tube": {"focal_spot": None},
+        "Tube": {"falloff": False, "focal_spot": None, "off_focal": None},
+        "Detector": {"blur": None, "lag": ()},
+        "Blur": {"tail": 0.0, "tail_fwhm": None},
         "FocalSpot": {"shape": "gaussian", "weights": None},
         "Scatter": {"grid_ratio": None},
         "Simulation": {"scatter_error": 0.02, "spot_error": 0.02},

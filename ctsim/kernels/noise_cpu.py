@@ -168,6 +168,21 @@ def _row_words(key, first, words):
         words[1, u] = (w2 << _32) | w3
 
 
+@njit(cache=True, inline="always")
+def _reading(signal, p0, p1, word, electronic, gain, dark, full):
+    """Return what is written of a relative signal; `word` holds the random bits of the electronic noise."""
+    value = dark
+    factor = p0 * (1.0 + p1 * max(1.0 - signal, 0.0))
+    if factor > 0.0:
+        if electronic > 0.0:
+            value += gain * (signal * factor + electronic * normal(word & _LOW))
+        else:
+            value += gain * signal * factor
+    if full > 0.0:
+        value = min(max(np.floor(value + 0.5), 0.0), full)
+    return value
+
+
 @njit(parallel=True, cache=True)
 def detect(m1, m2, pattern, spans, i0, electronic, gain, dark, full, key, out, bad):
     """Draw the counts of one view in columns spans[v] = (from, to) of its rows.
@@ -199,19 +214,27 @@ def detect(m1, m2, pattern, spans, i0, electronic, gain, dark, full, key, out, b
                 signal = k * (second / (mean * i0))
             elif not (mean == 0.0 and 0.0 <= second < np.inf):
                 wrong = True
-            value = dark
-            factor = 1.0
+            p0, p1 = 1.0, 0.0
             if pattern.size > 0:
-                factor = float(pattern[0, v, u]) * (1.0 + float(pattern[1, v, u]) * max(1.0 - signal, 0.0))
-            if factor > 0.0:
-                if electronic > 0.0:
-                    value += gain * (signal * factor + electronic * normal(words[1, u - begin] & _LOW))
-                else:
-                    value += gain * signal * factor
-            if full > 0.0:
-                value = min(max(np.floor(value + 0.5), 0.0), full)
-            out[v, u] = value
+                p0, p1 = float(pattern[0, v, u]), float(pattern[1, v, u])
+            out[v, u] = _reading(signal, p0, p1, words[1, u - begin], electronic, gain, dark, full)
         bad[v] = wrong
+
+
+@njit(parallel=True, cache=True)
+def read_out(drawn, pattern, i0, electronic, gain, dark, full, key, out):
+    """Write the counts of a signal [v, u] that was drawn already, in photons; arguments as in `detect`."""
+    n_v, n_u = drawn.shape
+    key = np.uint64(key)
+    electronic = electronic / i0
+    for v in prange(n_v):
+        words = np.empty((2, n_u), np.uint64)
+        _row_words(key, np.uint64(v) * np.uint64(n_u), words)
+        for u in range(n_u):
+            p0, p1 = 1.0, 0.0
+            if pattern.size > 0:
+                p0, p1 = float(pattern[0, v, u]), float(pattern[1, v, u])
+            out[v, u] = _reading(float(drawn[v, u]) / i0, p0, p1, words[1, u], electronic, gain, dark, full)
 
 
 @njit(parallel=True, cache=True)

@@ -74,6 +74,17 @@ def poisson(means, key, out):
         out[i] = _poisson(float(mean), i, key)
 
 
+def _reading(signal, pattern, gauss, electronic, gain, dark, full):
+    """Return what is written of a relative signal; `gauss` is a normal number."""
+    factor = float(pattern[0]) * (1 + float(pattern[1]) * max(1 - signal, 0))
+    value = dark
+    if factor > 0:
+        value += gain * (signal * factor + electronic * gauss)
+    if full > 0:
+        value = min(max(math.floor(value + 0.5), 0.0), full)
+    return value
+
+
 def detect(m1, m2, pattern, i0, electronic, gain, dark, full, key, out, bad):
     """Draw the counts of one view; see `noise_cpu.detect`."""
     bad[:] = 0
@@ -85,16 +96,15 @@ def detect(m1, m2, pattern, i0, electronic, gain, dark, full, key, out, bad):
             signal = _poisson(photons, index, key) * (second / (mean * i0))
         elif not (mean == 0 and 0 <= second < math.inf):
             bad[v] = 1
-        factor = 1.0
-        if pattern.size:
-            gain0, bend = float(pattern[0, v, u]), float(pattern[1, v, u])
-            factor = gain0 * (1 + bend * max(1 - signal, 0))
-        value = dark
-        if factor > 0:
-            value += gain * (signal * factor + electronic / i0 * normal(_block(key, index, 0)[3]))
-        if full > 0:
-            value = min(max(math.floor(value + 0.5), 0.0), full)
-        out[v, u] = value
+        gauss, own = normal(_block(key, index, 0)[3]), pattern[:, v, u] if pattern.size else (1.0, 0.0)
+        out[v, u] = _reading(signal, own, gauss, electronic / i0, gain, dark, full)
+
+
+def read_out(drawn, pattern, i0, electronic, gain, dark, full, key, out):
+    """Write the counts of a signal that was drawn already; see `noise_cpu.read_out`."""
+    for index, (v, u) in enumerate(np.ndindex(drawn.shape)):
+        gauss, own = normal(_block(key, index, 0)[3]), pattern[:, v, u] if pattern.size else (1.0, 0.0)
+        out[v, u] = _reading(float(drawn[v, u]) / i0, own, gauss, electronic / i0, gain, dark, full)
 
 
 def detect_tigre(m1, top, i0, electronic, key, out):

@@ -20,6 +20,7 @@ from ctsim.benchmarks.engine.host import in_turns
 from ctsim.benchmarks.studies.skipping.study import CORE, Skip
 from ctsim.benchmarks.suites import load, select
 from ctsim.bricks import Bricks, make_bricks
+from ctsim.panel import Blur, Lag
 from ctsim.phantoms.bodies import Validation
 from ctsim.phantoms.scene import Scene, build, stream_id
 from ctsim.plan import Plan, make_plan
@@ -29,6 +30,7 @@ from ctsim.scatter import Scatter
 from ctsim.settings import Truth
 from ctsim.shadow import MOST_TIMES
 from ctsim.simulate import compact, simulate_views
+from ctsim.spot import FocalSpot
 from ctsim.types import Phantom, Scanner
 
 LINES = Truth(noise_free=True)
@@ -328,6 +330,24 @@ def scatter(setup: Bench) -> Iterator[Pair]:
     )
 
 
+def blurs(setup: Bench) -> Iterator[Pair]:
+    """Yield a scan without and with each effect that makes it less sharp or its field less even: all are off."""
+    plain = setup.planned()
+    tube, detector = plain.scanner.tube, plain.scanner.detector
+    blur, lag = Blur(fwhm=0.4, tail=0.1, tail_fwhm=2.0), (Lag(share=0.03, decay=0.5), Lag(share=0.01, decay=0.9))
+    changes: dict[str, dict[str, Any]] = {
+        "a focal spot of 0.4 mm": {"tube": msgspec.structs.replace(tube, focal_spot=FocalSpot(size=(0.4, 0.4)))},
+        "detector blur": {"detector": msgspec.structs.replace(detector, blur=blur)},
+        "lag": {"detector": msgspec.structs.replace(detector, lag=lag)},
+        "1/r² and slant over the panel": {"tube": msgspec.structs.replace(tube, falloff=True)},
+    }
+    for what, change in changes.items():
+        given = setup.planned(**change)
+        points = "" if given.plan.spot is None else f"{len(given.plan.spot.weights)} sub-sources"
+        yield setup.pair(what, plain, given, difference=image_difference, unit="counts", limit=None, stated="a choice",
+                         note=points)  # fmt: skip
+
+
 def twin(setup: Bench) -> Iterator[Pair]:
     """Yield scans with metal-free twins: the twin made in the metal's shadow only, and as a whole scan."""
     for scan in setup.inside_and_outside():
@@ -360,6 +380,6 @@ def truth(setup: Bench) -> Iterator[Pair]:
     yield setup.pair("ground truth that is not asked for", asked, all_of_it, difference=image_difference, unit="counts")
 
 
-NAMED = (materials, bricks, rays, energies, edges, refining, scatter, twin, truth)
+NAMED = (materials, bricks, rays, energies, edges, refining, scatter, blurs, twin, truth)
 Cases = dict[str, Callable[[Bench], Iterator[Pair]]]
 CASES: Cases = {case.__name__: case for case in NAMED}
