@@ -119,7 +119,7 @@ def sub_sources(
     """
     if off_focal is None:
         return _point() if spot is None else _parted(spot, pixels, tolerance)
-    around = FocalSpot(size=(off_focal.fwhm,) * 2)
+    around = FocalSpot(size=(off_focal.fwhm, off_focal.fwhm))
     share, half = off_focal.share, tolerance / 2
     main = _point() if spot is None else _parted(spot, pixels, half / (1 - share))
     wide = _parted(around, pixels, half / share)
