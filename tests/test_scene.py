@@ -148,6 +148,7 @@ def test_the_defaults_of_later_keys_stay() -> None:
     known = {
         "Tube": {"falloff": False, "focal_spot": None, "off_focal": None},
         "Detector": {"blur": None, "lag": ()},
+        "Scatter": {"grid_ratio": None},
         "Blur": {"tail": 0.0, "tail_fwhm": None},
         "FocalSpot": {"shape": "gaussian", "weights": None},
         "Scatter": {"grid_ratio": None},
