@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.detector import response
+from ctsim.dose import Dose, dose_of
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.human import human_bytes, human_time
@@ -76,6 +77,7 @@ class Plan:
     materials: tuple[str, ...]
     rule: EnergyRule
     spectrum: Spectrum
+    dose: Dose
     l0: float
     scatter_fraction: float
     scatter_error: float | None
@@ -140,6 +142,7 @@ class Plan:
             "does": does,
             "skips": "; ".join(f"{reason}: {', '.join(names)}" for reason, names in skipped.items()),
             "error": f"{self.error:.0e} (energies){edges}{spot}{scatter}",
+            "dose": self.dose.text(),
             "takes": f"{human_time(self.seconds)}, {human_bytes(self.disk_bytes)} on disk, "
             f"{human_bytes(self.memory_bytes)} of memory, {self.n_rays / 1e6:.3g} M rays, {self.flops / 1e9:.2g} Gflop",
         }
@@ -181,6 +184,7 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
         materials=present,
         rule=rule,
         spectrum=source,
+        dose=dose_of(scanner.tube, scanner.geometry, scanner.i0),
         l0=found.median_path(phantom.materials, mean_energy),
         scatter_fraction=open_fraction(scanner.scatter, scanner.geometry),
         scatter_error=scatter_error,

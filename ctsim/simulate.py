@@ -351,6 +351,8 @@ def scan_info(plan: Plan, phantom: Phantom, scanner: Scanner) -> dict:
         "dark": noise.dark,
         "gain": noise.gain(scanner.i0),
         "i0": scanner.i0,
+        "view_kerma": plan.dose.view_kerma,
+        "scan_kerma": plan.dose.scan_kerma,
         "e_max": float(plan.spectrum.e_max),
         "l0": plan.l0,
         "mean_detected_kev": float(np.average(plan.spectrum.energies, weights=plan.spectrum.weights * a1)),

@@ -22,6 +22,7 @@ from ctsim.spot import FocalSpot, OffFocal
 
 TABLE_KVP = (20.0, 300.0)
 _TABLE_ANGLE_DEG = (1.0, 40.0)
+_MGY_PER_KEV_PER_G = 1.602176634e-10
 _NEGLIGIBLE = 1e-12  # bins with less than this share of the largest are cut off at the soft end
 
 
@@ -140,10 +141,16 @@ class Spectrum:
 
     def hvl(self, which: str = "Al", order: int = 1) -> float:
         """Return the `order`-th half-value layer (mm) of a material, in air kerma."""
-        mu = attenuation(which, self.energies)
-        kerma = self.weights * self.energies * mass_energy_transfer("air", self.energies)
+        mu, kerma = attenuation(which, self.energies), self._kerma_per_bin()
         start = _thickness_to(kerma, mu, 0.5 ** (order - 1))
         return _thickness_to(kerma, mu, 0.5**order) - start
+
+    def kerma(self, passed: ArrayLike = 1.0) -> float:
+        """Return the air kerma (mGy) of one photon per cm2, of which the share `passed` [n] is left in each bin."""
+        return float(np.sum(self._kerma_per_bin() * passed)) * _MGY_PER_KEV_PER_G
+
+    def _kerma_per_bin(self) -> NDArray[np.float64]:
+        return self.weights * self.energies * mass_energy_transfer("air", self.energies)
 
 
 def _thickness_to(kerma: NDArray[np.float64], mu: NDArray[np.float64], share: float) -> float:

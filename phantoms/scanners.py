@@ -10,6 +10,7 @@ from typing import Annotated, Literal, NamedTuple
 import msgspec
 
 from ctsim.detector import Detector
+from ctsim.dose import i0_of_kerma, i0_of_mas
 from ctsim.errors import InputError
 from ctsim.geometry import Count, Geometry, Pair, Triple
 from ctsim.noise import Noise
@@ -141,13 +142,19 @@ class ScannerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     scatter: Scatter | None = None
     """The scatter model."""
     i0: Annotated[float, msgspec.Meta(ge=1, le=1e12)] | None = None
-    """Photons that reach an open pixel in one view (1e5 by default)."""
+    """Photons that reach an open pixel in one view, behind the filters (1e5 by default)."""
+    scan_mas: Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None = None
+    """Instead of `i0`: mAs of the whole scan, the same share in every view; not for the model "mono"."""
+    scan_kerma: Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None = None
+    """Instead of `i0`: air kerma in mGy at the isocentre, without the object, of the whole scan."""
 
     def __post_init__(self) -> None:
         if self.field_mm is not None and not (math.isfinite(self.field_mm) and self.field_mm > 0):
             raise InputError(f"field_mm must be positive (mm), got {self.field_mm}")
         if self.geometry is not None and (given := [k for k in SHAPING if getattr(self, k) is not None]):
             raise InputError(f"geometry is given in full, so {', '.join(given)} must be left out")
+        if len(given := [k for k in DOSE if getattr(self, k) is not None]) > 1:
+            raise InputError(f"{given[-1]}: expected only one of {', '.join(DOSE)}, got {' and '.join(given)}")
 
     def resolve(self, object_mm: float) -> Scanner:
         """Return the scanner for an object of a cube of `object_mm`."""
@@ -165,9 +172,15 @@ class ScannerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
             machine = MACHINES[self.preset]
             scanner = Scanner(geometry=self.geometry, tube=machine.tube, detector=machine.detector)
         parts = {k: getattr(self, k) for k in ("tube", "detector", "noise", "scatter", "i0")}
-        return msgspec.structs.replace(scanner, **{k: v for k, v in parts.items() if v is not None})
+        scanner = msgspec.structs.replace(scanner, **{k: v for k, v in parts.items() if v is not None})
+        if self.scan_mas is not None:
+            scanner = msgspec.structs.replace(scanner, i0=i0_of_mas(scanner.tube, scanner.geometry, self.scan_mas))
+        if self.scan_kerma is not None:
+            scanner = msgspec.structs.replace(scanner, i0=i0_of_kerma(scanner.tube, scanner.geometry, self.scan_kerma))
+        return scanner
 
 
 SHAPING = (
     "n_views", "n_detector", "n_voxel", "field_mm", "start_deg", "arc_deg", "angles_deg", "off_detector", "off_origin",
 )  # fmt: skip
+DOSE = ("i0", "scan_mas", "scan_kerma")

@@ -22,6 +22,9 @@ from ctsim.settings import Simulation, Truth
 from ctsim.types import Phantom, Scanner
 
 
+LATER = ("scan_mas", "scan_kerma")  # keys of the scanner that are in an id only where given: older ids stay
+
+
 class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A scene: what is scanned, by which scanner, and what is written."""
 
@@ -97,6 +100,9 @@ def _digest(scene: Scene, without: tuple[str, ...]) -> str:
         for name, kind in _kinds().items()
         if name not in without
     }
+    for name in LATER:
+        if kept["scanner"][name] is None:
+            del kept["scanner"][name]
     if "sha256" in kept["phantom"]:  # the file is known by its content, wherever it lies
         del kept["phantom"]["path"]
     return hashlib.sha256(msgspec.json.encode(kept, order="deterministic")).hexdigest()[:12]
