@@ -71,6 +71,7 @@ class Metric:
     scale: float = 1.0
 
 
+KERMA = "kerma"  # a scan's air kerma, not a run's cost, but tables show it there
 _IMAGE = {"psnr3d": Metric("PSNR3D (dB)", 2, "max"), "ssim3d": Metric("SSIM3D", 3, "max")}
 
 COLUMNS: dict[str, dict[str, Metric]] = {
@@ -123,6 +124,7 @@ COLUMNS: dict[str, dict[str, Metric]] = {
         "peak_bytes": Metric("peak (MiB)", 0, "min", 1 / 2**20),
         "view_updates": Metric("view updates", 0),
         "warm_up": Metric("warm-up (s)", 2),
+        KERMA: Metric("air kerma (mGy)", 3),
     },
 }
 """The metrics that tables show of each protocol, in order."""

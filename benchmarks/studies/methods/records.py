@@ -62,7 +62,8 @@ class Result(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How a run ended: scores by protocol, cost, and the details that the method gives of its volume.
 
     `inputs` is what the method needs in addition to the counts; `files["volume"]` its kept volume; `data_code` hashes
-    the code of the simulator that made the scan (empty: unknown).
+    the code of the simulator that made the scan (empty: unknown). `kerma` is the scan's air kerma (mGy) at the
+    isocentre (None: the scan or the record is older).
     """
 
     inputs: str = ""
@@ -70,6 +71,7 @@ class Result(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
     cost: Cost | None = None
     details: dict[str, Any] = msgspec.field(default_factory=dict)
     data_code: str = ""
+    kerma: float | None = None
 
 
 class RunRecord(Record[Result], frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -126,6 +128,11 @@ class RunRecord(Record[Result], frozen=True, kw_only=True, forbid_unknown_fields
     def data_code(self) -> str:
         """The hash of the simulator's code that made the scan."""
         return self.found[0].data_code
+
+    @property
+    def kerma(self) -> float | None:
+        """The scan's air kerma (mGy) at the isocentre; None where it is unknown."""
+        return self.found[0].kerma
 
 
 def case_of(run: Run) -> str:

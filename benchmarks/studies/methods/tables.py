@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Literal
 
 from ctsim.benchmarks.engine.record import OK, uncollected
 from ctsim.benchmarks.engine.table import Cell, Column, Table, escape, harmless, tex_comment
-from ctsim.benchmarks.scores.score import AS_RETURNED, COLUMNS, COMPARED, NMAR, Metric, SeedValue, derived, harm, row_of
+from ctsim.benchmarks.scores.score import AS_RETURNED, COLUMNS, COMPARED, KERMA, NMAR, Metric, SeedValue, derived, harm, row_of
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest, outdated, remarks
 from ctsim.durable import write_synced
 from ctsim.errors import InputError
@@ -62,7 +62,8 @@ def numbers(shown: Sequence[RunRecord]) -> Numbers:
                 if metric in wanted:
                     compared.append(SeedValue(who[0], run.seed, *who[1:], protocol, metric, value, *said))
         for metric in COLUMNS["cost"] if record.cost is not None else ():
-            add((*who, "cost", metric), float(getattr(record.cost, metric)), status)
+            value = record.kerma if metric == KERMA else float(getattr(record.cost, metric))
+            add((*who, "cost", metric), value, status)
         if record.cost is None and not any(score.values for score in record.scores.values()):
             add((*who, "", ""), None, status)
     for row in derived(compared):
@@ -218,7 +219,10 @@ _NUMBER = re.compile(r"\d+\.\d+")
 def caption(records: Sequence[RunRecord], protocol: str) -> str:
     """State protocol, region, reference, alignment and data range of a table."""
     if protocol == "cost":
-        return "Protocol cost: seconds and peak resident memory of a run; compilation and first call are not included."
+        return (
+            "Protocol cost: seconds and peak resident memory of a run; compilation and first call are not included. Air "
+            "kerma is that of the whole scan at the isocentre without the object, the same for every method."
+        )
     if protocol == "against":
         nmar = row_of(NMAR, (r.label for r in records if r.status == OK and r.run.variant == METAL))
         return (
