@@ -40,6 +40,22 @@ def test_mean_and_std_over_seeds():
     assert "21.00 ± 1.41" in text
 
 
+def test_air_kerma_is_with_the_cost_and_a_dash_in_older_records():
+    for given, expected in (
+        ([record(kerma=1.2345), record("net")], ["1.234", "–"]),
+        ([record(), record("net")], ["–", "–"]),
+    ):
+        text = tables.render(given, "md")
+        text = text[text.index("## cost") :]
+        assert cells(text, "| inputs")[-1] == "lung: air kerma (mGy)"
+        assert [cells(text, f"| counts only | {who}")[-1] for who in ("fdk", "net")] == expected
+    seeds = [record(kerma=1.5), record(seed=1, kerma=1.5)]
+    assert "1.500 ± 0.000" in tables.render(seeds, "md")
+    assert "air kerma" in tables.render(seeds, "tex")
+    found = tables.summary(seeds).set_index(["protocol", "metric"])
+    assert found.loc[("cost", "kerma"), "mean"] == 1.5
+
+
 def test_ranks_stay_within_an_input_class():
     given = [record("a", psnr=20.0), record("b", psnr=25.0), record("c", psnr=30.0), record("d", 50, inputs="mask")]
     given[3] = record("d", psnr=50.0, inputs="mask")
@@ -346,7 +362,7 @@ def test_no_cell_of_the_csv_is_a_formula(tmp_path, text):
     tables.write(given, tmp_path)
     with (tmp_path / "table.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * 2 + 2 * 5  # two protocols of two metrics, and two runs' costs
+    assert len(rows) == 2 * 2 + 2 * 6  # two protocols of two metrics, and two runs' costs
     for row in rows:
         assert None not in row  # as many cells as columns
         texts = [row[k] for k in ("scene", "method", "inputs", "status", "volume", "protocol", "metric")]

@@ -61,10 +61,11 @@ def numbers(shown: Sequence[RunRecord]) -> Numbers:
                 add((*who, protocol, metric), value, *said)
                 if metric in wanted:
                     compared.append(SeedValue(who[0], run.seed, *who[1:], protocol, metric, value, *said))
-        for metric in COLUMNS["cost"] if record.cost is not None else ():
-            value = record.kerma if metric == KERMA else float(getattr(record.cost, metric))
+        cost = record.cost
+        for metric in COLUMNS["cost"] if cost is not None else ():
+            value = record.kerma if metric == KERMA else float(getattr(cost, metric))
             add((*who, "cost", metric), value, status)
-        if record.cost is None and not any(score.values for score in record.scores.values()):
+        if cost is None and not any(score.values for score in record.scores.values()):
             add((*who, "", ""), None, status)
     for row in derived(compared):
         key = (row.scene, row.variant, row.method, row.inputs, row.protocol, row.metric)
@@ -152,8 +153,8 @@ def _tables(shown: Sequence[RunRecord], found: Numbers, protocols: Iterable[str]
         if variant == METAL:
             chosen.setdefault(protocol, {})[scene, method, metric] = number
     made = []
-    for protocol in protocols:
-        columns, rows = _grid(chosen.get(protocol, {}), protocol, own)
+    for protocol in (p for p in protocols if p in chosen):
+        columns, rows = _grid(chosen[protocol], protocol, own)
         if len(columns) > len(STUBS):
             text, notes = caption(shown, protocol), _notes(shown, protocol)
             made.append(Table(title=protocol, columns=columns, rows=rows, caption=text, notes=notes, rank_within=0))
