@@ -78,6 +78,11 @@ class StoredScan:
         return self.info.l0
 
     @property
+    def kerma(self) -> float | None:
+        """Return the scan's air kerma (mGy) at the isocentre; None where scan.json of an older scan lacks it."""
+        return self.info.scan_kerma
+
+    @property
     def labels(self) -> NDArray[np.uint8]:
         """Return the label volume, uint8 [z, y, x]."""
         return self.array("labels")

@@ -50,6 +50,7 @@ class Double:
     content_hash: str = "hash"
     code: str = "v1"
     l0: float = 10.0
+    kerma: float | None = 1.25
 
     @property
     def info(self):
@@ -156,7 +157,7 @@ def once(name, results, stored=None, **options):
 def test_a_run_is_scored_timed_kept_and_recorded(tmp_path):
     record = once("good", tmp_path)
     assert record.status == "ok" and record.run.seed == 3 and record.run.params == {"level": 0.018}
-    assert record.data_code == "v1"
+    assert record.data_code == "v1" and record.kerma == 1.25
     assert set(record.scores) == {"tissue", "aligned", "aligned_50kev", "paper", "metal", "projection", "artefact"}
     assert "without scene.toml" in record.scores["projection"].note
     assert record.scores["artefact"].note == NOT_ASKED

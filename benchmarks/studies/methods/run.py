@@ -137,7 +137,7 @@ class Runner:
             cost=outcome.cost,
             details=outcome.details,
             data_code=job.stored.code,
-            kerma=job.stored.info.scan_kerma,
+            kerma=job.stored.kerma,
         )
 
 
