@@ -145,7 +145,7 @@ class Spectrum:
         start = _thickness_to(kerma, mu, 0.5 ** (order - 1))
         return _thickness_to(kerma, mu, 0.5**order) - start
 
-    def kerma(self, passed: ArrayLike = 1.0) -> float:
+    def kerma(self, passed: NDArray[np.float64] | float = 1.0) -> float:
         """Return the air kerma (mGy) of one photon per cm2, of which the share `passed` [n] is left in each bin."""
         return float(np.sum(self._kerma_per_bin() * passed)) * _MGY_PER_KEV_PER_G
 

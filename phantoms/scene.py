@@ -21,7 +21,6 @@ from ctsim.phantoms.suites import NULL, decode, parse_toml, read_toml, scenes_of
 from ctsim.settings import Simulation, Truth
 from ctsim.types import Phantom, Scanner
 
-
 LATER = ("scan_mas", "scan_kerma")  # keys of the scanner that are in an id only where given: older ids stay
 
 

@@ -1,4 +1,4 @@
-"""Photons per pixel from mAs or from an air kerma, and the air kerma of a scan, against published numbers and SpekPy."""
+"""Photons per pixel from mAs or air kerma, and the air kerma of a scan, against published numbers and SpekPy."""
 
 import math
 import re
@@ -122,12 +122,10 @@ def test_a_bow_tie_is_in_the_kerma_and_not_in_the_photons() -> None:
     bowtie = Bowtie(material="Al", center=2.0, edge=9.0, half_angle_deg=10.0)
     with_it, sheet = tube(bowtie=bowtie), tube(thickness=2.5)
     assert i0_of_mas(with_it, geometry(), 1.0) == i0_of_mas(tube(), geometry(), 1.0)
-    one, other = (
-        dose_of(made, geometry(), i0_of_mas(made, geometry(), 1.0)).scan_kerma for made in (with_it, sheet)
-    )
+    one, other = (dose_of(made, geometry(), i0_of_mas(made, geometry(), 1.0)).scan_kerma for made in (with_it, sheet))
     # a sheet attenuates the lines at their own energies, the bow-tie in the bins that share them, a fraction of
-    # 0.25 keV away. Sharing keeps the mean energy, so only the curvature is left: (0.25 keV)²/8 · μ″ · 2 mm, 3e-7 at 59 keV
-    # (μ ~ E⁻³: 12 · 0.07/mm / 59²), and the soft L lines hardly pass
+    # 0.25 keV away. Sharing keeps the mean energy, so only the curvature is left: (0.25 keV)²/8 · μ″ · 2 mm = 4e-6 of
+    # the K lines (μ″ = 12 · 0.075/mm / 59² keV²), which have less than a tenth of the kerma. L lines hardly pass.
     assert one == pytest.approx(other, rel=1e-6)
 
 

@@ -17,7 +17,18 @@ from typing import TYPE_CHECKING, Literal
 
 from ctsim.benchmarks.engine.record import OK, uncollected
 from ctsim.benchmarks.engine.table import Cell, Column, Table, escape, harmless, tex_comment
-from ctsim.benchmarks.scores.score import AS_RETURNED, COLUMNS, COMPARED, KERMA, NMAR, Metric, SeedValue, derived, harm, row_of
+from ctsim.benchmarks.scores.score import (
+    AS_RETURNED,
+    COLUMNS,
+    COMPARED,
+    KERMA,
+    NMAR,
+    Metric,
+    SeedValue,
+    derived,
+    harm,
+    row_of,
+)
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest, outdated, remarks
 from ctsim.durable import write_synced
 from ctsim.errors import InputError
@@ -221,8 +232,8 @@ def caption(records: Sequence[RunRecord], protocol: str) -> str:
     """State protocol, region, reference, alignment and data range of a table."""
     if protocol == "cost":
         return (
-            "Protocol cost: seconds and peak resident memory of a run; compilation and first call are not included. Air "
-            "kerma is that of the whole scan at the isocentre without the object, the same for every method."
+            "Protocol cost: seconds and peak resident memory of a run; compilation and first call are not included. "
+            "Air kerma is that of the whole scan at the isocentre without the object, the same for every method."
         )
     if protocol == "against":
         nmar = row_of(NMAR, (r.label for r in records if r.status == OK and r.run.variant == METAL))
