@@ -149,6 +149,14 @@ def test_keys_set_the_photons_of_a_scene() -> None:
     assert other.i0 == pytest.approx(1e5 * SPEKPY[2][3] / SPEKPY[0][3], rel=1e-2)
 
 
+def test_a_scene_can_empty_the_photons_of_the_defaults() -> None:
+    text = "[defaults.scanner]\ni0 = 2e4\n[[scene]]\n" + RODS
+    assert parse_suite(text)[0].resolve().i0 == 2e4
+    with pytest.raises(InputError, match="got i0 and scan_mas"):
+        parse_suite(text + "scanner = { scan_mas = 1 }")
+    assert parse_suite(text + 'scanner = { scan_mas = 1, i0 = "null" }')[0].resolve().i0 > 1e5
+
+
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
