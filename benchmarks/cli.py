@@ -34,6 +34,9 @@ OTHERS = {
     "inspect": Command("ctsim.benchmarks.studies.inspect.study", "score a volume by other conventions of PSNR, SSIM"),
     "pareto": Command("ctsim.benchmarks.studies.pareto.study", "error against run time, simulator and methods"),
     "skipping": Command("ctsim.benchmarks.studies.skipping.study", "what ctsim leaves out: time saved, error made"),
+    "validate": Command(
+        "ctsim.benchmarks.studies.validate.study", "the physics against tables, closed forms, Monte Carlo"
+    ),
     "stress": Command("ctsim.benchmarks.studies.stress.study", "extreme scenes for the simulator and every method"),
     "peers": Command("ctsim.benchmarks.studies.peers.study", "time and error against RTK and XCIST"),
     "reproduce": Command("ctsim.benchmarks.studies.claims", "check what is claimed of FDK, LIMAR and NMAR"),

@@ -28,6 +28,7 @@ from ctsim.benchmarks.studies.pareto.study import Pareto
 from ctsim.benchmarks.studies.peers.study import Peers
 from ctsim.benchmarks.studies.skipping.study import Skipping
 from ctsim.benchmarks.studies.stress.study import Stress
+from ctsim.benchmarks.studies.validate.study import Validate
 from ctsim.durable import replacing
 from ctsim.errors import InputError
 from ctsim.reports import Flags, page, slices
@@ -42,6 +43,7 @@ STUDIES: tuple[tuple[type[Study[Any, Any]], dict[str, dict[str, Any]]], ...] = (
     (Pareto, {"pareto": {}}),
     (Peers, {"peers": {}, "peers, small grids": {"small": True}}),
     (Skipping, {"skipping": {}, "skipping, small grids": {"size": "small"}}),
+    (Validate, {"validate": {}, "validate, short": {"short": True}}),
     (Stress, {"stress": {}, "stress, small grids": {"short": True}}),
 )
 """Other studies whose records a results folder may hold, with titles and the flags that choose the rows."""

@@ -1,0 +1,30 @@
+"""The cases of `run-benchmark validate` by name; each returns its checks."""
+
+from collections.abc import Callable
+
+from ctsim.benchmarks.engine.record import Task
+from ctsim.benchmarks.studies.validate import closed, paper, published, recovered, scatter, transport
+from ctsim.benchmarks.studies.validate.study import Check, Flags
+
+CASES: dict[str, Callable[[bool], list[Check]]] = {
+    "attenuation": published.attenuation,
+    "absorption": published.absorption,
+    "spectra": published.spectra,
+    "energies": closed.energies,
+    "chords": closed.chords,
+    "primary": transport.primary,
+    "noise": closed.noise,
+    "tg195-1": published.layers,
+    "tg195-2": transport.radiography,
+    "tg195-4": transport.tomography,
+    "lung-Fe": scatter.lung,
+    "teeth-Ti": scatter.teeth,
+    "head": scatter.head,
+    "recovered": recovered.recovered,
+    "paper": paper.paper,
+}
+
+
+def measure(task: Task, given: Flags) -> list[Check]:
+    """Return the checks of a case."""
+    return CASES[task.case](task.part == "short")
