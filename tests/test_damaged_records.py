@@ -21,12 +21,14 @@ from ctsim.benchmarks.studies.peers.finding import Measurement
 from ctsim.benchmarks.studies.skipping import study as skipping
 from ctsim.benchmarks.studies.skipping.study import Skip
 from ctsim.benchmarks.studies.stress import study as stress
+from ctsim.benchmarks.studies.validate import study as validate
 from ctsim.errors import InputError
 from ctsim.folder import read_progress
 from ctsim.scaninfo import read_info
 
 BY = {"host": host(), "commit": "a" * 40, "time": "2026-01-01T00:00:00+00:00"}
 SKIPPED = Skip(seconds={"skipping": (1.0,), "whole": (2.0,)}, difference=0.0, limit=0.1)
+CHECKED = validate.check("q", 1.0, 2.0, tolerance=0.6, seconds={"case": (1.0,)})
 PEER = Measurement(scene="s", contender="c", seconds={"run": (1.0,)})
 KINDS = {
     "records": (methods.Methods(), methods.Flags, record(params={"a": [1, {"b": 2.5}]}, time=BY["time"])),
@@ -47,6 +49,11 @@ KINDS = {
             found=(stress.Judged(found="f", seconds={"row": (1.0,)}),),
             **BY,
         ),
+    ),
+    "validate": (
+        validate.Validate(),
+        validate.Flags,
+        Record(task=Task(study="validate", part="full", case="noise", subject="noise"), found=(CHECKED,), **BY),
     ),
     "peers": (
         peers.Peers(),

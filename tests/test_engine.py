@@ -33,6 +33,8 @@ from ctsim.benchmarks.studies.skipping import simulator
 from ctsim.benchmarks.studies.skipping.simulator import Pair
 from ctsim.benchmarks.studies.skipping.study import Skipping
 from ctsim.benchmarks.studies.stress.study import Judged, Stress, StressRow
+from ctsim.benchmarks.studies.validate import cases as validate_cases
+from ctsim.benchmarks.studies.validate.study import Validate, check
 
 COMMIT = "a" * 40
 TINY = tiny_study.Tiny
@@ -122,6 +124,13 @@ def three_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Stress, "measure", measure)
 
 
+def validated_in_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the study of validation find that one is one, here."""
+    monkeypatch.setattr(Validate, "isolated", False)
+    for case in list(validate_cases.CASES):
+        monkeypatch.setitem(validate_cases.CASES, case, lambda short: [check("one", 1.0, 1.0, tolerance=0.1)])
+
+
 STUDIES = {
     "tiny": Command(tiny_study.Tiny(), "tiny_study", ("good", "better", "best")),
     "skipping": Command(
@@ -134,6 +143,10 @@ STUDIES = {
     ),
     "peers": Command(
         Peers(), "ctsim.benchmarks.studies.peers.study", ("paths", "fdk", "poly"), ("--repeats", "1"), without_peers,
+    ),
+    "validate": Command(
+        Validate(), "ctsim.benchmarks.studies.validate.study", ("attenuation", "spectra", "head"), ("--short",),
+        validated_in_no_time, timed=False,
     ),
     "stress": Command(
         Stress(), "ctsim.benchmarks.studies.stress.study", ("flat", "odd", "empty"), ("--short",), three_rows,

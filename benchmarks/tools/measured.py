@@ -3,9 +3,9 @@
     python -m ctsim.benchmarks.tools.measured PAGE RESULTS docs/measured
     python -m ctsim.benchmarks.tools.measured freshness [docs/measured]
 
-The first writes a page: PAGE is skipping, stability, speed, pareto or ablation. The study's own table in RESULTS, which
-names commit and machine, becomes the page, under a title and the command that measures it. `run-benchmark report
-RESULTS --markdown docs/measured/results.md` writes the page of the results.
+The first writes a page: PAGE is skipping, stability, speed, pareto, validation or ablation. The study's own table in
+RESULTS, which names commit and machine, becomes the page, under a title and the command that measures it.
+`run-benchmark report RESULTS --markdown docs/measured/results.md` writes the page of the results.
 
 The second lists, for every page, how many of its sources have changed between the oldest commit that the page names
 and HEAD, and which of them have another default: a field of a settings type, a constant, a key of a suite. Moved files,
@@ -82,6 +82,10 @@ PAGES: dict[str, Page] = {
     "speed": _of(
         "peers", "Speed and error of ctsim, RTK and XCIST", "peers.md",
         *SIMULATOR, "reconstruct/fdk.py", f"{STUDIES}peers/",
+    ),
+    "validation": _of(
+        "validate", "Validation of the physics", "physics.md",
+        *SIMULATOR, "reconstruct/fdk.py", "reconstruct/splat/", f"{STUDIES}validate/", f"{SUITES}quick.toml",
     ),
     "stability": _of(
         "stress", "Numerical stability", "stability.md",

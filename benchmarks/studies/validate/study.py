@@ -123,7 +123,7 @@ class Flags(study.Options):
 
 
 # seconds of a case on two idle cores (docs/measured/validation.md)
-SECONDS: dict[str, float] = {}
+SECONDS: dict[str, float] = dict.fromkeys(get_args(Case), 20.0)
 
 
 class Validate(study.Study[Record[Check], Flags]):
@@ -153,6 +153,10 @@ class Validate(study.Study[Record[Check], Flags]):
     def expected(self, task: Task, given: Flags) -> float | None:
         """Return the seconds of a case, from `SECONDS`."""
         return None if given.short else SECONDS.get(task.case)
+
+    def took(self, record: Record[Check], given: Flags) -> float | None:
+        """Return the seconds that the case took."""
+        return sum(second for f in record.found for seconds in f.seconds.values() for second in seconds) or None
 
     def tables(self, records: Sequence[Record[Check]], given: Flags) -> list[Table]:
         """Return a table for each group, with a row for each check."""
