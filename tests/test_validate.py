@@ -41,8 +41,8 @@ def test_the_short_form_holds(tmp_path, here):
     assert tuple(checks) == CASES
     judged = [c for of in checks.values() for c in of if c.tolerance is not None]
     assert len(judged) > 70 and all(c.source and c.why for c in judged)
-    assert {c.held for c in judged} == {"yes", "not held, known"}
-    known = [c.quantity for c in judged if c.held == "not held, known"]
+    assert {c.verdict for c in judged} == {"yes", "not held, known"}
+    known = [c.quantity for c in judged if c.verdict == "not held, known"]
     assert len(known) == 4 and all("of counts" in quantity for quantity in known)
     text = (tmp_path / "validate.md").read_text(encoding="utf-8")
     assert all(f"| {case} |" in text for case in CASES) and all(f"## {group}" in text for group in validate.GROUPS)
@@ -125,30 +125,30 @@ def test_a_fault_is_seen(tmp_path, here, monkeypatch, case):
         monkeypatch.setattr(recovered, "of_counts", lambda scene: [])
     monkeypatch.setattr(module, name, fault(getattr(module, name)))
     assert validate.main([str(tmp_path), "--short", "--case", case]) == 1
-    assert "NO" in [c.held for c in found(tmp_path)[case]]
+    assert "NO" in [c.verdict for c in found(tmp_path)[case]]
 
 
 @pytest.mark.slow
 def test_more_noise_in_the_papers_image_is_seen(tmp_path, here, monkeypatch):
     monkeypatch.setattr(paper, "detect", wider_noise(paper.detect))
     assert validate.main([str(tmp_path), "--short", "--case", "paper"]) == 1
-    assert "NO" in [c.held for c in found(tmp_path)["paper"] if "noise alone" in c.quantity]
+    assert "NO" in [c.verdict for c in found(tmp_path)["paper"] if "noise alone" in c.quantity]
 
 
 # --- what a check says -----------------------------------------------------------------------------------
 
 
 def test_a_check_judges_itself():
-    assert check("q", 1.05, 1.0, tolerance=0.06).held == "yes"
-    assert check("q", 0.95, 1.0, tolerance=0.06).held == "yes"
+    assert check("q", 1.05, 1.0, tolerance=0.06).verdict == "yes"
+    assert check("q", 0.95, 1.0, tolerance=0.06).verdict == "yes"
     far = check("q", 1.07, 1.0, tolerance=0.06)
-    assert far.held == "NO" and not far.ok
+    assert far.verdict == "NO" and not far.ok
     known = check("q", 1.07, 1.0, tolerance=0.06, known=True)
-    assert known.held == "not held, known" and known.ok
-    assert check("q", 10.5, 10.0, tolerance=0.6, relative=False).held == "yes"
-    assert check("q", 10.5, 10.0, tolerance=0.4, relative=False).held == "NO"
+    assert known.verdict == "not held, known" and known.ok
+    assert check("q", 10.5, 10.0, tolerance=0.6, relative=False).verdict == "yes"
+    assert check("q", 10.5, 10.0, tolerance=0.4, relative=False).verdict == "NO"
     stated = check("q", 5.0, 1.0)
-    assert stated.held == "–" and stated.ok
+    assert stated.verdict == "–" and stated.ok
     for bad in (math.nan, math.inf):
         assert not check("q", bad, 1.0, tolerance=0.1).ok and not check("q", bad, 1.0).ok
 
@@ -166,12 +166,12 @@ def test_a_figure_shows_every_check_with_a_tolerance_and_all_curves():
     curves = Curves(title="$t", across="x", up="y", x=(0.0, 1.0), lines={"a": (0.0, 1.0), "b": (1.0, 2.0)})
     checks = [
         check("near", 1.01, 1.0, tolerance=0.1, curves=(curves,)),
-        check("far", 9.0, 1.0, tolerance=0.1),
+        check("far", 9.0, 1.0, tolerance=0.1, curves=(msgspec.structs.replace(curves, lines={"c": (5.0, 6.0)}),)),
         check("stated", 9.0, 1.0),
     ]
     dots, lines = figure.figure(checks, "group").axes
     assert [label.get_text() for label in dots.get_yticklabels()] == ["near", "far"]
-    assert [line.get_label() for line in lines.get_lines()] == ["a", "b"]
+    assert [line.get_label() for line in lines.get_lines()] == ["a", "b", "c"]
     assert figure.figure([], "nothing").axes
 
 

@@ -3,11 +3,12 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import msgspec
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ctsim.benchmarks.engine.table import pictured
-from ctsim.benchmarks.studies.validate.study import Check
+from ctsim.benchmarks.studies.validate.study import Check, Curves
 from ctsim.durable import replacing
 
 DPI = 110
@@ -24,7 +25,7 @@ def save_figure(checks: Sequence[Check], group: str, path: Path) -> None:
 def figure(checks: Sequence[Check], group: str) -> Figure:
     """Return the figure: a dot for each check on the left, a panel for each set of curves on the right."""
     judged = [c for c in checks if c.tolerance and c.difference is not None]
-    curves = [one for c in checks for one in c.curves]
+    curves = _merged([one for c in checks for one in c.curves])
     height = max(2.5, 0.9 + 0.22 * len(judged))
     picture = Figure(figsize=(8 + 4 * len(curves), height), layout="constrained")
     panels = picture.subplots(1, 1 + len(curves), squeeze=False, width_ratios=[1.6] + [1] * len(curves))[0]
@@ -38,6 +39,16 @@ def figure(checks: Sequence[Check], group: str) -> Figure:
         panel.set_ylabel(pictured(one.up))
         panel.legend(fontsize="x-small")
     return picture
+
+
+def _merged(curves: Sequence[Curves]) -> list[Curves]:
+    """Return the curves with those of one title and one axis in one panel."""
+    panels: dict[tuple[object, ...], Curves] = {}
+    for one in curves:
+        key = one.title, one.across, one.up, one.x
+        before = panels[key].lines if key in panels else {}
+        panels[key] = msgspec.structs.replace(one, lines=before | one.lines)
+    return list(panels.values())
 
 
 def _dots(panel: Axes, judged: Sequence[Check]) -> None:

@@ -51,11 +51,11 @@ def _scanned(scene: Scene) -> tuple[Scan, torch.Tensor]:
     phantom, scanner = build(scene), scene.resolve()
     plan = make_plan(phantom, scanner, scene.simulation, Truth(twin=False, mono_kev=(KEV,)), stream_id(scene))
     images = [images for _, images in simulate_views(plan, phantom, scanner)]
-    told = scan_info(plan, phantom, scanner)
+    info = scan_info(plan, phantom, scanner)
     counts, mono = (torch.from_numpy(np.stack([i[name] for i in images])) for name in ("counts", f"mono_{KEV:g}kev"))
-    flat = torch.from_numpy(told["flat"])
+    flat = torch.from_numpy(info["flat"])
     scan = Scan(
-        geometry=scanner.geometry, counts=counts, flat=flat, dark=told["dark"], i0=told["i0"], e_max=told["e_max"]
+        geometry=scanner.geometry, counts=counts, flat=flat, dark=info["dark"], i0=info["i0"], e_max=info["e_max"]
     )
     return scan, mono
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import msgspec
@@ -87,10 +88,12 @@ class Check(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return self.ours / self.reference - 1 if self.relative else self.ours - self.reference
 
     @property
-    def held(self) -> str:
-        """Whether the tolerance is held, in a word."""
+    def verdict(self) -> str:
+        """Whether the difference is within the tolerance, in a word."""
+        if self.ours is None:
+            return "NO"
         if self.tolerance is None:
-            return "–" if self.status == OK else "NO"
+            return "–"
         within = self.difference is not None and abs(self.difference) <= self.tolerance
         return "yes" if within else "not held, known" if self.known else "NO"
 
@@ -104,7 +107,7 @@ def check(quantity: str, ours: float, reference: float, *, tolerance: float | No
         tolerance=None if tolerance is None else float(tolerance),
         **more,
     )
-    return msgspec.structs.replace(found, ok=found.ours is not None and found.held != "NO")
+    return msgspec.structs.replace(found, ok=found.verdict != "NO")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +117,7 @@ class Flags(study.Options):
     Exit code 1 where a difference exceeds its tolerance. Minutes on two cores.
     """
 
-    results: tyro.conf.Positional[study.Path]
+    results: tyro.conf.Positional[Path]
     """Folder for records, table and figures; created if missing."""
     case: Annotated[tyro.conf.UseAppendAction[tuple[Case, ...]], tyro.conf.arg(metavar="CASE")] = ()
     """Only this case, such as spectra or tg195-2; may be given several times (default: all)."""
@@ -194,7 +197,7 @@ COLUMNS: dict[str, Callable[[str, Check], str]] = {
     "reference": lambda _, f: _number(f.reference),
     "difference": lambda _, f: _amount(f.difference, f.relative, signed=True),
     "tolerance": lambda _, f: _amount(f.tolerance, f.relative) + (f" ({f.why})" if f.why else ""),
-    "held": lambda _, f: f.held,
+    "held": lambda _, f: f.verdict,
     "source": lambda _, f: f.source or "–",
 }
 
