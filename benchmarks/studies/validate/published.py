@@ -3,6 +3,7 @@
 import functools
 import math
 from importlib import resources
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -133,7 +134,13 @@ def _worst(what: str, ours: NDArray[np.float64], values: tuple[float, ...], tole
         title="", across="keV", up="difference (%)", x=nist.energies, lines={what: tuple((100 * off).tolist())}
     )
     quantity = f"{what}, {nist.energies[k]:g} keV"
-    more = {"unit": "cm²/g", "tolerance": tolerance, "why": why, "source": nist.source, "curves": (curve,)}
+    more: dict[str, Any] = {
+        "unit": "cm²/g",
+        "tolerance": tolerance,
+        "why": why,
+        "source": nist.source,
+        "curves": (curve,),
+    }
     return check(quantity, ours[k], values[k], **more)
 
 
@@ -177,7 +184,7 @@ def layers(short: bool) -> list[Check]:
             tolerance = digits + mu * _half_unit(layer.mm[0]) + 2 * DIGITS * mu * thickness
             what = f"transmission, {layer.kev:g} keV, {thickness:g} mm Al"
             why = "digits of kerma and thickness, and of μ"
-            more = {"tolerance": tolerance, "why": why, "source": f"{numbers().tg195.source}, case 1"}
+            more: dict[str, Any] = {"tolerance": tolerance, "why": why, "source": f"{numbers().tg195.source}, case 1"}
             found.append(check(what, math.exp(-mu * thickness), kerma / layer.kerma[0], **more))
     return found
 
