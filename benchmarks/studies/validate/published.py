@@ -117,7 +117,7 @@ def absorption(short: bool) -> list[Check]:
     """Compare the energy transferred with NIST's energy absorbed."""
     nist = numbers().nist
     # the tables' standard uncertainty is 1.6 % up to 100 kV (Andreo et al., Phys. Med. Biol. 57, 2117, 2012);
-    # bremsstrahlung, which only μ_en leaves out, is up to 0.2 % (Al, 150 keV)
+    # bremsstrahlung, which only μ_en leaves out, is below 0.2 % for light elements at 150 keV
     why = "digits as for μ/ρ, and bremsstrahlung, which μ_en leaves out"
     return [
         _worst(f"μ_tr/ρ, {name}", materials.mass_energy_transfer(name, nist.energies), values, 3e-3, why)
