@@ -54,7 +54,9 @@ def radiography(short: bool) -> list[Check]:
     for number, (x, y, depth) in enumerate(CUBES, 2):
         k, j, i = 310 + depth // 5, (y + 180) // 5, (x + 180) // 5
         regions[k : k + 6, j : j + 6, i : i + 6] = number
-    phantom = Phantom(labels=labels, materials=("air", DRY_AIR, soft), d_voxel=(5.0,) * 3, off_origin=(900.0, 0.0, 0.0))
+    phantom = Phantom(
+        labels=labels, materials=("air", DRY_AIR, soft), d_voxel=(5.0, 5.0, 5.0), off_origin=(900.0, 0.0, 0.0)
+    )
     histories = 200_000 if short else 4_000_000
     pose = [0.0, 0, 1e-3, 0, 0, 1800, 390, 0, 0, 0, 390, 0]
     found, error = _absorbed(phantom, pose, regions, histories)
@@ -84,7 +86,7 @@ def tomography(short: bool) -> list[Check]:
     phantom = Phantom(
         labels=labels,
         materials=("air", DRY_AIR, pmma),
-        d_voxel=(10.0,) * 3,
+        d_voxel=(10.0, 10.0, 10.0),
         off_origin=(0.0, 0.0, 220.0),
         solids=(solid,),
     )
@@ -150,7 +152,7 @@ def _rods() -> Phantom:
     ]  # fmt: skip
     labels = np.zeros((40, 40, 40), np.uint8)
     labels[6:34, 8:33, 5:30] = 1
-    return Phantom(labels=labels, materials=("air", "water", "Fe", "Ti"), d_voxel=(1.5,) * 3, solids=tuple(rods))
+    return Phantom(labels=labels, materials=("air", "water", "Fe", "Ti"), d_voxel=(1.5, 1.5, 1.5), solids=tuple(rods))
 
 
 def _expected(
