@@ -22,13 +22,14 @@ from ctsim.benchmarks.studies.skipping import study as skipping
 from ctsim.benchmarks.studies.skipping.study import Skip
 from ctsim.benchmarks.studies.stress import study as stress
 from ctsim.benchmarks.studies.validate import study as validate
+from ctsim.benchmarks.studies.validate.finding import check
 from ctsim.errors import InputError
 from ctsim.folder import read_progress
 from ctsim.scaninfo import read_info
 
 BY = {"host": host(), "commit": "a" * 40, "time": "2026-01-01T00:00:00+00:00"}
 SKIPPED = Skip(seconds={"skipping": (1.0,), "whole": (2.0,)}, difference=0.0, limit=0.1)
-CHECKED = validate.check("q", 1.0, 2.0, tolerance=0.6, seconds={"case": (1.0,)})
+CHECKED = check("q", 1.0, 2.0, tolerance=0.6, seconds={"case": (1.0,)})
 PEER = Measurement(scene="s", contender="c", seconds={"run": (1.0,)})
 KINDS = {
     "records": (methods.Methods(), methods.Flags, record(params={"a": [1, {"b": 2.5}]}, time=BY["time"])),

@@ -34,7 +34,8 @@ from ctsim.benchmarks.studies.skipping.simulator import Pair
 from ctsim.benchmarks.studies.skipping.study import Skipping
 from ctsim.benchmarks.studies.stress.study import Judged, Stress, StressRow
 from ctsim.benchmarks.studies.validate import cases as validate_cases
-from ctsim.benchmarks.studies.validate.study import Validate, check
+from ctsim.benchmarks.studies.validate.finding import check
+from ctsim.benchmarks.studies.validate.study import Validate
 
 COMMIT = "a" * 40
 TINY = tiny_study.Tiny

@@ -10,7 +10,7 @@ import pytest
 from ctsim.benchmarks.engine.record import latest
 from ctsim.benchmarks.studies.validate import cases, closed, figure, paper, published, recovered, scatter, transport
 from ctsim.benchmarks.studies.validate import study as validate
-from ctsim.benchmarks.studies.validate.study import Check, Curves, check
+from ctsim.benchmarks.studies.validate.finding import Check, Curves, check
 from ctsim.quadrature import gauss_rule
 
 CASES = get_args(validate.Case)

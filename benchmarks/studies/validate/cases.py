@@ -7,7 +7,8 @@ import msgspec
 
 from ctsim.benchmarks.engine.record import Task
 from ctsim.benchmarks.studies.validate import closed, paper, published, recovered, scatter, transport
-from ctsim.benchmarks.studies.validate.study import Check, Flags
+from ctsim.benchmarks.studies.validate.finding import Check
+from ctsim.benchmarks.studies.validate.study import Flags
 
 CASES: dict[str, Callable[[bool], list[Check]]] = {
     "attenuation": published.attenuation,

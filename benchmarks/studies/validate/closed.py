@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ctsim import rng
 from ctsim.benchmarks import oracles
-from ctsim.benchmarks.studies.validate.study import Check, check
+from ctsim.benchmarks.studies.validate.finding import Check, check
 from ctsim.detector import Detector, response
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ctsim.benchmarks.engine.table import pictured
-from ctsim.benchmarks.studies.validate.study import Check, Curves
+from ctsim.benchmarks.studies.validate.finding import Check, Curves
 from ctsim.durable import replacing
 
 DPI = 110

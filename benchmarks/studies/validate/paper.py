@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim import rng
+from ctsim.benchmarks.studies.validate.finding import Check, Curves, check
 from ctsim.benchmarks.studies.validate.published import numbers
 from ctsim.benchmarks.studies.validate.scatter import source_of
-from ctsim.benchmarks.studies.validate.study import Check, Curves, check
 from ctsim.montecarlo.series import scatter_series
 from ctsim.noise import Noise, detect
 from ctsim.phantoms.scene import build, parse_suite

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim import materials
-from ctsim.benchmarks.studies.validate.study import Check, Curves, check
+from ctsim.benchmarks.studies.validate.finding import Check, Curves, check
 from ctsim.spectrum import Filter, Tube, spectrum
 
 DIGITS = 5e-4  # half a unit of the last of four digits, at most

@@ -5,8 +5,8 @@ import torch
 from numpy.typing import NDArray
 
 from ctsim.benchmarks.methods import find
+from ctsim.benchmarks.studies.validate.finding import Check, check
 from ctsim.benchmarks.studies.validate.published import DIGITS, numbers
-from ctsim.benchmarks.studies.validate.study import Check, check
 from ctsim.materials import material
 from ctsim.phantoms.scene import Scene, build, parse_suite, stream_id
 from ctsim.plan import make_plan

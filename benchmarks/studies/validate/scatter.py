@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.benchmarks.studies.validate.study import Check, Curves, check
+from ctsim.benchmarks.studies.validate.finding import Check, Curves, check
 from ctsim.benchmarks.suites import load, select
 from ctsim.montecarlo.series import ScatterSeries, scatter_series
 from ctsim.montecarlo.transport import Source, scatter_image

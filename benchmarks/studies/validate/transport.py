@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.benchmarks.studies.validate.finding import Check, check
 from ctsim.benchmarks.studies.validate.published import numbers
-from ctsim.benchmarks.studies.validate.study import Check, check
 from ctsim.detector import Detector, response
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
