@@ -98,7 +98,7 @@ class Published(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 @functools.cache
 def numbers() -> Published:
     """Return the published numbers."""
-    text = resources.files(__package__).joinpath("published.toml").read_bytes()
+    text = resources.files("ctsim.benchmarks.studies.validate").joinpath("published.toml").read_bytes()
     return msgspec.toml.decode(text, type=Published)
 
 
