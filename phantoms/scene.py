@@ -21,9 +21,6 @@ from ctsim.phantoms.suites import NULL, decode, parse_toml, read_toml, scenes_of
 from ctsim.settings import Simulation, Truth
 from ctsim.types import Phantom, Scanner
 
-LATER = {"scanner": ("scan_mas", "scan_kerma"), "scatter": ("grid_ratio",)}
-"""Keys of the scanner and of its scatter that are in an id only where they are given, so that older ids stay."""
-
 
 class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A scene: what is scanned, by which scanner, and what is written."""
@@ -100,11 +97,6 @@ def _digest(scene: Scene, without: tuple[str, ...]) -> str:
         for name, kind in _kinds().items()
         if name not in without
     }
-    scanner = kept["scanner"]
-    for table, values in (("scanner", scanner), ("scatter", scanner["scatter"] or {})):
-        for name in LATER[table]:
-            if values.get(name, 0) is None:
-                del values[name]
     if "sha256" in kept["phantom"]:  # the file is known by its content, wherever it lies
         del kept["phantom"]["path"]
     return hashlib.sha256(msgspec.json.encode(kept, order="deterministic")).hexdigest()[:12]

@@ -148,12 +148,12 @@ def test_a_later_key_is_part_of_an_id_only_where_it_is_used() -> None:
 def test_the_defaults_of_later_keys_stay() -> None:
     """An id without such a key means its default: a new key is added here, and no entry ever changes."""
     known = {
+        "ScannerSettings": {"scan_kerma": None, "scan_mas": None},
         "Tube": {"falloff": False, "focal_spot": None, "off_focal": None},
         "Detector": {"blur": None, "lag": ()},
         "Scatter": {"grid_ratio": None},
         "Blur": {"tail": 0.0, "tail_fwhm": None},
         "FocalSpot": {"shape": "gaussian", "weights": None},
-        "Scatter": {"grid_ratio": None},
         "Simulation": {"scatter_error": 0.02, "spot_error": 0.02},
     }
     found: dict[str, dict] = {}
