@@ -487,7 +487,8 @@ def test_random_scenes_simulate_or_are_refused_by_the_name_of_a_key(plain: dict,
         }
         for name, image in images.items():
             assert np.isfinite(image).all(), name
-            assert name.split("/")[-1] in signed or image.min(initial=0) >= 0, name
+            # P of air: the weights of an open pixel add up to 1 within a few roundings of float32
+            assert name.split("/")[-1] in signed or image.min(initial=0) >= -(2.0**-22), name
 
 
 @pytest.mark.parametrize(("path", "value"), ABSURDITIES)
