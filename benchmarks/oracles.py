@@ -79,7 +79,7 @@ def voxelised(phantom: Phantom, geometry: Geometry, keep: tuple[Solid, ...]) -> 
 
 def scanner_of(side: int, views: int) -> Scanner:
     """Return the desktop scanner of the bundled suites on side² pixels, with side³ voxels in the scene's cube."""
-    return preset("skyscan1273", views, (side, side), (side, side, side), SIZE)
+    return preset("ideal", views, (side, side), (side, side, side), SIZE)
 
 
 def poly_scene(n: int) -> Phantom:

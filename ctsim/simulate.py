@@ -140,7 +140,7 @@ class _Simulator:
     def _signals(self, k: int) -> tuple[Moments, Moments | None, NDArray[np.int64] | None]:
         """Noise-free moments of the scan and of its twin, and the columns of each row in which these can differ."""
         spot = self.plan.spot
-        if spot is None:
+        if spot is None or not spot.offsets.any():
             return self._seen(self.geometry, k)
         geometry = spot.geometry(self.geometry, k)
         twins = 2 if "metal_free/counts" in self.names else 1

@@ -91,11 +91,13 @@ class Scanner(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         tube, panel = self.tube, self.detector
         if (tube.heel or tube.bowtie or tube.falloff) and self.noise.model == "tigre":
             raise InputError(
-                "noise.model = 'tigre' knows P only: expected neither tube.heel, tube.bowtie nor tube.falloff with it"
+                "noise.model = 'tigre' knows P only: expected neither tube.heel, tube.bowtie nor tube.falloff with it "
+                '(of the presets only "ideal" has no falloff)'
             )
         if (panel.blur or panel.lag) and self.noise.model == "tigre":
             raise InputError(
-                "noise.model = 'tigre' has independent pixels: expected neither detector.blur nor detector.lag with it"
+                "noise.model = 'tigre' has independent pixels: expected neither detector.blur nor detector.lag with it "
+                '(of the presets only "ideal" has none)'
             )
         if (tube.heel or tube.bowtie or tube.falloff) and self.geometry.poses is not None:
             raise InputError(

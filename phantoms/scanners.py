@@ -2,6 +2,9 @@
 
 Distances are those of machines one can buy, rounded; the panel is binned so that the asked number of
 pixels covers the object's shadow, as an operator would choose the binning and the collimation.
+
+What spoils their images has typical sizes, not those measured on one machine (docs/explanation/physics.md names the
+sources). The preset "ideal" has the distances of the micro-CT and none of it.
 """
 
 import math
@@ -14,16 +17,18 @@ from ctsim.dose import i0_of_kerma, i0_of_mas
 from ctsim.errors import InputError
 from ctsim.geometry import Count, Geometry, Pair, Triple
 from ctsim.noise import Noise
+from ctsim.panel import Blur, Lag
 from ctsim.phantoms.bodies import REACH
 from ctsim.scatter import Scatter
 from ctsim.spectrum import Filter, Tube
+from ctsim.spot import FocalSpot, OffFocal
 from ctsim.types import Scanner
 
 MARGIN = 1.06  # air around the object's shadow, so that filters and flat-field checks see open pixels
 
 
 class Machine(NamedTuple):
-    """Fixed properties of a machine: distances and panel (v, u) in mm, arc, tube and detector."""
+    """Fixed properties of a machine: distances and panel (v, u) in mm, arc, tube, detector and scatter."""
 
     dso: float
     dsd: float
@@ -31,26 +36,47 @@ class Machine(NamedTuple):
     arc_deg: float
     tube: Tube
     detector: Detector
+    scatter: Scatter = Scatter(level=3)
 
+
+_SOFT = (Filter(material="Al", thickness=0.5),)
+_HARD = (Filter(material="Al", thickness=2.5),)
+_CSI_BLUR = Blur(fwhm=0.37, tail=0.08, tail_fwhm=20.0)
+_SILICON_LAG = (Lag(share=0.023, decay=0.3), Lag(share=0.02, decay=0.8))
 
 MACHINES: dict[str, Machine] = {
-    # desktop micro-CT: half-metre source to panel, 3072 x 1944 pixels of 75 um, GOS screen
+    # the next one's distances, tube and screen; nothing scatters, blurs or darkens the corners
+    "ideal": Machine(
+        250.0, 500.0, (146.0, 230.0), 360.0,
+        Tube(kvp=90.0, filters=_SOFT),
+        Detector(kind="gos", thickness=0.1),
+        Scatter(),
+    ),
+    # desktop micro-CT: half-metre source to panel, 3072 x 1944 pixels of 75 um, GOS screen; it stops for each view, so
+    # there is no lag
     "skyscan1273": Machine(
         250.0, 500.0, (146.0, 230.0), 360.0,
-        Tube(kvp=90.0, filters=(Filter(material="Al", thickness=0.5),)),
-        Detector(kind="gos", thickness=0.1),
+        Tube(kvp=90.0, filters=_SOFT, focal_spot=FocalSpot(size=(0.01, 0.01)), falloff=True),
+        Detector(kind="gos", thickness=0.1, blur=Blur(fwhm=0.3)),
     ),
-    # seated dental cone-beam unit, full turn
+    # seated dental cone-beam unit, full turn, fixed anode
     "dental": Machine(
         430.0, 690.0, (250.0, 300.0), 360.0,
-        Tube(kvp=90.0, filters=(Filter(material="Al", thickness=2.5),)),
-        Detector(kind="csi", thickness=0.5),
+        Tube(kvp=90.0, filters=_HARD, focal_spot=FocalSpot(size=(0.5, 0.5)), falloff=True),
+        Detector(kind="csi", thickness=0.5, blur=_CSI_BLUR, lag=_SILICON_LAG),
     ),
-    # interventional C-arm: 200 degree short scan, 30 x 40 cm panel
+    # interventional C-arm: 200 degree short scan, 30 x 40 cm panel, rotating anode, grid
     "c-arm": Machine(
         785.0, 1200.0, (300.0, 400.0), 200.0,
-        Tube(kvp=100.0, filters=(Filter(material="Al", thickness=2.5), Filter(material="Cu", thickness=0.1))),
-        Detector(kind="csi", thickness=0.6),
+        Tube(
+            kvp=100.0,
+            filters=(*_HARD, Filter(material="Cu", thickness=0.1)),
+            focal_spot=FocalSpot(size=(0.6, 0.6)),
+            off_focal=OffFocal(share=0.03, fwhm=20.0),
+            falloff=True,
+        ),
+        Detector(kind="csi", thickness=0.6, blur=_CSI_BLUR, lag=_SILICON_LAG),
+        Scatter(level=3, grid_ratio=10.0),
     ),
 }  # fmt: skip
 
@@ -102,7 +128,11 @@ def preset(
         n_views=n_views,
         arc_deg=machine.arc_deg,
     )
-    return Scanner(geometry=geometry, tube=machine.tube, detector=machine.detector)
+    return _scanner(machine, geometry)
+
+
+def _scanner(machine: Machine, geometry: Geometry) -> Scanner:
+    return Scanner(geometry=geometry, tube=machine.tube, detector=machine.detector, scatter=machine.scatter)
 
 
 class ScannerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -111,8 +141,8 @@ class ScannerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     With a `geometry`, the keys that shape one (`n_views` … `off_origin`) must be left out.
     """
 
-    preset: Literal["skyscan1273", "dental", "c-arm"] = "skyscan1273"
-    """The machine: distances, panel, arc, tube and detector."""
+    preset: Literal["ideal", "skyscan1273", "dental", "c-arm"] = "ideal"
+    """The machine: distances, panel, arc, tube, detector and scatter; "ideal" has no scatter and no blur."""
     n_views: Count | None = None
     """Number of projections (60 by default)."""
     n_detector: tuple[Count, Count] | None = None
@@ -134,9 +164,9 @@ class ScannerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     geometry: Geometry | None = None
     """All of the geometry, instead of a preset."""
     tube: Tube | None = None
-    """Replaces the preset's tube."""
+    """Replaces the preset's tube, except a focal spot, off-focal radiation and falloff that it does not state."""
     detector: Detector | None = None
-    """Replaces the preset's detector."""
+    """Replaces the preset's detector, except blur and lag that it does not state."""
     noise: Noise | None = None
     """How photons become counts."""
     scatter: Scatter | None = None
@@ -170,14 +200,33 @@ class ScannerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
             scanner = msgspec.structs.replace(scanner, geometry=msgspec.structs.replace(scanner.geometry, **changes))
         else:
             machine = MACHINES[self.preset]
-            scanner = Scanner(geometry=self.geometry, tube=machine.tube, detector=machine.detector)
-        parts = {k: getattr(self, k) for k in ("tube", "detector", "noise", "scatter", "i0")}
+            scanner = _scanner(machine, self.geometry)
+        parts = {k: getattr(self, k) for k in ("noise", "scatter", "i0")}
+        parts |= {"tube": self._tube(scanner.tube), "detector": self._detector(scanner.detector)}
         scanner = msgspec.structs.replace(scanner, **{k: v for k, v in parts.items() if v is not None})
         if self.scan_mas is not None:
             scanner = msgspec.structs.replace(scanner, i0=i0_of_mas(scanner.tube, scanner.geometry, self.scan_mas))
         if self.scan_kerma is not None:
             scanner = msgspec.structs.replace(scanner, i0=i0_of_kerma(scanner.tube, scanner.geometry, self.scan_kerma))
         return scanner
+
+    def _tube(self, machine: Tube) -> Tube:
+        """Return the tube; a change of voltage or filter leaves the machine's focal spot as it is."""
+        tube = self.tube
+        if tube is None:
+            return machine
+        return msgspec.structs.replace(
+            tube,
+            focal_spot=tube.focal_spot or machine.focal_spot,
+            off_focal=tube.off_focal or machine.off_focal,
+            falloff=tube.falloff or machine.falloff,
+        )
+
+    def _detector(self, machine: Detector) -> Detector:
+        detector = self.detector
+        if detector is None or detector.kind == "counting":  # which has no light
+            return detector or machine
+        return msgspec.structs.replace(detector, blur=detector.blur or machine.blur, lag=detector.lag or machine.lag)
 
 
 SHAPING = (

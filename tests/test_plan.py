@@ -16,7 +16,7 @@ from ctsim.types import Scanner
 
 def scene(n: int, metal: str = "Fe"):
     phantom = build_recipe(Validation(n_voxel=(n, n, n), size=60.0, metal=metal), 1)
-    return phantom, Scanner(geometry=preset("skyscan1273", 6, (n, n), (n, n, n), 60.0).geometry)
+    return phantom, Scanner(geometry=preset("ideal", 6, (n, n), (n, n, n), 60.0).geometry)
 
 
 def plan(parts, **simulation):

@@ -9,7 +9,7 @@ from ctsim.phantoms.scanners import preset
 def test_every_contender_has_a_row_and_is_near_the_exact_form(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(splat_kernels, "ROUNDS", 1)
     monkeypatch.setattr(splat_kernels, "N_SPLATS", 300)
-    monkeypatch.setattr(splat_kernels, "CORE", preset("skyscan1273", 48, (32, 32), (16, 16, 16), 60.0).geometry)
+    monkeypatch.setattr(splat_kernels, "CORE", preset("ideal", 48, (32, 32), (16, 16, 16), 60.0).geometry)
     assert splat_kernels.main([str(tmp_path / "new")]) == 0
     text = (tmp_path / "new" / "splat_kernels.md").read_text(encoding="utf-8")
     assert capsys.readouterr().out == text

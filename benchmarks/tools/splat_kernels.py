@@ -26,8 +26,8 @@ from ctsim.reconstruct.splat.model import Splats
 from ctsim.reconstruct.splat.project import Projector
 
 ROUNDS = 7
-CORE = preset("skyscan1273", 240, (224, 224), (128, 128, 128), 60.0).geometry
-VIEW = preset("skyscan1273", 1, (512, 512), (256, 256, 256), 60.0).geometry
+CORE = preset("ideal", 240, (224, 224), (128, 128, 128), 60.0).geometry
+VIEW = preset("ideal", 1, (512, 512), (256, 256, 256), 60.0).geometry
 N_SPLATS, SIGMA = 50_000, 2.5  # of a published view; σ in pixels
 NUMBERS = ("ms", "ns a splat and view", "relative RMS off the exact form")
 
