@@ -12,7 +12,8 @@ from ctsim.detector import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.montecarlo import series
-from ctsim.montecarlo.kernels.transport_cpu import CHUNKS, SINGLE, SQUARED
+from ctsim.montecarlo.kernels.scoring_cpu import SINGLE, SQUARED
+from ctsim.montecarlo.kernels.transport_cpu import CHUNKS
 from ctsim.montecarlo.series import scatter_series
 from ctsim.montecarlo.transport import PLANES, Source, scatter_image
 from ctsim.montecarlo.world import World

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.montecarlo.kernels.transport_cpu import CHUNKS, MULTIPLE, SINGLE, SQUARED
+from ctsim.montecarlo.kernels.scoring_cpu import MULTIPLE, SINGLE, SQUARED
+from ctsim.montecarlo.kernels.transport_cpu import CHUNKS
 from ctsim.montecarlo.transport import Source, add_histories
 from ctsim.montecarlo.world import World
 from ctsim.rng import stream_key

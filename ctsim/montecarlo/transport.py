@@ -9,7 +9,8 @@ from ctsim.detector import Detector, response
 from ctsim.errors import InputError
 from ctsim.materials import E_MIN, attenuation
 from ctsim.montecarlo.kernels import transport_cpu
-from ctsim.montecarlo.kernels.transport_cpu import CHUNKS, MULTIPLE, SINGLE, SQUARED
+from ctsim.montecarlo.kernels.scoring_cpu import MULTIPLE, SINGLE, SQUARED
+from ctsim.montecarlo.kernels.transport_cpu import CHUNKS
 from ctsim.montecarlo.tables import STEP
 from ctsim.montecarlo.world import World
 from ctsim.rng import stream_key

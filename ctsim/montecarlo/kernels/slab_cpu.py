@@ -10,11 +10,10 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from ctsim.montecarlo.kernels.transport_cpu import _start, _uniform
+from ctsim.montecarlo.kernels.laws_cpu import HC, REST, start, uniform
 
 CHUNKS = 64
 CUT = 1.0  # keV; a photon below it stays where it is
-REST, HC = 510.998950, 12.3984198  # keV, keV·Å
 DEPTH = 32  # photons that wait at once: an event sets at most two free, with less energy each
 HIT, DEPOSIT, SQUARE, FRONT, BACK, PASSED = range(6)
 
@@ -47,14 +46,14 @@ def _compton(bound, most, energy, rng):
     least = 1.0 / (1.0 + 2.0 * alpha)
     one, two = -math.log(least), 0.5 * (1.0 - least * least)
     while True:
-        if _uniform(rng) * (one + two) < one:
-            ratio = math.exp(-one * _uniform(rng))
+        if uniform(rng) * (one + two) < one:
+            ratio = math.exp(-one * uniform(rng))
         else:
-            ratio = math.sqrt(least * least + (1.0 - least * least) * _uniform(rng))
+            ratio = math.sqrt(least * least + (1.0 - least * least) * uniform(rng))
         away = min((1.0 - ratio) / (ratio * alpha), 2.0)  # 1 − cos θ
         accept = 1.0 - ratio * away * (2.0 - away) / (1.0 + ratio * ratio)
         accept *= _bound(bound, most, energy / HC * math.sqrt(0.5 * away))
-        if _uniform(rng) < accept:
+        if uniform(rng) < accept:
             return ratio, 1.0 - away
 
 
@@ -67,12 +66,12 @@ def _rayleigh(form, most, energy, rng):
     low, high = (most * (i / n) ** 2) ** 2, (most * ((i + 1) / n) ** 2) ** 2
     total = form[i] + (last * last - low) / (high - low) * (form[i + 1] - form[i])
     while True:
-        wanted = _uniform(rng) * total
+        wanted = uniform(rng) * total
         i = min(max(np.searchsorted(form, wanted, side="right") - 1, 0), n - 1)
         low, high = (most * (i / n) ** 2) ** 2, (most * ((i + 1) / n) ** 2) ** 2
         squared = low + (wanted - form[i]) / (form[i + 1] - form[i]) * (high - low)
         cos = 1.0 - 2.0 * min(squared / (last * last), 1.0)
-        if 2.0 * _uniform(rng) < 1.0 + cos * cos:
+        if 2.0 * uniform(rng) < 1.0 + cos * cos:
             return cos
 
 
@@ -80,7 +79,7 @@ def _rayleigh(form, most, energy, rng):
 def _turn(along, cos, rng):
     """Return the cosine to the slab's normal after a turn by cos θ about a random azimuth."""
     sine = math.sqrt(max(0.0, (1.0 - along * along) * (1.0 - cos * cos)))
-    return min(max(along * cos + sine * math.cos(2.0 * math.pi * _uniform(rng)), -1.0), 1.0)
+    return min(max(along * cos + sine * math.cos(2.0 * math.pi * uniform(rng)), -1.0), 1.0)
 
 
 @njit(cache=True, error_model="numpy")
@@ -88,14 +87,14 @@ def _relax(first, lines, shell, depth, stack, waiting, rng):
     """Fill a vacancy, and those that this makes, and let the photons wait; return their number and energy."""
     emitted = 0.0
     while shell >= 0:
-        wanted = _uniform(rng)
+        wanted = uniform(rng)
         step = first[shell]
         while step < first[shell + 1] and lines[step, 0] <= wanted:
             step += 1
         if step == first[shell + 1]:  # an Auger electron
             break
         if lines[step, 1] >= CUT:
-            stack[waiting, 0], stack[waiting, 1] = depth, 2.0 * _uniform(rng) - 1.0
+            stack[waiting, 0], stack[waiting, 1] = depth, 2.0 * uniform(rng) - 1.0
             stack[waiting, 2] = lines[step, 1]
             emitted += lines[step, 1]
             waiting += 1
@@ -109,7 +108,7 @@ def _collide(tables, at, stack, waiting, rng):
     _, rates, first, lines, bound, form, most = tables
     depth, along, energy, i, part = at
     shells, last = first.size - 1, rates.shape[1] - 1
-    wanted = _uniform(rng) * _between(rates, i, part, last)
+    wanted = uniform(rng) * _between(rates, i, part, last)
     kind = 0
     while kind < last and _between(rates, i, part, kind) <= wanted:
         kind += 1
@@ -135,7 +134,7 @@ def _history(tables, thickness, energy, share, stack, rng, out):
     energies, rates = tables[0], tables[1]
     last = rates.shape[1] - 1
     i, part = _place(energies, energy)
-    depth = -math.log(1.0 - share * _uniform(rng)) / _between(rates, i, part, last)
+    depth = -math.log(1.0 - share * uniform(rng)) / _between(rates, i, part, last)
     if depth >= thickness:
         out[PASSED] += 1.0
         return
@@ -144,7 +143,7 @@ def _history(tables, thickness, energy, share, stack, rng, out):
         waiting -= 1
         depth, along, e = stack[waiting, 0], stack[waiting, 1], stack[waiting, 2]
         i, part = _place(energies, e)
-        depth -= along * math.log(_uniform(rng)) / _between(rates, i, part, last)
+        depth -= along * math.log(uniform(rng)) / _between(rates, i, part, last)
         if depth < 0.0:
             out[FRONT] += e
         elif depth >= thickness:
@@ -164,7 +163,7 @@ def _chunks(tables, photon, key, count, scratch, out):
     stack, rng = scratch
     for chunk in prange(CHUNKS):
         for history in range(chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS):
-            _start(rng[chunk], key, np.uint64(history))
+            start(rng[chunk], key, np.uint64(history))
             _history(tables, thickness, energy, share, stack[chunk], rng[chunk], out[chunk])
 
 
