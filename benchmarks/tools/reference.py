@@ -204,10 +204,27 @@ def _presets() -> str:
     for name, m in MACHINES.items():
         size, detector = f"{m.panel[0]:g} × {m.panel[1]:g}", f"{m.detector.thickness:g} mm {m.detector.kind.upper()}"
         distances = f"{m.dso:g}", f"{m.dsd:g}", size, f"{m.arc_deg:g}"
-        rows.append((f"`{name}`", *distances, f"{m.tube.kvp:g}", _filters(m.tube, " + "), detector))
+        rows.append((f"`{name}`", *distances, f"{m.tube.kvp:g}", _filters(m.tube, " + "), detector, *_spoilers(m)))
     head = ("preset", "dso (mm)", "dsd (mm)", "panel v × u (mm)", "arc (deg)", "kVp", "filter", "detector")
+    head += ("spot (mm)", "off-focal", "falloff", "blur FWHM (mm)", "lag", "scatter")
     said = f"A preset bins its panel so that `n_detector` pixels cover the object. {described(ScannerSettings)}"
     return f"## Scanner presets\n\n{said.partition('. ')[0]}.\n\n{table(head, rows)}"
+
+
+def _spoilers(machine: Any) -> tuple[str, ...]:
+    """Return the cells of what spoils a machine's images."""
+    tube, panel, scatter = machine.tube, machine.detector, machine.scatter
+    off, blur = tube.off_focal, panel.blur
+    grid = f", grid {scatter.grid_ratio:g}" if scatter.grid_ratio else ""
+    tail = f" + {blur.tail:.0%} in {blur.tail_fwhm:g}" if blur and blur.tail else ""
+    return (
+        f"{tube.focal_spot.size[0]:g}" if tube.focal_spot else "none",
+        f"{off.share:.0%} in {off.fwhm:g} mm" if off else "none",
+        "yes" if tube.falloff else "no",
+        f"{blur.fwhm:g}{tail}" if blur else "none",
+        f"{sum(part.share for part in panel.lag):.1%}" if panel.lag else "none",
+        f"level {scatter.level}{grid}",
+    )
 
 
 def _filters(tube: Any, between: str) -> str:
