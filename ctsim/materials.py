@@ -22,6 +22,9 @@ from ctsim.errors import InputError
 E_MIN, E_MAX = 1.0, 800.0  # the energies (keV) where the tables of every element hold
 _ELECTRON_REST = 510.998950  # keV
 _HC = 12.3984198  # keV·Å
+SHARES_END = 300.0
+"""Highest energy (keV) at which xraylib tabulates the shares of the shells in photoelectric absorption."""
+_SHARES_END_LIGHT, _LAST_LIGHT = 100.0, 8  # the same up to oxygen
 
 # Compositions in percent by weight, densities in g/cm3. Tissues: ICRU Report 44 (1989), lung inflated.
 # Compounds and elements: NIST, physics.nist.gov/PhysRefData/XrayMassCoef. Enamel and dentin: 95 and 70 %
@@ -259,16 +262,17 @@ def k_shell(z: int) -> KShell | None:
 
 @functools.lru_cache(maxsize=256)
 def _k_share(z: int, energies: bytes) -> NDArray[np.float64]:
-    """Share of element `z`'s photoelectric absorption that leaves a K vacancy; zero below the edge."""
+    """Share of element `z`'s photoelectric absorption that leaves a K vacancy; zero below the edge.
+
+    Above the energies that xraylib tabulates, the share keeps its last value: it changes by 1e-4 per 10 keV there.
+    """
     xrl, shell = _xraylib(), k_shell(z)
     e = np.frombuffer(energies)
     out = np.zeros(e.size)
     if shell is not None:
         for i in np.flatnonzero(e > shell.edge):
-            try:
-                out[i] = xrl.CS_Photo_Partial(z, xrl.K_SHELL, float(e[i])) / xrl.CS_Photo_Total(z, float(e[i]))
-            except ValueError:  # far above the edge of a light element: the jump at the edge
-                out[i] = 1 - 1 / xrl.JumpFactor(z, xrl.K_SHELL)
+            at = min(float(e[i]), SHARES_END if z > _LAST_LIGHT else _SHARES_END_LIGHT)
+            out[i] = xrl.CS_Photo_Partial(z, xrl.K_SHELL, at) / xrl.CS_Photo_Total(z, at)
     return out
 
 

@@ -9,10 +9,12 @@ from ctsim.materials import (
     Material,
     attenuation,
     k_edges,
+    k_vacancies,
     mass_attenuation,
     mass_energy_transfer,
     material,
     names,
+    photoelectric,
 )
 
 ENERGIES = np.array([10.0, 20, 30, 50, 60, 80, 100, 150])
@@ -45,6 +47,14 @@ def test_attenuation_is_nists(name: str) -> None:
 def test_energy_transfer_is_nists(name: str) -> None:
     # 0.3 %: 0.1 % of the cross sections, the rest bremsstrahlung, binding and L fluorescence; measured: 0.18 % (Al).
     assert mass_energy_transfer(name, ENERGIES) == pytest.approx(NIST_EN[name], rel=3e-3)
+
+
+@pytest.mark.parametrize(("symbol", "z", "end"), [("W", 74, 300.0), ("Gd", 64, 300.0), ("Al", 13, 300.0), ("O", 8, 100.0)])
+def test_the_share_of_the_k_shell_has_no_jump_where_its_table_ends(symbol: str, z: int, end: float) -> None:
+    e = end + np.array([-0.01, 0.0, 1e-3, 0.1, 0.5, 1.0, 100.0])
+    share = k_vacancies(f"{symbol}@1", e)[z] / photoelectric(f"{symbol}@1", e)
+    # 1e-4: below the end the share changes by 2e-4 per keV at most (O), hence 2e-6 in the first step
+    assert share == pytest.approx(np.full(e.size, share[1]), rel=1e-4)
 
 
 def test_every_promised_name_is_known() -> None:

@@ -19,18 +19,20 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from ctsim.detector import closed_form
-from ctsim.materials import E_MIN, absorption_edges, compton, k_edges
+from ctsim.materials import E_MIN, SHARES_END, absorption_edges, compton, k_edges
 from ctsim.montecarlo.slab import E_MAX, Slab, absorbed
 
 THICKNESS = np.geomspace(0.01, 10.0, 19)  # mm
 HISTORIES = 2_000_000
 STEP = 1.1  # between energies, at most
 CLOSE = 1e-3  # relative distance of the nodes from a break; xraylib's edges are blurred by as much
-SHARES_END = 300.0  # keV; the closed form changes its source for the share of the K shell here
 
 
 def breaks(name: str) -> list[float]:
-    """Return where the quotient may jump: edges, and where the closed form's Compton photon crosses a K edge."""
+    """Return where the quotient may jump: edges, and where the closed form's Compton photon crosses a K edge.
+
+    At SHARES_END it has a kink, since the share of the K shell is constant above.
+    """
     crossed = []
     for edge in k_edges([name], 10.0, E_MAX):
 

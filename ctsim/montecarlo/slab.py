@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ctsim.errors import InputError
 from ctsim.materials import (
     E_MIN,
+    SHARES_END,
     absorption_edges,
     attenuation,
     compton,
@@ -32,7 +33,6 @@ E_MAX = 500.0
 """The greatest energy (keV), as in `ctsim.spectrum`."""
 _STEP = 0.005  # between logarithms of energies: linear between the nodes, E^-3 is wrong by 4e-5
 _EDGE = 1e-3  # xraylib's shells begin up to this share of an edge's energy away from it
-_PARTIAL = 300.0  # keV; the shares of the shells are tabulated up to here and change by 1e-4 per 10 keV
 _N_Q = 2048
 _Q_MIN = 0.005  # 1/Å; xraylib has four digits of the scattering function there, none below 0.001: it goes as q²
 _SHELLS = ("K", "L1", "L2", "L3")
@@ -151,7 +151,7 @@ def _photo(name: str, z: int, shell: str, energies: NDArray[np.float64]) -> NDAr
     out = np.zeros(energies.size)
     for i in np.flatnonzero(energies > edge):
         e = float(energies[i])
-        at = min(e, _PARTIAL)
+        at = min(e, SHARES_END)
         out[i] = xrl.CS_Photo(z, e) * xrl.CS_Photo_Partial(z, number, at) / xrl.CS_Photo_Total(z, at)
     which = material(name)
     return 0.1 * which.density * which.mass_fractions[z] * out
