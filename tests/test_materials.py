@@ -49,7 +49,9 @@ def test_energy_transfer_is_nists(name: str) -> None:
     assert mass_energy_transfer(name, ENERGIES) == pytest.approx(NIST_EN[name], rel=3e-3)
 
 
-@pytest.mark.parametrize(("symbol", "z", "end"), [("W", 74, 300.0), ("Gd", 64, 300.0), ("Al", 13, 300.0), ("O", 8, 100.0)])
+@pytest.mark.parametrize(
+    ("symbol", "z", "end"), [("W", 74, 300.0), ("Gd", 64, 300.0), ("Al", 13, 300.0), ("O", 8, 100.0)]
+)
 def test_the_share_of_the_k_shell_has_no_jump_where_its_table_ends(symbol: str, z: int, end: float) -> None:
     e = end + np.array([-0.01, 0.0, 1e-3, 0.1, 0.5, 1.0, 100.0])
     share = k_vacancies(f"{symbol}@1", e)[z] / photoelectric(f"{symbol}@1", e)
