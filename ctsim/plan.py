@@ -18,6 +18,7 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.human import human_bytes, human_time
 from ctsim.materials import attenuation
+from ctsim.montecarlo.series import expected_histories
 from ctsim.notes import metal_notes
 from ctsim.panel import response as lag_response
 from ctsim.project import Response, Tracer
@@ -33,8 +34,7 @@ from ctsim.types import Phantom, Scanner
 THICKNESS_MARGIN = 1.1  # a coarse survey can miss the thickest ray
 # a draw and core, a byte, a voxel of a scan's labels and references (4.4 s for 2 scans of 256³)
 NOISE_SECONDS, WRITE_SECONDS, VOLUME_SECONDS = 40e-9, 1e-9, 130e-9
-# core-seconds of scatter by Monte Carlo, a scan to 2 % (5 to 12 for the scenes of `quick` and a head of water)
-SCATTER_SECONDS, SCATTER_ERROR = 10.0, 0.02
+HISTORY_SECONDS = 1.3e-6  # a core and photon of scatter by Monte Carlo: 0.8 (broccoli) to 1.8 (a head of water)
 PLANNING_BYTES = 45_000_000  # of the search for energies
 
 
@@ -172,7 +172,7 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
     draws = n_rays * (2 if twin else 1) * (scanner.noise.model != "none")
     disk = _disk_bytes(outputs, scanner.geometry, twin)
     scatter_error = simulation.scatter_error if scanner.scatter.level == 3 else None
-    scatter = 0.0 if scatter_error is None else SCATTER_SECONDS * (SCATTER_ERROR / scatter_error) ** 2
+    photons = 0 if scatter_error is None else expected_histories(scanner.geometry, scatter_error)
     passes = 2 if scanner.noise.model == "tigre" else 1  # the first finds the scan's largest P
     passes *= 1 if spot is None else len(spot.weights)
     return Plan(
@@ -194,7 +194,7 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
         seconds=passes * scanner.geometry.n_views * tried.seconds
         + draws * NOISE_SECONDS / numba.get_num_threads()
         + n_voxels * (2 if twin else 1) * VOLUME_SECONDS
-        + scatter * (2 if twin else 1) / numba.get_num_threads()
+        + photons * (2 if twin else 1) * HISTORY_SECONDS / numba.get_num_threads()
         + disk * WRITE_SECONDS,
         flops=float(n_rays) * len(rule.energies) * (2 * len(present) + 16),
         disk_bytes=disk,
@@ -306,6 +306,9 @@ def _stages(
         Stage(name=f"scatter {level}" if level else "scatter", runs=bool(level), reason="" if level else "off")
     )
     stages.append(Stage(name="heel", runs=scanner.tube.heel, reason="" if scanner.tube.heel else "off"))
+    grid = scanner.scatter.grid_ratio
+    reason = f"ratio {grid:g}" if grid else "off"
+    stages.append(Stage(name="anti-scatter grid", runs=grid is not None, reason=reason))
     bowtie = scanner.tube.bowtie is not None
     stages.append(Stage(name="bow-tie", runs=bowtie, reason="" if bowtie else "off"))
     noise = scanner.noise.model

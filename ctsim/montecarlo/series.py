@@ -26,6 +26,8 @@ STEP_DEG = 15.0
 LEAST_VIEWS = 8
 FIRST, MOST = 20_000, 20_480_000
 """Histories of a view: at first, and at most; they are doubled until the error is reached."""
+USUAL, USUAL_ERROR = 300_000, 0.02
+"""Histories of a view that reach an error: 160,000 for a head of water to 640,000 for broccoli of 60 mm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +100,11 @@ def scatter_series(
             series /= np.multiply.outer(*(np.sinc(np.arange(n) / (2 * n)) for n in cells))
             return ScatterSeries(series, geometry.shape, geometry.is_full_turn, error, done * len(poses))
         wanted = 2 * done
+
+
+def expected_histories(geometry: Geometry, tolerance: float) -> int:
+    """Estimate how many photons `scatter_series` follows in all views, before any is followed."""
+    return len(_few(geometry)) * max(FIRST, round(USUAL * (USUAL_ERROR / tolerance) ** 2))
 
 
 def _cells(geometry: Geometry) -> tuple[int, int]:
