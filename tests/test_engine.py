@@ -29,7 +29,7 @@ from ctsim.benchmarks.studies.pareto.study import Pareto
 from ctsim.benchmarks.studies.peers import cases as peer_cases
 from ctsim.benchmarks.studies.peers import finding as peer_finding
 from ctsim.benchmarks.studies.peers.study import Peers
-from ctsim.benchmarks.studies.skipping import simulator
+from ctsim.benchmarks.studies.skipping import effects, simulator
 from ctsim.benchmarks.studies.skipping.simulator import Pair
 from ctsim.benchmarks.studies.skipping.study import Skipping
 from ctsim.benchmarks.studies.stress.study import Judged, Stress, StressRow
@@ -81,8 +81,9 @@ def in_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the study of skipping compare nothing with nothing, here."""
     nothing = Pair(scene="s", what="w", skipping=float, whole=float, difference=lambda a, b: a - b, unit="P")
     monkeypatch.setattr(Skipping, "isolated", False)
-    for case in list(simulator.CASES):
-        monkeypatch.setitem(simulator.CASES, case, lambda setup: iter([nothing]))
+    for cases in (simulator.CASES, effects.CASES):
+        for case in list(cases):
+            monkeypatch.setitem(cases, case, lambda setup: iter([nothing]))
 
 
 def timed_in_no_time(monkeypatch: pytest.MonkeyPatch) -> None:

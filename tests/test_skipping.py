@@ -9,15 +9,21 @@ import pytest
 from ctsim.benchmarks import cli, make_dataset
 from ctsim.benchmarks.engine import host
 from ctsim.benchmarks.engine.record import Record, latest
+from ctsim.benchmarks.studies.skipping import effects as skipping_effects
 from ctsim.benchmarks.studies.skipping import methods as skipping_methods
 from ctsim.benchmarks.studies.skipping import simulator as skipping_cases
 from ctsim.benchmarks.studies.skipping import study as skipping
-from ctsim.benchmarks.studies.skipping.simulator import Bench, Pair, largest
+from ctsim.benchmarks.studies.skipping.simulator import Bench, Pair, image_difference, largest
 from ctsim.benchmarks.studies.skipping.study import Skip
 from ctsim.bricks import MIXED
+from ctsim.detector import Detector
+from ctsim.panel import Blur, Lag
 from ctsim.phantoms.scene import build
 from ctsim.project import Tracer, transmit
 from ctsim.scatter import Scatter, open_fraction
+from ctsim.simulate import _Simulator
+from ctsim.spectrum import Tube
+from ctsim.spot import FocalSpot, OffFocal
 
 pytestmark = pytest.mark.slow
 
@@ -49,7 +55,8 @@ def small(tmp_path):
 
 
 def pairs(case, tmp_path):
-    return list((skipping_cases.CASES | skipping_methods.CASES)[case](small(tmp_path)))
+    every = skipping_cases.CASES | skipping_effects.CASES | skipping_methods.CASES
+    return list(every[case](small(tmp_path)))
 
 
 def fake(difference, limit=1.0):
@@ -68,15 +75,16 @@ def test_every_case_is_measured_and_stays_within_what_is_stated(run):
     code, cases, folder = run
     assert code == 0
     assert tuple(cases) == CASES == tuple(skipping.SECONDS)
-    assert skipping_cases.CASES.keys() | skipping_methods.CASES.keys() == set(CASES)
+    every = skipping_cases.CASES | skipping_effects.CASES | skipping_methods.CASES
+    assert every.keys() == set(CASES)
     rows = [row for rows in cases.values() for row in rows]
     assert all(len(row.seconds["skipping"]) == len(row.seconds["whole"]) == 1 for row in rows)
     for exact in ("twin", "truth", "metal-free", "scan", "record"):
         assert all(row.difference == row.limit == 0 for row in cases[exact]), exact
     # fewer energies and no scatter are seen in the result, or the two ways were the same
-    (energies,), (scatter,) = cases["energies"], cases["scatter"]
+    (energies,) = cases["energies"]
     assert 0 < energies.difference <= energies.limit < 2e-4
-    for choice in (scatter, *cases["refining"]):
+    for choice in (*cases["scatter"], *cases["refining"]):
         assert choice.difference > 1e-3 and choice.limit is None
     text = (folder / "skipping.md").read_text(encoding="utf-8")
     assert all(f"| {case} |" in text for case in CASES) and "Grids this small" in text and "NO" not in text
@@ -199,7 +207,7 @@ def test_sub_rays_are_cast_everywhere_in_the_way_without_the_skip(tmp_path):
 
 
 def test_the_stated_difference_of_scatter_is_its_fraction(tmp_path):
-    (pair,) = pairs("scatter", tmp_path)
+    pair, *_ = pairs("scatter", tmp_path)
     setup = small(tmp_path)
     fraction = open_fraction(Scatter(level=1), setup.planned().scanner.geometry)
     assert fraction > 0.005
@@ -207,6 +215,49 @@ def test_the_stated_difference_of_scatter_is_its_fraction(tmp_path):
         lifted = np.exp(-lit["noise_free"].astype(np.float64)) - np.exp(-without["noise_free"].astype(np.float64))
         # signals up to 1 and their logarithms, each rounded to float32 a few times
         np.testing.assert_allclose(lifted, fraction, rtol=0, atol=1e-6)
+
+
+EFFECTS = {
+    "scatter 1": {"scatter": Scatter(level=1)},
+    "scatter 3": {"scatter": Scatter(level=3)},
+    "anti-scatter grid": {"scatter": Scatter(level=3, grid_ratio=10.0)},
+    "focal spot": {"tube": Tube(focal_spot=FocalSpot(size=(3.0, 3.0)))},
+    "off-focal": {"tube": Tube(off_focal=OffFocal(share=0.1, fwhm=9.0))},
+    "falloff": {"tube": Tube(falloff=True)},
+    "detector blur": {"detector": Detector(blur=Blur(fwhm=3.0))},
+    "lag": {"detector": Detector(lag=(Lag(share=0.1, decay=0.1),))},
+}
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_an_effect_that_is_off_runs_none_of_its_code(tmp_path, monkeypatch, name):
+    """The plan says so, and the counts are the same where that code cannot run."""
+    setup = small(tmp_path)
+    scan, given = setup.planned(), setup.planned(**EFFECTS[name])
+    assert given.plan.runs(name) and not scan.plan.runs(name)
+    off = [stage.reason for stage in scan.plan.stages if stage.name == name.removesuffix(" 1").removesuffix(" 3")]
+    assert off == ["off"]
+    before = [images for _, images in scan.views()]
+
+    def never(*arguments, **more):
+        raise RuntimeError("this was to be left out")
+
+    monkeypatch.setattr("ctsim.simulate.scatter_series", never)
+    monkeypatch.setattr("ctsim.simulate.Panel", never)
+    monkeypatch.setattr("ctsim.spot.SubSources.geometry", never)
+    if name in ("focal spot", "off-focal", "detector blur", "lag", "scatter 3", "anti-scatter grid"):
+        with pytest.raises(RuntimeError, match="left out"):
+            next(given.views())
+    simulator = _Simulator(scan.plan, scan.phantom, scan.scanner)
+    assert simulator.beam.gain is None and scan.plan.scatter_fraction == 0 and simulator.frames == 0
+    assert image_difference(before, [images for _, images in scan.views()]) == 0
+
+
+def test_a_sharp_panel_and_a_point_change_no_line_integral(tmp_path):
+    neutral, *_ = pairs("blurs", tmp_path)
+    without, through = neutral.skipping(), neutral.whole()
+    assert image_difference(without, through, skipping_cases.P_IMAGES) == 0
+    assert neutral.difference(without, through) <= neutral.limit
 
 
 @pytest.mark.parametrize("name", ["limar", "nmar"])

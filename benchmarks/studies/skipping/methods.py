@@ -1,4 +1,4 @@
-"""What `run-benchmark skipping` measures of reconstruction methods and commands; `simulator` has the other cases."""
+"""What `run-benchmark skipping` measures of methods and commands; `simulator` and `effects` have the other cases."""
 
 import functools
 import tempfile
@@ -22,7 +22,7 @@ from ctsim.benchmarks.methods import find
 from ctsim.benchmarks.studies.methods import study as cli_run
 from ctsim.benchmarks.studies.methods.attempt import scan_for
 from ctsim.benchmarks.studies.methods.volumes import read_volume
-from ctsim.benchmarks.studies.skipping import simulator
+from ctsim.benchmarks.studies.skipping import effects, simulator
 from ctsim.benchmarks.studies.skipping.simulator import Bench, Cases, Pair, largest
 from ctsim.benchmarks.studies.skipping.study import Flags, Skip
 from ctsim.phantoms.scene import scene_to_toml
@@ -175,7 +175,7 @@ CASES: Cases = {"metal-free": metal_free, "rows": rows, "scan": stored_scan, "re
 def measure(task: Task, given: Flags) -> list[Skip]:
     """Measure all pairs of a case."""
     setup = Bench(size=task.part, repeats=given.repeats, folder=_folder())
-    return [pair.measure(given.repeats) for pair in (simulator.CASES | CASES)[task.case](setup)]
+    return [pair.measure(given.repeats) for pair in (simulator.CASES | effects.CASES | CASES)[task.case](setup)]
 
 
 @functools.cache

@@ -1,7 +1,8 @@
 """What `run-benchmark skipping` measures of the simulator: each skip as a pair of runs, with it and without it.
 
 Both run in turns on the same views, after one run each that is not counted. What a scan prepares once (bricks, columns,
-solids) is prepared before the clock starts. The pairs of methods and commands are in `methods`.
+solids) is prepared before the clock starts. The pairs of effects that a scanner
+may leave out are in `effects`, those of methods and commands in `methods`.
 """
 
 import itertools
@@ -20,17 +21,14 @@ from ctsim.benchmarks.engine.host import in_turns
 from ctsim.benchmarks.studies.skipping.study import CORE, Skip
 from ctsim.benchmarks.suites import load, select
 from ctsim.bricks import Bricks, make_bricks
-from ctsim.panel import Blur, Lag
 from ctsim.phantoms.bodies import Validation
 from ctsim.phantoms.scene import Scene, build, stream_id
 from ctsim.plan import Plan, make_plan
 from ctsim.project import EDGE_THRESHOLD, Response, Tracer, transmit
 from ctsim.quadrature import full_rule
-from ctsim.scatter import Scatter
 from ctsim.settings import Truth
 from ctsim.shadow import MOST_TIMES
 from ctsim.simulate import compact, simulate_views
-from ctsim.spot import FocalSpot
 from ctsim.types import Phantom, Scanner
 
 LINES = Truth(noise_free=True)
@@ -153,6 +151,10 @@ class Bench:
         views = scan.views()
         next(views)
         return lambda: [images for _, images in itertools.islice(views, self.views)]
+
+    def first_views(self, scan: PlannedScan) -> Callable[[], Images]:
+        """Return a function that begins a scan at each call and makes its first few views."""
+        return lambda: [images for _, images in itertools.islice(scan.views(), self.views)]
 
     def pair(self, what: str, skipping: PlannedScan, whole: PlannedScan, **more: Any) -> Pair:
         """Return a pair of scans, compared by P without noise unless `more` says otherwise."""
@@ -321,33 +323,6 @@ def refining(setup: Bench) -> Iterator[Pair]:
         yield setup.pair(what, without, scan, limit=None, stated="a choice", note=note)
 
 
-def scatter(setup: Bench) -> Iterator[Pair]:
-    """Yield a scan without scatter and with the constant scatter of level 1, which level 0 leaves out."""
-    plain, scattering = setup.planned(), setup.planned(scatter=Scatter(level=1))
-    note = f"level 1 adds S/I0 = {scattering.plan.scatter_fraction:.2g} to every pixel"
-    yield setup.pair(
-        "scatter at level 0, which leaves it out", plain, scattering, limit=None, stated="a choice", note=note
-    )
-
-
-def blurs(setup: Bench) -> Iterator[Pair]:
-    """Yield a scan without and with each effect that makes it less sharp or its field less even: all are off."""
-    plain = setup.planned()
-    tube, detector = plain.scanner.tube, plain.scanner.detector
-    blur, lag = Blur(fwhm=0.4, tail=0.1, tail_fwhm=2.0), (Lag(share=0.03, decay=0.5), Lag(share=0.01, decay=0.9))
-    changes: dict[str, dict[str, Any]] = {
-        "a focal spot of 0.4 mm": {"tube": msgspec.structs.replace(tube, focal_spot=FocalSpot(size=(0.4, 0.4)))},
-        "detector blur": {"detector": msgspec.structs.replace(detector, blur=blur)},
-        "lag": {"detector": msgspec.structs.replace(detector, lag=lag)},
-        "1/r² and slant over the panel": {"tube": msgspec.structs.replace(tube, falloff=True)},
-    }
-    for what, change in changes.items():
-        given = setup.planned(**change)
-        points = "" if given.plan.spot is None else f"{len(given.plan.spot.weights)} sub-sources"
-        yield setup.pair(what, plain, given, difference=image_difference, unit="counts", limit=None, stated="a choice",
-                         note=points)  # fmt: skip
-
-
 def twin(setup: Bench) -> Iterator[Pair]:
     """Yield scans with metal-free twins: the twin made in the metal's shadow only, and as a whole scan."""
     for scan in setup.inside_and_outside():
@@ -380,6 +355,6 @@ def truth(setup: Bench) -> Iterator[Pair]:
     yield setup.pair("ground truth that is not asked for", asked, all_of_it, difference=image_difference, unit="counts")
 
 
-NAMED = (materials, bricks, rays, energies, edges, refining, scatter, blurs, twin, truth)
+NAMED = (materials, bricks, rays, energies, edges, refining, twin, truth)
 Cases = dict[str, Callable[[Bench], Iterator[Pair]]]
 CASES: Cases = {case.__name__: case for case in NAMED}
