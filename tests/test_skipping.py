@@ -249,7 +249,8 @@ def test_an_effect_that_is_off_runs_none_of_its_code(tmp_path, monkeypatch, name
         with pytest.raises(RuntimeError, match="left out"):
             next(given.views())
     simulator = _Simulator(scan.plan, scan.phantom, scan.scanner)
-    assert simulator.beam.gain is None and scan.plan.scatter_fraction == 0 and simulator.frames == 0
+    assert scan.plan.spot is None and scan.plan.scatter_fraction == 0
+    assert simulator.beam.gain is None and simulator.frames == 0
     assert image_difference(before, [images for _, images in scan.views()]) == 0
 
 
