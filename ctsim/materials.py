@@ -22,6 +22,7 @@ from ctsim.errors import InputError
 E_MIN, E_MAX = 1.0, 800.0  # the energies (keV) where the tables of every element hold
 _ELECTRON_REST = 510.998950  # keV
 _HC = 12.3984198  # keV·Å
+_LEAST_Q = 1e-3  # 1/Å
 SHARES_END = 300.0
 """Highest energy (keV) at which xraylib tabulates the shares of the shells in photoelectric absorption."""
 _SHARES_END_LIGHT, _LAST_LIGHT = 100.0, 8  # the same up to oxygen
@@ -308,7 +309,8 @@ def scattering_function(
         atoms = w / xrl.AtomicWeight(z)
         electrons += atoms * z
         q = momentum_transfer.tolist()
-        incoherent += atoms * np.array([xrl.SF_Compt(z, v) if v > 0 else 0.0 for v in q])
+        # the table starts at _LEAST_Q; below it the function goes with q²
+        incoherent += atoms * np.array([xrl.SF_Compt(z, max(v, _LEAST_Q)) * min(v / _LEAST_Q, 1) ** 2 for v in q])
         squared += atoms * np.array([xrl.FF_Rayl(z, v) for v in q]) ** 2
     return incoherent / electrons, squared
 

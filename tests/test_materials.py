@@ -15,6 +15,7 @@ from ctsim.materials import (
     material,
     names,
     photoelectric,
+    scattering_function,
 )
 
 ENERGIES = np.array([10.0, 20, 30, 50, 60, 80, 100, 150])
@@ -125,3 +126,10 @@ def test_importing_loads_no_xraylib() -> None:
     assert subprocess.run([sys.executable, "-c", probe.format("pass")]).returncode == 0
     loads = "ctsim.materials.material('Fe')"
     assert subprocess.run([sys.executable, "-c", probe.format(loads)]).returncode == 1  # the check can fail
+
+
+def test_the_scattering_function_below_its_table_goes_with_the_square():
+    """xraylib's table starts at 0.001 1/Å and refuses less, which a tube of a few kV asks for."""
+    bound, squared = scattering_function("Fe", np.array([0.0, 2.5e-4, 5e-4, 1e-3, 1.1e-3]))
+    np.testing.assert_allclose(bound[:3] / bound[3], [0, 1 / 16, 1 / 4], rtol=1e-12)
+    assert bound[3] < bound[4] < 1e-4 and (abs(squared / squared[0] - 1) < 1e-3).all()

@@ -5,7 +5,7 @@ import dataclasses
 import msgspec
 import numpy as np
 import pytest
-from test_montecarlo import ALL
+from test_montecarlo import ALL, ball
 from test_simulate import GEOMETRY, phantom, run, scanner
 
 from ctsim.detector import Detector
@@ -187,6 +187,19 @@ def test_photons_are_followed_from_poses_of_the_orbit():
     given = geometry.pose_array()
     jumps = circle(poses=tuple(map(tuple, np.concatenate([given[:45], given[::-1][:45]]))))
     assert len(series._few(jumps)) == 90
+
+
+def test_little_scatter_needs_no_small_share_of_it(monkeypatch):
+    """An object of 5 mm scatters 2e-5 of the open field. 2 % of that would take 1e8 photons."""
+    geometry = msgspec.structs.replace(GEOMETRY, n_views=2)
+    small = ball("water", 2.5)
+    found = scatter_series(small, source(geometry), geometry, tolerance=0.02)
+    level = found.coefficients[0, 0, 0, 0]
+    assert found.error > 0.02 and level > 0 and found.error * level <= series.NEGLIGIBLE
+    monkeypatch.setattr(series, "NEGLIGIBLE", 0.0)
+    monkeypatch.setattr(series, "MOST", found.histories // 2)
+    with pytest.raises(InputError, match="scatter_error"):
+        scatter_series(small, source(geometry), geometry, tolerance=0.02)
 
 
 def test_an_error_that_is_not_reached_is_said(monkeypatch):

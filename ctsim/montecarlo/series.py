@@ -28,6 +28,8 @@ FIRST, MOST = 20_000, 20_480_000
 """Histories of a view: at first, and at most; they are doubled until the error is reached."""
 USUAL, USUAL_ERROR = 300_000, 0.02
 """Histories of a view that reach an error: 160,000 for a head of water to 640,000 for broccoli of 60 mm."""
+NEGLIGIBLE = 2e-6
+"""RMS error, as a share of the open field, below which no tolerance asks for more photons."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +59,7 @@ class ScatterSeries:
 def scatter_series(
     phantom: Phantom, source: Source, geometry: Geometry, *, tolerance: float, stream: str = ""
 ) -> ScatterSeries:
-    """Follow photons until the RMS error of the scatter is at most `tolerance` of its mean.
+    """Follow photons until the RMS error of the scatter is at most `tolerance` of its mean, or NEGLIGIBLE.
 
     Images are parted into waves over the views, rows and columns, and waves that hold little more than noise are
     weakened (see `_smooth`). The noise is known, since the photons come in two halves.
@@ -89,12 +91,13 @@ def scatter_series(
         done = wanted
         waves = np.einsum("hqtvu,ta,vb,uc->hqabc", halves * (2 / done), *bases, optimize=True) / norms
         kept, error = _smooth(waves[:, 0] * np.sqrt(norms / math.prod(sizes)), frequencies)
-        if error > tolerance and done >= MOST:
+        is_reached = error <= tolerance or error * waves[:, 0, 0, 0, 0].mean() <= NEGLIGIBLE
+        if not is_reached and done >= MOST:
             raise InputError(
                 f"simulation.scatter_error: {done * len(poses):.1e} photons reach {error:.2g} of the scatter, "
                 f"not {tolerance:g}; expected at least {error:.2g}"
             )
-        if error <= tolerance:
+        if is_reached:
             series = waves.mean(0) * kept
             # a cell holds the average of a wave over its width
             series /= np.multiply.outer(*(np.sinc(np.arange(n) / (2 * n)) for n in cells))
