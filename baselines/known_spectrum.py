@@ -19,18 +19,18 @@ from numpy.typing import NDArray
 from ctsim.baselines.kernels.excess_cpu import add_excess
 from ctsim.baselines.metal import auto_mask, water_value
 from ctsim.baselines.prior import BONE, LUNG
-from ctsim.detector import Detector
+from ctsim.beam.quadrature import effective_weights, energy_rule, full_rule
+from ctsim.beam.spectrum import Spectrum, Tube, spectrum
+from ctsim.detector.response import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import few_views
 from ctsim.materials import attenuation, material
-from ctsim.quadrature import effective_weights, energy_rule, full_rule
 from ctsim.reconstruct.beam import DetectorTable, Given, TubeTable, check_tables, known_detector, known_tube
 from ctsim.reconstruct.fdk import fdk_stream
 from ctsim.reconstruct.log import count_floor, how_it_ended, is_blind, line_integrals
 from ctsim.reconstruct.projector import forward_columns
 from ctsim.reconstruct.redundancy import ray_weights
 from ctsim.reconstruct.settings import about, keywords
-from ctsim.spectrum import Spectrum, Tube, spectrum
 from ctsim.types import Scan, Volume
 
 P_TOP, NODES = 30.0, 2048  # of the table of water; beyond it goes on straight

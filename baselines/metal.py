@@ -10,13 +10,13 @@ import scipy.ndimage
 import torch
 from numpy.typing import NDArray
 
-from ctsim.arrayfile import read_array
 from ctsim.baselines.morphology import dilate, filled, pieces, spread
+from ctsim.dataset.arrayfile import read_array
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry, crosswise
-from ctsim.project import Tracer
 from ctsim.reconstruct.log import LineIntegrals
 from ctsim.reconstruct.settings import about, names_of
+from ctsim.tracer.project import Tracer
 from ctsim.types import Phantom, Scan
 
 PEAK, HALF, SMALLEST = 0.25, 0.5, 8  # of the maximum; of the metal's value; voxels

@@ -9,15 +9,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.beam.quadrature import full_rule
+from ctsim.beam.spectrum import spectrum
 from ctsim.geometry import Geometry
 from ctsim.phantoms.scanners import preset
 from ctsim.phantoms.shapes import cylinder
-from ctsim.project import Response, Tracer, transmit
-from ctsim.quadrature import full_rule
 from ctsim.solids import Solid
-from ctsim.spectrum import spectrum
+from ctsim.tracer.project import Response, Tracer, transmit
+from ctsim.tracer.voxelise import label_volume
 from ctsim.types import Phantom, Scanner
-from ctsim.voxelise import label_volume
 
 SIZE = 60.0  # edge of the scene's cube in mm
 FINER = 16  # finer pixels along each side of a pixel in `measured_pixel`

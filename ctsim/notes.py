@@ -4,10 +4,10 @@ import msgspec
 import numpy as np
 
 from ctsim.geometry import Geometry
-from ctsim.project import Response, Tracer, transmit
-from ctsim.shadow import primitive_corners, row_spans
+from ctsim.tracer.project import Response, Tracer, transmit
+from ctsim.tracer.shadow import primitive_corners, row_spans
+from ctsim.tracer.voxelise import metal_mask
 from ctsim.types import Phantom
-from ctsim.voxelise import metal_mask
 
 NOT_ON_GRID = "no metal on the reconstruction grid"
 SHOWN = 0.01  # of a pixel's signal: less than 10 000 photons tell from noise

@@ -1,6 +1,6 @@
 """What a scene needs, what it does not, and what that costs: decided once, printed, then obeyed.
 
-A short survey (`ctsim.survey`) tells how thick the materials are that are met, hence how many energies
+A short survey (`ctsim.tracer.survey`) tells how thick the materials are that are met, hence how many energies
 reach the tolerance, how long a view takes on this machine and how good the edges of the inserts are.
 """
 
@@ -12,23 +12,23 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.detector import response
-from ctsim.dose import Dose, dose_of
+from ctsim.beam.dose import Dose, dose_of
+from ctsim.beam.quadrature import EnergyRule, energy_rule, full_rule
+from ctsim.beam.spectrum import Spectrum, spectrum
+from ctsim.beam.spot import SubSources, magnification, sub_sources
+from ctsim.detector.panel import response as lag_response
+from ctsim.detector.response import response
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.human import human_bytes, human_time
 from ctsim.materials import attenuation
 from ctsim.montecarlo.series import expected_histories
 from ctsim.notes import metal_notes
-from ctsim.panel import response as lag_response
-from ctsim.project import Response, Tracer
-from ctsim.quadrature import EnergyRule, energy_rule, full_rule
 from ctsim.scatter import open_fraction
 from ctsim.settings import Simulation, Truth
-from ctsim.shadow import box_corners, primitive_corners
-from ctsim.spectrum import Spectrum, spectrum
-from ctsim.spot import SubSources, magnification, sub_sources
-from ctsim.survey import survey, trial
+from ctsim.tracer.project import Response, Tracer
+from ctsim.tracer.shadow import box_corners, primitive_corners
+from ctsim.tracer.survey import survey, trial
 from ctsim.types import Phantom, Scanner
 
 THICKNESS_MARGIN = 1.1  # a coarse survey can miss the thickest ray
@@ -62,11 +62,11 @@ class Plan:
 
     `materials` are the ones that rays meet, air first. In P = −ln(signal/open), `error` is the greatest found of the
     energy quadrature and `edge_error` is the largest found in eight windows at edges of inserts, in one view (see
-    `ctsim.survey`); `scatter_error` is the RMS error of scatter by Monte Carlo over its mean, None for other scatter;
-    `scatter_fraction` is the constant of level 1, whose error is not known. `spot` holds the points of a focal spot of
-    finite size; `edge_error` is that of each point. `l0` is the median water-equivalent path of
-    the body in mm. `memory_bytes` estimates the arrays;
-    Python and its libraries take a quarter of a gigabyte more. `notes` are those of `ctsim.notes`.
+    `ctsim.tracer.survey`); `scatter_error` is the RMS error of scatter by Monte Carlo over its mean, None for other
+    scatter; `scatter_fraction` is the constant of level 1, whose error is not known. `spot` holds the points of a focal
+    spot of finite size; `edge_error` is that of each point. `l0` is the median water-equivalent path of the body in mm.
+    `memory_bytes` estimates the arrays; Python and its libraries take a quarter of a gigabyte more. `notes` are those
+    of `ctsim.notes`.
     """
 
     stream_id: str

@@ -12,21 +12,21 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.detector import response
+from ctsim.beam.quadrature import effective_weights
+from ctsim.beam.spectrum import bowtie_thickness, heel_factor
+from ctsim.detector.noise import detect, detect_tigre, flat_field, largest_p, photons, pixel_pattern, read_out
+from ctsim.detector.panel import Panel
+from ctsim.detector.response import response
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.montecarlo.series import ScatterSeries, scatter_series
 from ctsim.montecarlo.transport import Source
-from ctsim.noise import detect, detect_tigre, flat_field, largest_p, photons, pixel_pattern, read_out
-from ctsim.panel import Panel
 from ctsim.plan import Plan
-from ctsim.project import Response, Tracer, path_lengths, transmit
-from ctsim.quadrature import effective_weights
 from ctsim.rng import stream_key
-from ctsim.shadow import join, row_spans
-from ctsim.spectrum import bowtie_thickness, heel_factor
+from ctsim.tracer.project import Response, Tracer, path_lengths, transmit
+from ctsim.tracer.shadow import join, row_spans
+from ctsim.tracer.voxelise import attenuation_volume, label_volume, metal_mask
 from ctsim.types import Phantom, Scanner
-from ctsim.voxelise import attenuation_volume, label_volume, metal_mask
 
 Image = NDArray[np.float32]
 Moments = tuple[Image, Image]

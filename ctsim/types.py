@@ -10,14 +10,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.detector import Detector
+from ctsim.beam.spectrum import Tube
+from ctsim.detector.noise import Noise
+from ctsim.detector.response import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry, Triple
-from ctsim.noise import Noise
 from ctsim.scaninfo import check_readings
 from ctsim.scatter import Scatter
 from ctsim.solids import Solid
-from ctsim.spectrum import Tube
 
 if TYPE_CHECKING:
     import torch  # loaded where there are readings: most of a second that making data does without

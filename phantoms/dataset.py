@@ -9,14 +9,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ctsim.detector import response
+from ctsim.beam.spectrum import spectrum
+from ctsim.dataset.writer import SceneWriter, Stack
+from ctsim.detector.response import response
 from ctsim.errors import InputError
 from ctsim.phantoms.scene import Scene, build, scene_id, scene_to_toml, stream_id
 from ctsim.plan import Plan, make_plan
 from ctsim.simulate import scan_info, simulate_views, truth_volumes
-from ctsim.spectrum import spectrum
 from ctsim.types import Phantom, Scanner
-from ctsim.writer import SceneWriter, Stack
 
 Watch = Callable[[Iterable[Any], int, int], Iterable[Any]]
 """Passes on views while it shows how far they are: (views, number of the first, number of all) -> the same views."""

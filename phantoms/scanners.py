@@ -12,16 +12,16 @@ from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 
-from ctsim.detector import Detector
-from ctsim.dose import i0_of_kerma, i0_of_mas
+from ctsim.beam.dose import i0_of_kerma, i0_of_mas
+from ctsim.beam.spectrum import Filter, Tube
+from ctsim.beam.spot import FocalSpot, OffFocal
+from ctsim.detector.noise import Noise
+from ctsim.detector.panel import Blur, Lag
+from ctsim.detector.response import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Count, Geometry, Pair, Triple
-from ctsim.noise import Noise
-from ctsim.panel import Blur, Lag
 from ctsim.phantoms.bodies import REACH
 from ctsim.scatter import Scatter
-from ctsim.spectrum import Filter, Tube
-from ctsim.spot import FocalSpot, OffFocal
 from ctsim.types import Scanner
 
 MARGIN = 1.06  # air around the object's shadow, so that filters and flat-field checks see open pixels

@@ -11,9 +11,9 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
+from ctsim.dataset.manifest import is_reserved
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry, crosswise
-from ctsim.manifest import is_reserved
 from ctsim.phantoms.identity import identity
 from ctsim.phantoms.recipes import AnyRecipe, build_recipe
 from ctsim.phantoms.scanners import REACH, ScannerSettings

@@ -8,12 +8,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.detector import Detector
+from ctsim.beam.quadrature import full_rule
+from ctsim.beam.spectrum import Tube, spectrum
+from ctsim.detector.response import Detector
 from ctsim.errors import InputError
 from ctsim.materials import E_MIN
-from ctsim.quadrature import full_rule
 from ctsim.reconstruct.settings import about
-from ctsim.spectrum import Tube, spectrum
 
 ROUNDED = 1e-6  # keV
 Given = Mapping[str, Any] | None

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.kernels.backproject_cpu import backproject
 from ctsim.reconstruct.filters import Cutoff, Window, filter_rows, padded_length, ramp_response
+from ctsim.reconstruct.kernels.backproject_cpu import backproject
 from ctsim.reconstruct.log import LineIntegrals, how_it_ended, is_blind
 from ctsim.reconstruct.redundancy import RayWeights, ray_weights
 from ctsim.reconstruct.settings import keywords

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.kernels.joseph_cpu import backproject, project
+from ctsim.reconstruct.kernels.joseph_cpu import backproject, project
 
 Views = Sequence[int] | NDArray[np.integer] | slice | None
 Rows = NDArray[np.bool_] | NDArray[np.integer] | None

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ctsim.benchmarks.scores.protocol import truth_of
 from ctsim.benchmarks.studies.methods.panels import cut
+from ctsim.dataset.store import open_scan
 from ctsim.errors import InputError
-from ctsim.store import open_scan
 
 DSO, DSD, HALF_U, HALF_V = 5.0, 8.0, 2.6, 2.0
 ANGLE = np.radians(35.0)

@@ -17,8 +17,8 @@ from ctsim.benchmarks.studies.methods.panels import Look, cut, look_of
 from ctsim.benchmarks.studies.methods.plan import repetition
 from ctsim.benchmarks.studies.methods.records import RunRecord, latest, read
 from ctsim.benchmarks.studies.methods.volumes import identity_of, map_volume, own_at_50kev
+from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
-from ctsim.store import list_scans, open_scan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

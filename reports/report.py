@@ -29,7 +29,7 @@ from ctsim.benchmarks.studies.peers.study import Peers
 from ctsim.benchmarks.studies.skipping.study import Skipping
 from ctsim.benchmarks.studies.stress.study import Stress
 from ctsim.benchmarks.studies.validate.study import Validate
-from ctsim.durable import replacing
+from ctsim.dataset.durable import replacing
 from ctsim.errors import InputError
 from ctsim.reports import Flags, page, slices
 from ctsim.reports.kept import first_cases

@@ -77,10 +77,10 @@ def serve() -> None:
     import ctsim.benchmarks.studies.methods.panels
     import ctsim.benchmarks.studies.methods.run
     import ctsim.benchmarks.studies.methods.study
+    import ctsim.dataset.writer
     import ctsim.phantoms.scene
-    import ctsim.writer
 
-    note_every_view(ctsim.writer.SceneWriter)
+    note_every_view(ctsim.dataset.writer.SceneWriter)
     assert all(
         (
             ctsim.benchmarks.studies.methods.study,
@@ -216,7 +216,7 @@ def be(
         if powerless:
             drop_powers()
         if view:
-            from ctsim.writer import SceneWriter
+            from ctsim.dataset.writer import SceneWriter
 
             die_after(SceneWriter, view[0], Path(view[1]))
         changes = count_changes(change)

@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from ctsim.dataset.writer import SceneWriter, Stack
 from ctsim.geometry import Geometry
-from ctsim.writer import SceneWriter, Stack
 
 GEOMETRY = Geometry(
     dso=200.0,

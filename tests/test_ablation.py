@@ -11,8 +11,8 @@ from ctsim.benchmarks.studies import ablation
 from ctsim.benchmarks.studies.methods import records
 from ctsim.benchmarks.studies.paper import tables as paper_tables
 from ctsim.benchmarks.suites import load as load_suite
+from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
-from ctsim.store import list_scans, open_scan
 
 pytestmark = pytest.mark.slow
 

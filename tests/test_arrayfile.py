@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from ctsim import arrayfile
-from ctsim.arrayfile import read_array, read_arrays
 from ctsim.benchmarks.studies.methods.volumes import read_volume, write_volume
+from ctsim.dataset import arrayfile
+from ctsim.dataset.arrayfile import read_array, read_arrays
 from ctsim.errors import InputError
 
 BLOCK = np.arange(60, dtype=np.int16).reshape(3, 4, 5)

@@ -10,8 +10,8 @@ from ctsim.benchmarks.scores import artefact, metrics
 from ctsim.benchmarks.scores.artefact import Layout, artefact_score, cupping_index, homogeneous, metal_lines, near_metal
 from ctsim.benchmarks.scores.protocol import Truth
 from ctsim.benchmarks.scores.score import COLUMNS
+from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
-from ctsim.store import list_scans, open_scan
 
 SHAPE, D = (30, 36, 48), (1.5, 1.0, 0.5)
 WATER = 0.02

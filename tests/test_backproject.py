@@ -2,7 +2,7 @@ import numba
 import numpy as np
 import pytest
 
-from ctsim.kernels import backproject_cpu, backproject_reference
+from ctsim.reconstruct.kernels import backproject_cpu, backproject_reference
 
 RNG = np.random.default_rng(3)
 VIEWS = RNG.standard_normal((9, 7, 11)).astype(np.float32)

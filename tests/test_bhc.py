@@ -11,20 +11,20 @@ import torch
 from ctsim.baselines import bhc, known_spectrum
 from ctsim.baselines.known_spectrum import Beam, precorrect
 from ctsim.baselines.metal import Metal, Trace
+from ctsim.beam.quadrature import full_rule
 from ctsim.benchmarks.studies.methods.volumes import attached
+from ctsim.detector.noise import Noise
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
-from ctsim.noise import Noise
 from ctsim.plan import make_plan
-from ctsim.quadrature import full_rule
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.log import line_integrals
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import flat_image, simulate_views
 from ctsim.solids import FRUSTUM, Primitive, Solid
+from ctsim.tracer.voxelise import metal_mask
 from ctsim.types import Phantom, Scan, Scanner, Status
-from ctsim.voxelise import metal_mask
 
 METHODS = {
     "bhc-poly": bhc.bhc_poly,

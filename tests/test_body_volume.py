@@ -10,14 +10,14 @@ import pytest
 import tifffile
 from scipy import ndimage
 
+from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.phantoms.body_volume import TISSUES, CtVolume
 from ctsim.phantoms.recipes import build_recipe
 from ctsim.phantoms.scene import parse_suite, scene_id, scene_to_toml, stream_id
-from ctsim.store import list_scans, open_scan
-from ctsim.voxelise import attenuation_volume
+from ctsim.tracer.voxelise import attenuation_volume
 
 SPACING = (2.0, 1.5, 1.0)
 

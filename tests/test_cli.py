@@ -13,7 +13,7 @@ from test_paper_tables import record
 
 from ctsim.benchmarks import cli, make_dataset
 from ctsim.benchmarks.studies.methods import records
-from ctsim.store import list_scans, open_scan
+from ctsim.dataset.store import list_scans, open_scan
 
 WAITING = """
 import time

@@ -10,8 +10,8 @@ from numba.core.event import end_event, start_event
 from test_simulate import EVERYTHING, phantom, run, scanner
 
 from ctsim.benchmarks.engine import terminal
-from ctsim.kernels import raytrace_cpu
 from ctsim.kernels.once import compiled_once
+from ctsim.tracer.kernels import raytrace_cpu
 
 
 def specialisations(name):

@@ -9,7 +9,7 @@ import torch
 
 from ctsim.benchmarks.methods import TABLE, find
 from ctsim.benchmarks.studies.methods.attempt import scan_for
-from ctsim.store import list_scans, open_scan
+from ctsim.dataset.store import list_scans, open_scan
 from ctsim.types import Status
 
 SHORT = {name: {"steps": 100} for name in ("splat-paper", "splat-r2")}  # of 20 000 and 30 000

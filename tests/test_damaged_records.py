@@ -10,7 +10,6 @@ import pytest
 from test_paper_tables import record
 from test_pareto_points import task, timed
 
-from ctsim import locks, manifest
 from ctsim.benchmarks.engine.host import host
 from ctsim.benchmarks.engine.record import Record, Task, done
 from ctsim.benchmarks.methods import parse_overrides
@@ -23,8 +22,9 @@ from ctsim.benchmarks.studies.skipping.study import Skip
 from ctsim.benchmarks.studies.stress import study as stress
 from ctsim.benchmarks.studies.validate import study as validate
 from ctsim.benchmarks.studies.validate.finding import check
+from ctsim.dataset import locks, manifest
+from ctsim.dataset.folder import read_progress
 from ctsim.errors import InputError
-from ctsim.folder import read_progress
 from ctsim.scaninfo import read_info
 
 BY = {"host": host(), "commit": "a" * 40, "time": "2026-01-01T00:00:00+00:00"}

@@ -3,14 +3,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import ctsim.data
-from ctsim.data import make_detector_table
-from ctsim.detector import Detector, closed_form, outcomes, response, swank
+import ctsim.detector
+from ctsim.detector import make_table
+from ctsim.detector.response import Detector, closed_form, outcomes, response, swank
+from ctsim.detector.slab import Slab, absorbed
 from ctsim.errors import InputError
 from ctsim.materials import attenuation, compton, k_shell, k_vacancies, photoelectric
-from ctsim.montecarlo.slab import Slab, absorbed
 
-TABLE = Path(ctsim.data.__file__).with_name("detector_response.npz")
+TABLE = Path(ctsim.detector.__path__[0], "detector_response.npz")
 SIGMAS = 4.0
 
 
@@ -110,9 +110,9 @@ def test_the_table_is_what_its_script_makes(which: str, i: int, j: int) -> None:
     with np.load(TABLE) as table:
         energies, thickness = table[f"{which}_energy"], table["thickness"]
         stored = table[f"{which}_ratio"][:, i, j]
-    np.testing.assert_allclose(energies, make_detector_table.energies(which), rtol=1e-12)
-    np.testing.assert_allclose(thickness, make_detector_table.THICKNESS, rtol=1e-12)
-    made, _ = make_detector_table.node(which, float(thickness[i]), float(energies[j]))
+    np.testing.assert_allclose(energies, make_table.energies(which), rtol=1e-12)
+    np.testing.assert_allclose(thickness, make_table.THICKNESS, rtol=1e-12)
+    made, _ = make_table.node(which, float(thickness[i]), float(energies[j]))
     np.testing.assert_allclose(made, stored, rtol=2e-6)  # float32, and a rounding that turns one history in a million
 
 

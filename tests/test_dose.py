@@ -8,7 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from ctsim.dose import dose_of, i0_of_kerma, i0_of_mas
+from ctsim.beam.dose import dose_of, i0_of_kerma, i0_of_mas
+from ctsim.beam.spectrum import Bowtie, Filter, Tube, spectrum
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
@@ -16,7 +17,6 @@ from ctsim.phantoms.scene import build, load_suite, parse_suite, scene_id, scene
 from ctsim.plan import make_plan
 from ctsim.scaninfo import ScanInfo
 from ctsim.simulate import scan_info
-from ctsim.spectrum import Bowtie, Filter, Tube, spectrum
 
 SUITES = Path(__file__).parent.parent / "benchmarks" / "suites"
 RODS = 'name = "rods"\nphantom = { recipe = "validation" }\n'

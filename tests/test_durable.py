@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ctsim import durable, process
 from ctsim.benchmarks.studies.methods import volumes
 from ctsim.benchmarks.studies.methods.volumes import read_volume, write_volume
-from ctsim.durable import replacing, write_synced
+from ctsim.dataset import durable, process
+from ctsim.dataset.durable import replacing, write_synced
 from ctsim.reconstruct.splat.checkpoint import Checkpoint
 
 ROUNDS = 40

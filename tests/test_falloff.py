@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 
 from ctsim import simulate
+from ctsim.beam.spectrum import Tube, heel_factor
+from ctsim.detector.noise import Noise
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.noise import Noise
 from ctsim.plan import make_plan
 from ctsim.scatter import Scatter
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import flat_image, simulate_views
 from ctsim.solids import ELLIPSOID, Primitive, Solid
-from ctsim.spectrum import Tube, heel_factor
 from ctsim.types import Phantom, Scanner
 
 GEOMETRY = Geometry(

@@ -21,9 +21,9 @@ from test_workers import records_of, scores, tables, until
 
 from ctsim.benchmarks import make_dataset
 from ctsim.benchmarks.studies.methods import records
-from ctsim.folder import partial_of
-from ctsim.manifest import list_scans, read_manifest, verify
-from ctsim.tiffstack import map_array
+from ctsim.dataset.folder import partial_of
+from ctsim.dataset.manifest import list_scans, read_manifest, verify
+from ctsim.dataset.tiffstack import map_array
 
 pytestmark = pytest.mark.slow
 
@@ -50,7 +50,7 @@ phantom = {{ metal = "none" }}
 PRELOAD = """
 from pathlib import Path
 
-from ctsim.writer import SceneWriter
+from ctsim.dataset.writer import SceneWriter
 from forks import die_after, note_every_view
 
 note_every_view(SceneWriter)

@@ -5,9 +5,9 @@ import torch
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.kernels.backproject_cpu import backproject
 from ctsim.reconstruct.fdk import add_fdk, fdk, reconstruct
 from ctsim.reconstruct.filters import WINDOWS
+from ctsim.reconstruct.kernels.backproject_cpu import backproject
 from ctsim.reconstruct.log import count_floor, line_integrals
 from ctsim.reconstruct.redundancy import parker_share, ray_weights
 from ctsim.types import Scan, Status

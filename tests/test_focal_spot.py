@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from ctsim.detector import Detector
+from ctsim.beam.spectrum import Tube
+from ctsim.beam.spot import FWHM, FocalSpot, OffFocal, sub_sources
+from ctsim.detector.noise import Noise
+from ctsim.detector.response import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
-from ctsim.noise import Noise
 from ctsim.plan import make_plan
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import simulate_views
 from ctsim.solids import BOX, ELLIPSOID, Primitive, Solid
-from ctsim.spectrum import Tube
-from ctsim.spot import FWHM, FocalSpot, OffFocal, sub_sources
 from ctsim.types import Phantom, Scanner
 
 QUIET = Noise(model="none")

@@ -10,18 +10,18 @@ import pytest
 from small_scan import STACKS, content, one_view, write
 from test_writer import interrupt
 
-from ctsim import folder, locks, manifest, sources
 from ctsim.benchmarks.make_dataset import main
 from ctsim.benchmarks.make_dataset import work as command
 from ctsim.benchmarks.suites import load
+from ctsim.dataset import folder, locks, manifest, sources
+from ctsim.dataset.folder import is_complete, remarks, unfinished
+from ctsim.dataset.manifest import INDEX, MANIFEST, PROGRESS, IndexLine, read_index, read_manifest
+from ctsim.dataset.store import open_scan, verify
+from ctsim.dataset.writer import SceneWriter
 from ctsim.errors import InputError
-from ctsim.folder import is_complete, remarks, unfinished
-from ctsim.manifest import INDEX, MANIFEST, PROGRESS, IndexLine, read_index, read_manifest
 from ctsim.phantoms import dataset
 from ctsim.phantoms import scene as scenes
 from ctsim.phantoms.scene import scene_id
-from ctsim.store import open_scan, verify
-from ctsim.writer import SceneWriter
 
 SUITE = """
 [defaults.scanner]

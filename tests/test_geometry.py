@@ -4,9 +4,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from ctsim.beam.spectrum import Bowtie, Tube
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry, few_views
-from ctsim.spectrum import Bowtie, Tube
 from ctsim.types import Scanner
 
 GEOMETRY = Geometry(

@@ -87,20 +87,20 @@ def test_importing_a_package_loads_nothing_heavy(package):
     assert not loaded(f"import {package}") & (DRAWS | SLOW) - declares
 
 
-@pytest.mark.parametrize("module", ["ctsim.errors", "ctsim.geometry", "ctsim.manifest", "ctsim.store"])
+@pytest.mark.parametrize("module", ["ctsim.errors", "ctsim.geometry", "ctsim.dataset.manifest", "ctsim.dataset.store"])
 def test_what_lists_and_checks_datasets_loads_nothing_slow(module):
     assert not loaded(f"import {module}") & (DRAWS | SLOW)
 
 
 def test_making_data_does_without_torch():
     assert "torch" not in loaded(
-        "import ctsim.phantoms.scene, ctsim.simulate, ctsim.writer, ctsim.benchmarks.make_dataset.work"
+        "import ctsim.phantoms.scene, ctsim.simulate, ctsim.dataset.writer, ctsim.benchmarks.make_dataset.work"
     )
 
 
 @pytest.mark.slow
 def test_nothing_below_benchmarks_draws_or_talks():
-    names = [m for m in modules("benchmarks", "reports") if m != "ctsim.data.make_spectrum_table"]
+    names = [m for m in modules("benchmarks", "reports") if m != "ctsim.beam.make_table"]
     assert len(names) > 30
     brought = loaded("import torch")
     assert not (loaded("import " + ", ".join(names)) - brought) & DRAWS
@@ -123,5 +123,5 @@ def test_help_loads_nothing_slow(words):
 @pytest.mark.slow
 def test_importing_everything_neither_prints_nor_warns():
     names = modules("reports")
-    left_out = {"ctsim.data.make_spectrum_table"}  # it needs what only an extra installs
+    left_out = {"ctsim.beam.make_table"}  # it needs what only an extra installs
     assert run("import " + ", ".join(n for n in names if n not in left_out)) == ""

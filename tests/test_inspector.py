@@ -192,8 +192,8 @@ def test_errors_are_one_sentence_and_code_2(smallest, results, tmp_path, monkeyp
 
 
 def test_a_volume_that_has_no_scores_is_refused(case, smallest):
+    from ctsim.dataset.store import list_scans, open_scan
     from ctsim.errors import InputError
-    from ctsim.store import list_scans, open_scan
 
     stored = open_scan(list_scans(smallest)[0])
     with pytest.raises(InputError, match="shape"):

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ctsim.detector.noise import Noise, detect, pixel_pattern
 from ctsim.geometry import Geometry
-from ctsim.kernels.raytrace_cpu import _signal
-from ctsim.noise import Noise, detect, pixel_pattern
-from ctsim.project import Tracer, path_lengths
 from ctsim.rng import stream_key
+from ctsim.tracer.kernels.raytrace_cpu import _signal
+from ctsim.tracer.project import Tracer, path_lengths
 from ctsim.types import Phantom
 
 FULL = os.environ.get("CTSIM_INSTRUCTIONS") == "full"

@@ -6,8 +6,8 @@ import pytest
 from ctsim.benchmarks import methods
 from ctsim.benchmarks.studies.methods import attempt
 from ctsim.benchmarks.studies.methods.volumes import attached
+from ctsim.dataset.store import list_scans, open_scan
 from ctsim.reconstruct.log import line_integrals
-from ctsim.store import list_scans, open_scan
 
 
 @pytest.mark.parametrize("name", ["limar", "nmar"])

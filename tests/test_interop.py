@@ -4,9 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from ctsim.errors import InputError
-from ctsim.geometry import Geometry
-from ctsim.interop import (
+from ctsim.dataset.interop import (
     Library,
     angles_to,
     astra_vectors,
@@ -16,7 +14,9 @@ from ctsim.interop import (
     volume_from,
     volume_to,
 )
-from ctsim.project import Tracer, path_lengths
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+from ctsim.tracer.project import Tracer, path_lengths
 from ctsim.types import Phantom
 
 GEOMETRY = Geometry(

@@ -17,7 +17,9 @@ from ctsim.baselines.kernels import (
 from ctsim.benchmarks.scores.kernels import ssim_cpu, ssim_reference
 from ctsim.benchmarks.scores.metrics import border, window
 from ctsim.geometry import Geometry
-from ctsim.kernels import (
+from ctsim.reconstruct.kernels import log_cpu, log_reference, tv_cpu, tv_reference
+from ctsim.reconstruct.splat.kernels import adam_cpu, adam_reference, carve_cpu, carve_reference
+from ctsim.tracer.kernels import (
     bricks_cpu,
     bricks_reference,
     columns_cpu,
@@ -25,8 +27,6 @@ from ctsim.kernels import (
     shadow_cpu,
     shadow_reference,
 )
-from ctsim.reconstruct.kernels import log_cpu, log_reference, tv_cpu, tv_reference
-from ctsim.reconstruct.splat.kernels import adam_cpu, adam_reference, carve_cpu, carve_reference
 
 SHAPE = (5, 7, 11)
 U = 2.0**-24  # of float32

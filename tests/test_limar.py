@@ -13,17 +13,17 @@ from ctsim.baselines.metal import Metal, Trace, auto_mask, find_metal, reach, re
 from ctsim.baselines.morphology import dilate, spread
 from ctsim.baselines.prior import choice_views, tissue_prior
 from ctsim.benchmarks.methods import find
+from ctsim.detector.noise import Noise
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.noise import Noise
 from ctsim.plan import make_plan
-from ctsim.project import Tracer, path_lengths
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import flat_image, simulate_views
 from ctsim.solids import FRUSTUM, Primitive, Solid
+from ctsim.tracer.project import Tracer, path_lengths
+from ctsim.tracer.voxelise import metal_mask
 from ctsim.types import Phantom, Scan, Scanner, Status
-from ctsim.voxelise import metal_mask
 
 METHODS = {"limar": limar.reconstruct, "nmar": nmar.reconstruct}
 GEOMETRY = Geometry(

@@ -15,12 +15,12 @@ import pytest
 from small_scan import STACKS, content, write
 from test_record import Value, record
 
-from ctsim import locks, process
 from ctsim.benchmarks.engine.record import Record, Store
+from ctsim.dataset import locks, process
+from ctsim.dataset.locks import Busy, Owner, lock, locked
+from ctsim.dataset.store import verify
+from ctsim.dataset.writer import SceneWriter
 from ctsim.errors import InputError
-from ctsim.locks import Busy, Owner, lock, locked
-from ctsim.store import verify
-from ctsim.writer import SceneWriter
 
 NO_FLOCK = [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS]
 APPENDED = 60

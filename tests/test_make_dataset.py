@@ -12,11 +12,11 @@ import tifffile
 from ctsim.benchmarks.make_dataset import main
 from ctsim.benchmarks.make_dataset import work as command
 from ctsim.benchmarks.suites import STUDY_SUITES, bundled, load, select
+from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
 from ctsim.human import human_bytes, human_time
 from ctsim.phantoms import dataset
 from ctsim.phantoms.scene import load_suite, parse_suite, scene_id
-from ctsim.store import list_scans, open_scan
 
 SUITE = """
 [defaults]

@@ -15,9 +15,9 @@ import pytest
 from ctsim.benchmarks import methods
 from ctsim.benchmarks.studies.methods import plan, records
 from ctsim.benchmarks.studies.methods import study as cli_run
+from ctsim.dataset.manifest import INDEX, MANIFEST
+from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
-from ctsim.manifest import INDEX, MANIFEST
-from ctsim.store import list_scans, open_scan
 
 LIMIT = 64  # open files; the interpreter and its libraries need a dozen
 

@@ -6,15 +6,15 @@ import numba
 import numpy as np
 import pytest
 
-from ctsim.detector import Detector
+from ctsim.beam.spectrum import Spectrum
+from ctsim.detector.response import Detector
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.montecarlo.kernels.transport_reference import single_scatter
 from ctsim.montecarlo.transport import Source, absorbed_energy, scatter_image
 from ctsim.montecarlo.world import World
-from ctsim.project import Tracer, path_lengths
 from ctsim.solids import ELLIPSOID, FRUSTUM, Primitive, Solid
-from ctsim.spectrum import Spectrum
+from ctsim.tracer.project import Tracer, path_lengths
 from ctsim.types import Phantom
 
 POSE = np.array([250.0, 0, 0, -250, 0, 0, 0, 120, 0, 0, 0, 120])

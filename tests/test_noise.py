@@ -6,9 +6,9 @@ import pytest
 from scipy import stats
 
 from ctsim import rng
+from ctsim.detector.noise import Noise, detect, detect_tigre, flat_field, largest_p, pixel_pattern
 from ctsim.errors import InputError
 from ctsim.kernels import noise_cpu, noise_reference
-from ctsim.noise import Noise, detect, detect_tigre, flat_field, largest_p, pixel_pattern
 
 KEY = rng.stream_key("scene", "photons", 0)
 PHOTONS = Noise(electronic=0.0, adc_bits=None)

@@ -6,21 +6,21 @@ import msgspec
 import numpy as np
 import pytest
 
+from ctsim.beam.quadrature import full_rule
+from ctsim.beam.spectrum import Tube, spectrum
 from ctsim.benchmarks.make_dataset import main as make_dataset
 from ctsim.benchmarks.methods import find
 from ctsim.benchmarks.scores.judge import Judge, Twin
 from ctsim.benchmarks.studies.methods import records
 from ctsim.benchmarks.studies.methods.attempt import scan_for
 from ctsim.benchmarks.studies.methods.study import main as run_benchmark
-from ctsim.detector import Detector
+from ctsim.dataset.store import open_scan
+from ctsim.detector.response import Detector
 from ctsim.geometry import Geometry
 from ctsim.notes import metal_notes
 from ctsim.phantoms.shapes import cylinder, sphere
-from ctsim.project import Response
-from ctsim.quadrature import full_rule
 from ctsim.solids import Solid
-from ctsim.spectrum import Tube, spectrum
-from ctsim.store import open_scan
+from ctsim.tracer.project import Response
 from ctsim.types import Phantom
 
 GRID, VIEW = "no metal on the reconstruction grid", "no metal in any view"

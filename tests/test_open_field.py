@@ -7,11 +7,11 @@ import pytest
 
 from ctsim.benchmarks.make_dataset import main as make_dataset
 from ctsim.benchmarks.scores.protocol import metal_score, tissue_score, truth_of
+from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reconstruct.scatter import open_excess
 from ctsim.reconstruct.splat.fast import reconstruct
-from ctsim.store import list_scans, open_scan
 
 SCENE = """
 name = "scattering"

@@ -19,7 +19,7 @@ from test_run import GEOMETRY, double
 from ctsim.benchmarks import methods
 from ctsim.benchmarks.studies.methods.attempt import restored
 from ctsim.benchmarks.studies.methods.volumes import read_volume
-from ctsim.store import list_scans, open_scan
+from ctsim.dataset.store import list_scans, open_scan
 from ctsim.types import Volume
 
 HERE = sys.modules[__name__]

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from ctsim import rng
-from ctsim.detector import Detector
+from ctsim.beam.spectrum import Tube
+from ctsim.detector.noise import Noise, detect, photons, pixel_pattern, read_out
+from ctsim.detector.panel import CUT, LATE, Blur, Lag, Panel, kernels, response, taps
+from ctsim.detector.response import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.kernels import noise_cpu, noise_reference
 from ctsim.materials import attenuation
-from ctsim.noise import Noise, detect, photons, pixel_pattern, read_out
-from ctsim.panel import CUT, LATE, Blur, Lag, Panel, kernels, response, taps
 from ctsim.plan import make_plan
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import flat_image, simulate_views
 from ctsim.solids import ELLIPSOID, Primitive, Solid
-from ctsim.spectrum import Tube
 from ctsim.types import Phantom, Scanner
 
 FWHM = math.sqrt(8 * math.log(2))

@@ -7,6 +7,8 @@ import numpy as np
 import peer_jobs
 import pytest
 
+from ctsim.beam.quadrature import full_rule
+from ctsim.beam.spectrum import spectrum
 from ctsim.benchmarks import oracles
 from ctsim.benchmarks.engine import host
 from ctsim.benchmarks.engine.record import Record, Task
@@ -16,11 +18,9 @@ from ctsim.benchmarks.studies.peers.libraries import Rtk, Xcist
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.phantoms.shapes import cylinder
-from ctsim.project import Tracer, path_lengths
-from ctsim.quadrature import full_rule
-from ctsim.spectrum import spectrum
+from ctsim.tracer.project import Tracer, path_lengths
+from ctsim.tracer.voxelise import fractions
 from ctsim.types import Phantom
-from ctsim.voxelise import fractions
 
 # not a cube, nor square, nor centred, so that no two axes can be exchanged or turned round unseen
 GEOMETRY = Geometry(

@@ -8,16 +8,16 @@ import numba
 import numpy as np
 import pytest
 
-from ctsim import project
-from ctsim.detector import Detector
+from ctsim.beam.quadrature import energy_rule
+from ctsim.beam.spectrum import Tube, spectrum
+from ctsim.detector.response import Detector
 from ctsim.geometry import Geometry
-from ctsim.kernels import raytrace_cpu, raytrace_reference
-from ctsim.kernels.exp_cpu import exp_minus
 from ctsim.materials import attenuation
-from ctsim.project import Response, Tracer, path_lengths, transmit, work_order
-from ctsim.quadrature import energy_rule
 from ctsim.solids import BOX, CAPSULE, ELLIPSOID, FRUSTUM, TORUS, Primitive, Solid
-from ctsim.spectrum import Tube, spectrum
+from ctsim.tracer import project
+from ctsim.tracer.kernels import raytrace_cpu, raytrace_reference
+from ctsim.tracer.kernels.exp_cpu import exp_minus
+from ctsim.tracer.project import Response, Tracer, path_lengths, transmit, work_order
 from ctsim.types import Phantom
 
 MATERIALS = ("air", "water", "cortical_bone", "Fe", "Ti")

@@ -12,9 +12,9 @@ from ctsim.benchmarks.scores import projection
 from ctsim.benchmarks.scores.judge import Judge, Twin
 from ctsim.benchmarks.scores.projection import REGIONS, HeldOut, half_way, held_out, projection_score, with_floor
 from ctsim.benchmarks.scores.protocol import truth_of
+from ctsim.dataset.store import list_scans, open_scan
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.projector import forward
-from ctsim.store import list_scans, open_scan
 
 GEOMETRY = Geometry(
     dso=100.0, dsd=150.0, n_voxel=(5, 7, 11), d_voxel=(1.0, 1.0, 1.0), n_detector=(8, 12), d_detector=(1.5, 1.5),

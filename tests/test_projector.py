@@ -6,7 +6,7 @@ import torch
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.kernels import joseph_cpu, joseph_reference
+from ctsim.reconstruct.kernels import joseph_cpu, joseph_reference
 from ctsim.reconstruct.projector import adjoint, forward
 
 RNG = np.random.default_rng(8)

@@ -3,11 +3,11 @@ import itertools
 import numpy as np
 import pytest
 
-from ctsim.detector import Detector, response
+from ctsim.beam.quadrature import EnergyRule, effective_weights, energy_rule, full_rule, gauss_rule
+from ctsim.beam.spectrum import Spectrum, Tube, spectrum
+from ctsim.detector.response import Detector, response
 from ctsim.errors import InputError
 from ctsim.materials import attenuation
-from ctsim.quadrature import EnergyRule, effective_weights, energy_rule, full_rule, gauss_rule
-from ctsim.spectrum import Spectrum, Tube, spectrum
 
 MATERIALS = ("water", "cortical_bone", "Al", "Ti", "Fe")
 LONGEST = (100.0, 30.0, 20.0, 15.0, 10.0)

@@ -9,8 +9,8 @@ from forks import Forks, Run
 
 from ctsim.benchmarks import make_dataset
 from ctsim.benchmarks.suites import load
-from ctsim.manifest import verify
-from ctsim.panel import Lag, response
+from ctsim.dataset.manifest import verify
+from ctsim.detector.panel import Lag, response
 from ctsim.phantoms.dataset import plan_scene
 
 pytestmark = pytest.mark.slow

@@ -3,11 +3,11 @@
 import msgspec
 import pytest
 
-from ctsim.detector import Detector
+from ctsim.beam.spectrum import Tube
+from ctsim.detector.response import Detector
 from ctsim.phantoms.scanners import MACHINES, ScannerSettings
 from ctsim.phantoms.scene import parse_suite
 from ctsim.scatter import Scatter
-from ctsim.spectrum import Tube
 
 REAL = [name for name in MACHINES if name != "ideal"]
 

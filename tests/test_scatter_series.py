@@ -8,7 +8,9 @@ import pytest
 from test_montecarlo import ALL, ball
 from test_simulate import GEOMETRY, phantom, run, scanner
 
-from ctsim.detector import Detector
+from ctsim.beam.spectrum import Spectrum, Tube
+from ctsim.detector.noise import Noise
+from ctsim.detector.response import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.montecarlo import series
@@ -17,10 +19,8 @@ from ctsim.montecarlo.kernels.transport_cpu import CHUNKS
 from ctsim.montecarlo.series import scatter_series
 from ctsim.montecarlo.transport import PLANES, Source, scatter_image
 from ctsim.montecarlo.world import World
-from ctsim.noise import Noise
 from ctsim.scatter import Scatter
 from ctsim.settings import Simulation, Truth
-from ctsim.spectrum import Spectrum, Tube
 
 SIGMAS = 4.0
 MONO = Spectrum(energies=np.array([60.0]), weights=np.array([1.0]))

@@ -13,9 +13,12 @@ import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctsim.detector import Detector
+from ctsim.beam.spectrum import Bowtie, Filter, Tube
+from ctsim.beam.spot import FocalSpot
+from ctsim.dataset.writer import SceneWriter
+from ctsim.detector.noise import Noise
+from ctsim.detector.response import Detector
 from ctsim.errors import InputError
-from ctsim.noise import Noise
 from ctsim.phantoms.body_lung import Lung
 from ctsim.phantoms.identity import FIRST_KEYS, identity
 from ctsim.phantoms.recipes import NAMES
@@ -25,9 +28,6 @@ from ctsim.plan import make_plan
 from ctsim.scatter import Scatter
 from ctsim.settings import Truth
 from ctsim.simulate import simulate_views
-from ctsim.spectrum import Bowtie, Filter, Tube
-from ctsim.spot import FocalSpot
-from ctsim.writer import SceneWriter
 
 SUITES = Path(__file__).parent.parent / "benchmarks" / "suites"
 

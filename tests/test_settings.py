@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 import torch
 
-from ctsim import store
 from ctsim.baselines.sart import OsSart, os_sart
 from ctsim.benchmarks import cli, methods
 from ctsim.benchmarks.methods import TABLE
+from ctsim.dataset import store
+from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
 from ctsim.reconstruct import fdk
 from ctsim.reconstruct.settings import parameters_of
 from ctsim.reconstruct.splat import fast
-from ctsim.store import list_scans, open_scan
 
 SCAN = cast("Any", "scan")
 

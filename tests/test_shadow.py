@@ -4,10 +4,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from ctsim import shadow
 from ctsim.geometry import Geometry
-from ctsim.kernels.solids_reference import intersect
 from ctsim.solids import BOX, CAPSULE, ELLIPSOID, FRUSTUM, TORUS, Primitive, Solid, pack
+from ctsim.tracer import shadow
+from ctsim.tracer.kernels.solids_reference import intersect
 
 SIZES = {
     ELLIPSOID: (5.0, 1.0, 3.0),

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ctsim.errors import InputError
-from ctsim.kernels import solids_cpu
 from ctsim.phantoms import shapes
 from ctsim.solids import Solid, pack
+from ctsim.tracer.kernels import solids_cpu
 
 TILT = (0.3, -0.5, 0.7)
 

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from ctsim.baselines.metal import reach
+from ctsim.detector.noise import Noise
 from ctsim.geometry import Geometry
-from ctsim.kernels import raytrace_reference
-from ctsim.noise import Noise
 from ctsim.phantoms.bodies import REACH
 from ctsim.phantoms.scene import _shadow
 from ctsim.plan import make_plan
-from ctsim.project import Response, Tracer, path_lengths, transmit
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import simulate_views
 from ctsim.solids import CAPSULE, ELLIPSOID, Primitive, Solid
+from ctsim.tracer.kernels import raytrace_reference
+from ctsim.tracer.project import Response, Tracer, path_lengths, transmit
 from ctsim.types import Phantom, Scanner
 
 ORBIT = Geometry(

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 import torch
 
-from ctsim.detector import Detector
+from ctsim.beam.spectrum import Bowtie, Filter, Tube, heel_factor
+from ctsim.detector.noise import Noise
+from ctsim.detector.response import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
-from ctsim.noise import Noise
 from ctsim.plan import make_plan, present_materials
 from ctsim.reconstruct.fdk import fdk
 from ctsim.scatter import Scatter
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import compact, flat_image, scan_info, simulate_views, truth_volumes
 from ctsim.solids import FRUSTUM, Primitive, Solid
-from ctsim.spectrum import Bowtie, Filter, Tube, heel_factor
 from ctsim.types import Phantom, Scanner
 
 GEOMETRY = Geometry(

@@ -6,6 +6,8 @@ from typing import get_args
 import numpy as np
 import pytest
 
+from ctsim.beam.spectrum import Tube
+from ctsim.beam.spot import FocalSpot, OffFocal
 from ctsim.benchmarks import cli, make_dataset
 from ctsim.benchmarks.engine import host
 from ctsim.benchmarks.engine.record import Record, latest
@@ -15,15 +17,13 @@ from ctsim.benchmarks.studies.skipping import simulator as skipping_cases
 from ctsim.benchmarks.studies.skipping import study as skipping
 from ctsim.benchmarks.studies.skipping.simulator import Bench, Pair, image_difference, largest
 from ctsim.benchmarks.studies.skipping.study import Skip
-from ctsim.bricks import MIXED
-from ctsim.detector import Detector
-from ctsim.panel import Blur, Lag
+from ctsim.detector.panel import Blur, Lag
+from ctsim.detector.response import Detector
 from ctsim.phantoms.scene import build
-from ctsim.project import Tracer, transmit
 from ctsim.scatter import Scatter, open_fraction
 from ctsim.simulate import _Simulator
-from ctsim.spectrum import Tube
-from ctsim.spot import FocalSpot, OffFocal
+from ctsim.tracer.bricks import MIXED
+from ctsim.tracer.project import Tracer, transmit
 
 pytestmark = pytest.mark.slow
 
@@ -244,7 +244,7 @@ def test_an_effect_that_is_off_runs_none_of_its_code(tmp_path, monkeypatch, name
 
     monkeypatch.setattr("ctsim.simulate.scatter_series", never)
     monkeypatch.setattr("ctsim.simulate.Panel", never)
-    monkeypatch.setattr("ctsim.spot.SubSources.geometry", never)
+    monkeypatch.setattr("ctsim.beam.spot.SubSources.geometry", never)
     if name in ("focal spot", "off-focal", "detector blur", "lag", "scatter 3", "anti-scatter grid"):
         with pytest.raises(RuntimeError, match="left out"):
             next(given.views())

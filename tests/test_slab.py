@@ -9,10 +9,10 @@ import xraylib as xrl
 from scipy.integrate import quad
 from scipy.special import expn
 
+from ctsim.detector.kernels import slab_cpu, slab_reference
+from ctsim.detector.slab import Slab, absorbed
 from ctsim.errors import InputError
 from ctsim.materials import attenuation, compton, k_shell, k_vacancies, material, photoelectric
-from ctsim.montecarlo.kernels import slab_cpu, slab_reference
-from ctsim.montecarlo.slab import Slab, absorbed
 
 SIGMAS = 4.0
 TABLE = 2e-4  # attenuations are linear between energies 0.5 % from each other: E^-3 is wrong by 4e-5, edges by more

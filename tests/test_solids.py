@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctsim.errors import InputError
-from ctsim.kernels import solids_cpu, solids_reference
 from ctsim.solids import BOX, CAPSULE, ELLIPSOID, FRUSTUM, TORUS, Primitive, Solid, pack
+from ctsim.tracer.kernels import solids_cpu, solids_reference
 
 KINDS = {
     "sphere": (ELLIPSOID, (2.0, 2.0, 2.0)),

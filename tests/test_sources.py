@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from ctsim.dataset.sources import NOT_OF_DATA, TABLES, TEXT, hash_of, source_hash
 from ctsim.errors import InputError
-from ctsim.sources import NOT_OF_DATA, TABLES, TEXT, hash_of, source_hash
 
 ROOT = Path(__file__).parents[1]
-FOR_PEOPLE = {"data/NOTICE.txt"}
+FOR_PEOPLE = {"beam/NOTICE.txt"}
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def test_methods_commands_and_reports_are_not_hashed(copy):
     assert hash_of(copy) == source_hash()
 
 
-@pytest.mark.parametrize("changed", ["noise.py", "kernels/raytrace_cpu.py", "phantoms/bodies.py"])
+@pytest.mark.parametrize("changed", ["detector/noise.py", "tracer/kernels/raytrace_cpu.py", "phantoms/bodies.py"])
 def test_a_changed_a_new_and_a_renamed_source_are_other_code(copy, changed):
     path = copy / changed
     before, text = hash_of(copy), path.read_text(encoding="utf-8")
@@ -53,7 +53,7 @@ def test_a_changed_a_new_and_a_renamed_source_are_other_code(copy, changed):
 
 
 def test_a_changed_table_is_other_code(copy):
-    path = copy / "data" / "tungsten_spectra.npz"
+    path = copy / "beam" / "tungsten_spectra.npz"
     data = bytearray(path.read_bytes())
     data[-1] ^= 1
     path.write_bytes(data)

@@ -6,9 +6,9 @@ import msgspec
 import numpy as np
 import pytest
 
-import ctsim.spectrum
+import ctsim.beam.spectrum
+from ctsim.beam.spectrum import Bowtie, Filter, Spectrum, Tube, bowtie_thickness, heel_factor, spectrum
 from ctsim.errors import InputError
-from ctsim.spectrum import Bowtie, Filter, Spectrum, Tube, bowtie_thickness, heel_factor, spectrum
 
 
 def tube(kvp: float, metal: str, thickness: float, **rest) -> Tube:
@@ -123,7 +123,7 @@ def test_what_cannot_be_is_refused() -> None:
 
 
 def test_missing_spekpy_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ctsim.spectrum.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(ctsim.beam.spectrum.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"ctsim\[spekpy\]"):
         spectrum(Tube(kvp=77.0, model="spekpy"))
 
@@ -143,6 +143,6 @@ def test_bowtie_thickens_to_its_edge() -> None:
 
 
 def test_table_is_small_and_carries_its_licence() -> None:
-    data = Path(ctsim.spectrum.__file__).with_name("data")
+    data = Path(ctsim.beam.spectrum.__file__).parent
     assert (data / "tungsten_spectra.npz").stat().st_size < 150_000
     assert "Copyright (c) 2019 Robert Bujila and Gavin Poludniowski" in (data / "NOTICE.txt").read_text()

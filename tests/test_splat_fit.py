@@ -14,6 +14,7 @@ from ctsim.benchmarks.methods import find
 from ctsim.benchmarks.scores.metrics import psnr3d
 from ctsim.benchmarks.scores.protocol import tissue_score, truth_of
 from ctsim.benchmarks.studies.methods.attempt import warm_up
+from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
@@ -27,7 +28,6 @@ from ctsim.reconstruct.splat.level import Data, carve, coarser, refined, weighte
 from ctsim.reconstruct.splat.ordered import Fit, bit_reversed, step_length
 from ctsim.reconstruct.splat.response import evaluate, make_response
 from ctsim.reconstruct.watch import listen
-from ctsim.store import list_scans, open_scan
 from ctsim.types import Status
 
 GEOMETRY = Geometry(

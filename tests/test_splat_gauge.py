@@ -5,12 +5,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from ctsim.detector import Detector
-from ctsim.detector import response as deposit
+from ctsim.beam.spectrum import Filter, Tube
+from ctsim.beam.spectrum import spectrum as tube_spectrum
+from ctsim.detector.response import Detector
+from ctsim.detector.response import response as deposit
 from ctsim.materials import attenuation
 from ctsim.reconstruct.splat.published_settings import Settings
-from ctsim.spectrum import Filter, Tube
-from ctsim.spectrum import spectrum as tube_spectrum
 
 CENTRE = 50.0  # keV, of 10 … 90
 LONGEST = {"water": 60.0, "cortical_bone": 60.0, "Fe": 20.0}  # mm

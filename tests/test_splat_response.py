@@ -9,10 +9,11 @@ import numba
 import numpy as np
 import pytest
 
-from ctsim.detector import Detector
+from ctsim.beam.quadrature import full_rule
+from ctsim.beam.spectrum import Filter, Tube, spectrum
+from ctsim.detector.response import Detector
 from ctsim.errors import InputError
 from ctsim.materials import attenuation
-from ctsim.quadrature import full_rule
 from ctsim.reconstruct.splat.kernels import response_reference as reference
 from ctsim.reconstruct.splat.response import (
     SCINTILLATOR,
@@ -25,7 +26,6 @@ from ctsim.reconstruct.splat.response import (
     theta_gradient,
     theta_sums,
 )
-from ctsim.spectrum import Filter, Tube, spectrum
 
 E_MAX = 90.0
 NAMES = get_args(Name)

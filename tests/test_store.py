@@ -12,13 +12,13 @@ import tifffile
 import torch
 from small_scan import GEOMETRY, STACKS, one_view, volume, write
 
-from ctsim import store
 from ctsim.benchmarks import cli
+from ctsim.dataset import store
+from ctsim.dataset.manifest import INDEX, MANIFEST, IndexLine, read_index
+from ctsim.dataset.store import list_scans, open_scan, verify
+from ctsim.dataset.tiffstack import create_stack, map_array, write_all
+from ctsim.dataset.writer import SceneWriter
 from ctsim.errors import InputError
-from ctsim.manifest import INDEX, MANIFEST, IndexLine, read_index
-from ctsim.store import list_scans, open_scan, verify
-from ctsim.tiffstack import create_stack, map_array, write_all
-from ctsim.writer import SceneWriter
 
 
 def test_a_stored_scan_opens_as_it_was_written(tmp_path):

@@ -13,6 +13,8 @@ from stress_ends import ENDS, Ends, Threads, catalogue
 
 from ctsim import plan
 from ctsim.baselines.known_spectrum import Beam
+from ctsim.beam.quadrature import gauss_rule
+from ctsim.beam.spectrum import Tube
 from ctsim.benchmarks.engine import study as engine
 from ctsim.benchmarks.methods import TABLE, find
 from ctsim.benchmarks.oracles import upright_chord
@@ -20,10 +22,9 @@ from ctsim.benchmarks.studies.stress import kernels, study, worker
 from ctsim.benchmarks.studies.stress import methods as stress_methods
 from ctsim.benchmarks.studies.stress.scans import Findings, carry_out, example, few_views, lengths
 from ctsim.benchmarks.studies.stress.suite import Machine, Rod, Scene, load
+from ctsim.detector.noise import Noise
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.noise import Noise
-from ctsim.quadrature import gauss_rule
 from ctsim.reconstruct import log
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reconstruct.splat import course, level, ordered
@@ -33,7 +34,6 @@ from ctsim.reconstruct.splat.loss import l1_ssim
 from ctsim.reconstruct.splat.objective import Objective
 from ctsim.reconstruct.splat.project import Projector
 from ctsim.reconstruct.splat.published_settings import Settings
-from ctsim.spectrum import Tube
 
 SMALLEST = 12
 SUBJECTS = [study.label(*method) for method in study.subjects()]

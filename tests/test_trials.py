@@ -8,11 +8,11 @@ import os
 import numpy as np
 import pytest
 
-from ctsim.detector import Detector, response
+from ctsim.beam.quadrature import P_MAX, energy_rule
+from ctsim.beam.spectrum import Filter, Tube, spectrum
+from ctsim.beam.trials import Beam, make_trials
+from ctsim.detector.response import Detector, response
 from ctsim.materials import attenuation
-from ctsim.quadrature import P_MAX, energy_rule
-from ctsim.spectrum import Filter, Tube, spectrum
-from ctsim.trials import Beam, make_trials
 
 TOLERANCE = 1e-4
 KINDS = ("gos", "csi", "ideal", "counting")

@@ -7,11 +7,11 @@ from typing import get_args
 import msgspec
 import pytest
 
+from ctsim.beam.quadrature import gauss_rule
 from ctsim.benchmarks.engine.record import latest
 from ctsim.benchmarks.studies.validate import cases, closed, figure, paper, published, recovered, scatter, transport
 from ctsim.benchmarks.studies.validate import study as validate
 from ctsim.benchmarks.studies.validate.finding import Check, Curves, check
-from ctsim.quadrature import gauss_rule
 
 CASES = get_args(validate.Case)
 

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from ctsim import voxelise
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.kernels import solids_reference, voxelise_cpu, voxelise_reference
 from ctsim.solids import BOX, CAPSULE, ELLIPSOID, FRUSTUM, MATERIAL, MATRIX, PARAMS, TORUS, Primitive, Solid, pack
+from ctsim.tracer import voxelise
+from ctsim.tracer.kernels import solids_reference, voxelise_cpu, voxelise_reference
 from ctsim.types import Phantom
 
 MATERIALS = ("air", "water", "Fe", "Ti")

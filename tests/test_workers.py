@@ -164,7 +164,7 @@ def cluster():
 
 def same_data(one: Path, other: Path) -> bool:
     """Compare names, recipes and checksums, and the order in which scenes are listed."""
-    from ctsim.manifest import verify
+    from ctsim.dataset.manifest import verify
 
     return verify(other) == [] and (one / "index.jsonl").read_bytes() == (other / "index.jsonl").read_bytes()
 
@@ -234,7 +234,7 @@ def test_a_scene_that_fails_on_a_cluster_ends_the_command_with_a_traceback(clust
 
 def break_scenes(broken: bool = True) -> None:
     """Let no scene be written in this process, or again."""
-    from ctsim.writer import SceneWriter
+    from ctsim.dataset.writer import SceneWriter
 
     def put(self, view, arrays):
         put(self, view, arrays)

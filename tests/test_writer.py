@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from small_scan import STACKS, content, one_view, write
 
-from ctsim import durable, folder
 from ctsim.benchmarks.make_dataset import main
+from ctsim.dataset import durable, folder
+from ctsim.dataset.manifest import INDEX, mend_index, read_index, read_manifest
+from ctsim.dataset.store import list_scans, open_scan, verify
+from ctsim.dataset.writer import SceneWriter, is_complete
 from ctsim.errors import InputError
-from ctsim.manifest import INDEX, mend_index, read_index, read_manifest
-from ctsim.store import list_scans, open_scan, verify
-from ctsim.writer import SceneWriter, is_complete
 
 
 @pytest.fixture(scope="module")

@@ -18,9 +18,9 @@ from typing import Annotated, Any, Generic, TypeVar
 import msgspec
 
 from ctsim.benchmarks.engine.host import Host
-from ctsim.durable import append_synced, cut_torn, write_synced
+from ctsim.dataset.durable import append_synced, cut_torn, write_synced
+from ctsim.dataset.locks import locked
 from ctsim.errors import InputError
-from ctsim.locks import locked
 
 log = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from ctsim.benchmarks.engine.process import Jobs, Lost, Process, Stopped, check_
 from ctsim.benchmarks.engine.record import Found, Record, Store, Task, by_row, done, latest, provenance
 from ctsim.benchmarks.engine.table import Table
 from ctsim.benchmarks.engine.terminal import Bar
-from ctsim.durable import write_synced
+from ctsim.dataset.durable import write_synced
 from ctsim.errors import InputError
 from ctsim.human import human_time
 

@@ -15,15 +15,25 @@ from ctsim.benchmarks.engine.process import TICK, Jobs, Lost
 from ctsim.benchmarks.engine.terminal import Bar, announced
 from ctsim.benchmarks.make_dataset import Flags
 from ctsim.benchmarks.suites import load, select
+from ctsim.dataset.folder import (
+    finished,
+    is_complete,
+    listing,
+    other_code,
+    partial_of,
+    recover,
+    remarks,
+    tidy,
+    unfinished,
+)
+from ctsim.dataset.locks import PATIENCE, Busy
+from ctsim.dataset.manifest import Manifest, mend_index, read_index, verify
+from ctsim.dataset.sources import source_hash
 from ctsim.errors import InputError
-from ctsim.folder import finished, is_complete, listing, other_code, partial_of, recover, remarks, tidy, unfinished
 from ctsim.human import human_bytes, human_time
-from ctsim.locks import PATIENCE, Busy
-from ctsim.manifest import Manifest, mend_index, read_index, verify
 from ctsim.phantoms.dataset import make_scene, plan_scene
 from ctsim.phantoms.scene import Scene, scene_id
 from ctsim.plan import Plan
-from ctsim.sources import source_hash
 
 T = TypeVar("T")
 _SPARE = 64 * 2**20  # bytes left free for the file system's own needs

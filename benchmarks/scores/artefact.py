@@ -17,9 +17,9 @@ from scipy import ndimage
 from ctsim.benchmarks.scores.metrics import Mask, box_around
 from ctsim.benchmarks.scores.protocol import Truth
 from ctsim.benchmarks.scores.score import COLUMNS, NO_TWIN, Score
+from ctsim.dataset.store import StoredScan
 from ctsim.errors import InputError
 from ctsim.materials import attenuation
-from ctsim.store import StoredScan
 
 NEAR = 5.0
 """Tissue up to this distance from the metal (mm, between voxel centres) is near."""

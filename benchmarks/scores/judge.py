@@ -11,8 +11,8 @@ from ctsim.benchmarks.scores.metrics import METAL
 from ctsim.benchmarks.scores.projection import HeldOut, held_out, projection_score, with_floor
 from ctsim.benchmarks.scores.protocol import Truth, evaluate, truth_of
 from ctsim.benchmarks.scores.score import NO_TWIN, Score
+from ctsim.dataset.store import StoredScan
 from ctsim.notes import NOT_ON_GRID
-from ctsim.store import StoredScan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ctsim import settings
+from ctsim.beam.quadrature import effective_weights
 from ctsim.benchmarks.scores.protocol import Truth
 from ctsim.benchmarks.scores.score import AS_RETURNED, Score
+from ctsim.dataset.store import StoredScan
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.phantoms.scene import build, load_suite, stream_id
 from ctsim.plan import make_plan
-from ctsim.quadrature import effective_weights
 from ctsim.reconstruct.projector import forward_columns
 from ctsim.simulate import REFERENCE_KEV, simulate_views
-from ctsim.store import StoredScan
 
 N_VIEWS = 12
 MARGIN = 2

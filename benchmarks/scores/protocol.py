@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from ctsim.benchmarks.scores import metrics
 from ctsim.benchmarks.scores.metrics import Mask
 from ctsim.benchmarks.scores.score import AS_RETURNED, AT_50KEV, Score
+from ctsim.dataset.store import StoredScan as Stored
 from ctsim.errors import InputError
-from ctsim.store import StoredScan as Stored
 
 METAL_MARGIN = 2
 BODY_MARGIN = 4

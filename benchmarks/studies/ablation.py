@@ -25,10 +25,10 @@ from ctsim.benchmarks.studies.methods.study import Flags as RunFlags
 from ctsim.benchmarks.studies.methods.study import Methods
 from ctsim.benchmarks.studies.paper.layout import Planned, load
 from ctsim.benchmarks.studies.paper.tables import ABLATION, text_of
-from ctsim.durable import write_synced
+from ctsim.dataset.durable import write_synced
+from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
 from ctsim.human import human_time
-from ctsim.store import list_scans, open_scan
 
 NAME = "ablation.md"
 # CPU seconds per step of each method on this suite, which ends with 65 536 splats. They include the warm-up, which

@@ -19,8 +19,8 @@ from ctsim.benchmarks.studies.methods import records, study, tables
 from ctsim.benchmarks.studies.methods.plan import Costs
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord
 from ctsim.benchmarks.suites import identity, load, select
+from ctsim.dataset.folder import is_complete
 from ctsim.errors import InputError
-from ctsim.folder import is_complete
 from ctsim.human import human_time
 
 METHODS = ("fdk", "limar", "nmar", "os-sart")

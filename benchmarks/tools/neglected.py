@@ -15,9 +15,10 @@ import numpy as np
 import xraylib as xrl
 from numpy.typing import ArrayLike, NDArray
 
+from ctsim.beam.spectrum import Filter, Tube, spectrum
 from ctsim.benchmarks.cli import guarded
 from ctsim.benchmarks.engine.table import simple
-from ctsim.detector import Detector, response, swank
+from ctsim.detector.response import Detector, response, swank
 from ctsim.errors import InputError
 from ctsim.materials import attenuation, k_shell, k_vacancies, material
 from ctsim.montecarlo.tables import HC, Interactions
@@ -25,7 +26,6 @@ from ctsim.montecarlo.transport import Source, scatter_image
 from ctsim.montecarlo.world import World, make_blocks
 from ctsim.phantoms.scanners import preset
 from ctsim.solids import ELLIPSOID, Primitive, Solid
-from ctsim.spectrum import Filter, Tube, spectrum
 from ctsim.types import Phantom
 
 CORE = preset("ideal", 240, (224, 224), (128, 128, 128), 60.0)  # the scanner of the suite `core`

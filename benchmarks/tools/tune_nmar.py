@@ -26,9 +26,9 @@ from ctsim.baselines.prior import Choice, better, choose_prior
 from ctsim.benchmarks.cli import guarded
 from ctsim.benchmarks.scores.artefact import water_attenuation
 from ctsim.benchmarks.scores.protocol import truth_of
+from ctsim.dataset.store import StoredScan, list_scans, open_scan
 from ctsim.errors import InputError
 from ctsim.reconstruct.fdk import reconstruct as fdk
-from ctsim.store import StoredScan, list_scans, open_scan
 
 DILATIONS = (0, None, 1)
 PRIORS = ("fdk", "limar")

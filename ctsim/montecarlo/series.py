@@ -37,7 +37,7 @@ class ScatterSeries:
     """Scatter as a share of the open field, for every view and pixel.
 
     `coefficients` [2, t, v, u] are those of waves over views, rows and columns, for the mean signal and the mean
-    squared one (as m1 and m2 in `ctsim.quadrature`); `error` is the RMS error of the mean signal over its mean;
+    squared one (as m1 and m2 in `ctsim.beam.quadrature`); `error` is the RMS error of the mean signal over its mean;
     `histories` is how many photons were followed.
     """
 

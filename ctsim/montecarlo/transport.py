@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.detector import Detector, response
+from ctsim.beam.spectrum import Spectrum
+from ctsim.detector.response import Detector, response
 from ctsim.errors import InputError
 from ctsim.materials import E_MIN, attenuation
 from ctsim.montecarlo.kernels import transport_cpu
@@ -14,7 +15,6 @@ from ctsim.montecarlo.kernels.transport_cpu import CHUNKS
 from ctsim.montecarlo.tables import STEP
 from ctsim.montecarlo.world import World
 from ctsim.rng import stream_key
-from ctsim.spectrum import Spectrum
 
 PLANES = SQUARED + 1
 _NONE = np.zeros((0, 0), np.float32)
@@ -56,7 +56,7 @@ class Image:
 
     `primary`, `single` and `multiple` are photons that were scattered not at all, once and more often; `error` is the
     standard error of single + multiple. `squared` is the mean squared signal of scattered photons over the squared mean
-    of the open field, as m2 in `ctsim.quadrature`.
+    of the open field, as m2 in `ctsim.beam.quadrature`.
     """
 
     primary: NDArray[np.float64]

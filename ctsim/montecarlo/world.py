@@ -5,10 +5,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.bricks import Bricks, make_bricks
-from ctsim.kernels.bricks_cpu import SIDE
 from ctsim.montecarlo.tables import Interactions
 from ctsim.solids import BOUND, pack
+from ctsim.tracer.bricks import Bricks, make_bricks
+from ctsim.tracer.kernels.bricks_cpu import SIDE
 from ctsim.types import Phantom
 
 LEAST_BRICKS, MOST_BLOCKS = 4, 32

@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.arrayfile import read_arrays
-from ctsim.durable import sweep, write_synced
+from ctsim.dataset.arrayfile import read_arrays
+from ctsim.dataset.durable import sweep, write_synced
 from ctsim.errors import InputError
 from ctsim.types import Scan
 

@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit
 
-from ctsim.detector import Detector
-from ctsim.detector import response as deposit
+from ctsim.beam.quadrature import P_MAX, gauss_rule
+from ctsim.beam.spectrum import Filter, Spectrum, Tube
+from ctsim.beam.spectrum import spectrum as tube_spectrum
+from ctsim.detector.response import Detector
+from ctsim.detector.response import response as deposit
 from ctsim.errors import InputError
 from ctsim.materials import attenuation
-from ctsim.quadrature import P_MAX, gauss_rule
 from ctsim.reconstruct.splat.kernels import response_cpu, response_reference
-from ctsim.spectrum import Filter, Spectrum, Tube
-from ctsim.spectrum import spectrum as tube_spectrum
 
 Name = Literal["paper", "hinge", "tube", "known", "mono", "sinh", "gmm", "free"]
 Basis = Literal["paper", "klein-nishina"]

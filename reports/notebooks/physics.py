@@ -24,19 +24,19 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from ctsim.beam.quadrature import effective_weights, full_rule
+from ctsim.dataset.store import list_scans, open_scan
+from ctsim.detector.noise import detect
 from ctsim.materials import attenuation
-from ctsim.noise import detect
 from ctsim.phantoms.scene import build, load_suite, stream_id
 from ctsim.plan import make_plan
-from ctsim.project import Response, Tracer, path_lengths, transmit
-from ctsim.quadrature import effective_weights, full_rule
 from ctsim.reconstruct.fdk import reconstruct
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reports import show
 from ctsim.reports.figures import COLOURS
 from ctsim.rng import stream_key
 from ctsim.simulate import compact
-from ctsim.store import list_scans, open_scan
+from ctsim.tracer.project import Response, Tracer, path_lengths, transmit
 
 DATA = Path(os.environ.get("CTSIM_DATA", "data"))
 stored = open_scan(list_scans(DATA)[0])

@@ -26,20 +26,20 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
+from ctsim.beam.quadrature import energy_rule
+from ctsim.beam.spectrum import Tube, spectrum
 from ctsim.benchmarks.engine.record import latest
 from ctsim.benchmarks.engine.table import pictured
 from ctsim.benchmarks.studies.stress.study import Flags, Stress, by_case
-from ctsim.detector import Detector
+from ctsim.dataset.store import list_scans, open_scan
+from ctsim.detector.response import Detector
 from ctsim.geometry import Geometry
-from ctsim.kernels import joseph_reference
 from ctsim.materials import attenuation
-from ctsim.quadrature import energy_rule
 from ctsim.reconstruct.fdk import reconstruct
+from ctsim.reconstruct.kernels import joseph_reference
 from ctsim.reconstruct.projector import adjoint, forward
 from ctsim.reports import show
 from ctsim.reports.figures import COLOURS
-from ctsim.spectrum import Tube, spectrum
-from ctsim.store import list_scans, open_scan
 
 DATA, RESULTS = (Path(os.environ.get(f"CTSIM_{name.upper()}", name)) for name in ("data", "results"))
 

@@ -27,9 +27,9 @@ from ctsim.benchmarks.studies.methods import records
 from ctsim.benchmarks.studies.methods.attempt import attempt, scan_for
 from ctsim.benchmarks.studies.methods.records import METAL
 from ctsim.benchmarks.studies.methods.volumes import identity_of, own_at_50kev, read_volume
+from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
 from ctsim.human import human_choice
-from ctsim.store import list_scans, open_scan
 
 Volume = NDArray[Any]
 Window = Literal["gauss", "gauss_zero", "r2", "uniform7"]

@@ -28,9 +28,9 @@ from ctsim.benchmarks.engine.host import measured
 from ctsim.benchmarks.methods import Method
 from ctsim.benchmarks.studies.methods.records import METAL, Cost
 from ctsim.benchmarks.studies.methods.volumes import Intermediates, attached, recordable
+from ctsim.dataset.store import StoredScan
 from ctsim.errors import InputError
 from ctsim.simulate import REFERENCE_KEV
-from ctsim.store import StoredScan
 from ctsim.types import Scan, Status, Volume
 
 log = logging.getLogger(__name__)

@@ -33,10 +33,10 @@ from ctsim.benchmarks.studies.methods.volumes import (
     map_volume,
     read_intermediates,
 )
-from ctsim.durable import replacing, sync
+from ctsim.dataset.durable import replacing, sync
+from ctsim.dataset.store import StoredScan
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reconstruct.projector import forward_columns
-from ctsim.store import StoredScan
 
 PLANES = ((0, "z"), (1, "y"))
 TOP, ERROR = 2.5, 1.0

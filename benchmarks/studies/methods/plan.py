@@ -14,11 +14,11 @@ from ctsim.benchmarks.methods import Method
 from ctsim.benchmarks.scores.score import lacks_twin
 from ctsim.benchmarks.studies.methods.records import METAL, TWIN, Run, RunRecord, RunTask, rank, task_of
 from ctsim.benchmarks.studies.methods.volumes import is_kept
+from ctsim.dataset.store import StoredScan
 from ctsim.errors import InputError
 from ctsim.phantoms.suites import read_toml
-from ctsim.store import StoredScan
 
-OPEN = "ctsim.store:open_scan"
+OPEN = "ctsim.dataset.store:open_scan"
 """The function that opens a scan's folder."""
 
 

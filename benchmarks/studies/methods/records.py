@@ -14,7 +14,7 @@ from ctsim.benchmarks.engine.record import Found, Record, Store, Task
 from ctsim.benchmarks.engine.record import latest as latest_rows
 from ctsim.benchmarks.methods import TABLE
 from ctsim.benchmarks.scores.score import VERSION, Score
-from ctsim.folder import mixture
+from ctsim.dataset.folder import mixture
 
 STUDY, FILE, WHAT = "methods", "records", "a record of run-benchmark"
 NAME = f"{FILE}.jsonl"

@@ -18,13 +18,13 @@ from ctsim.benchmarks.engine.record import Task
 from ctsim.benchmarks.engine.terminal import announced
 from ctsim.benchmarks.studies.methods import overview, plan, tables
 from ctsim.benchmarks.studies.methods.records import FILE, METAL, Result, RunRecord, RunTask
+from ctsim.dataset.folder import mixture, other_code
+from ctsim.dataset.manifest import read_index
+from ctsim.dataset.sources import source_hash
+from ctsim.dataset.store import StoredScan, list_scans, open_scan
 from ctsim.errors import InputError
-from ctsim.folder import mixture, other_code
 from ctsim.human import human_choice
-from ctsim.manifest import read_index
 from ctsim.reconstruct.watch import Progress, listen
-from ctsim.sources import source_hash
-from ctsim.store import StoredScan, list_scans, open_scan
 
 log = logging.getLogger(__name__)
 RUN = "ctsim.benchmarks.studies.methods.run"  # by name: it loads torch

@@ -30,7 +30,7 @@ from ctsim.benchmarks.scores.score import (
     row_of,
 )
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest, outdated, remarks
-from ctsim.durable import write_synced
+from ctsim.dataset.durable import write_synced
 from ctsim.errors import InputError
 
 if TYPE_CHECKING:

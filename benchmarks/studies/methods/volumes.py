@@ -17,12 +17,12 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from ctsim.arrayfile import read_arrays
 from ctsim.benchmarks.studies.methods.records import METAL, RunTask
-from ctsim.durable import replacing
+from ctsim.dataset.arrayfile import read_arrays
+from ctsim.dataset.durable import replacing
+from ctsim.dataset.tiffstack import write_all
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.tiffstack import write_all
 
 # raised by tifffile (TiffFileError is a ValueError) and JSON for files that are cut short or changed
 DAMAGED = (ValueError, LookupError, AttributeError, TypeError, RecursionError, struct.error)

@@ -28,14 +28,14 @@ from ctsim.benchmarks.studies.methods.attempt import describe, run_here, scan_fo
 from ctsim.benchmarks.studies.pareto import Flags, suite
 from ctsim.benchmarks.studies.pareto.finding import Mark, TimedRun
 from ctsim.benchmarks.studies.pareto.suite import EXACT, SCATTER, Choice, Effort
+from ctsim.dataset.store import StoredScan, open_scan
+from ctsim.detector.noise import Noise
 from ctsim.montecarlo.series import scatter_series
 from ctsim.montecarlo.transport import Source
-from ctsim.noise import Noise
 from ctsim.plan import Plan, make_plan
 from ctsim.reconstruct.watch import watch
 from ctsim.scatter import Scatter
 from ctsim.simulate import simulate_views
-from ctsim.store import StoredScan, open_scan
 from ctsim.types import Phantom, Scanner, Status
 
 CHECKED = 2  # views that are compared with the reference

@@ -28,7 +28,7 @@ from ctsim.benchmarks.studies.pareto.finding import (
     recommended,
     rivals,
 )
-from ctsim.durable import replacing
+from ctsim.dataset.durable import replacing
 
 HEADS: dict[Part, dict[str, str]] = {
     "simulator": {"rms": "relative RMS of P", "worst": "worst |ΔP|", "off_edges": "worst |ΔP| off the edges"},

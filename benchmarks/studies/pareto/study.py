@@ -23,10 +23,10 @@ from ctsim.benchmarks.studies.methods import run
 from ctsim.benchmarks.studies.pareto import Flags, results, suite
 from ctsim.benchmarks.studies.pareto.finding import Part, Timed, TimedRun, points
 from ctsim.benchmarks.studies.pareto.suite import Choice, Effort
+from ctsim.dataset.folder import is_complete
+from ctsim.dataset.manifest import read_manifest
 from ctsim.errors import InputError
-from ctsim.folder import is_complete
 from ctsim.human import human_choice
-from ctsim.manifest import read_manifest
 from ctsim.phantoms.dataset import make_scene
 from ctsim.phantoms.scene import Scene, scene_id
 

@@ -32,11 +32,11 @@ from ctsim.phantoms.bodies import Validation
 from ctsim.phantoms.body_lung import Lung
 from ctsim.phantoms.recipes import build_recipe
 from ctsim.plan import present_materials
-from ctsim.project import Tracer, path_lengths
 from ctsim.reconstruct.fdk import fdk as ours_fdk
 from ctsim.simulate import compact
+from ctsim.tracer.project import Tracer, path_lengths
+from ctsim.tracer.voxelise import attenuation_volume
 from ctsim.types import Phantom
-from ctsim.voxelise import attenuation_volume
 
 KEV = np.array([50.0])
 

@@ -1,8 +1,8 @@
 """Other libraries behind a few functions, as `run-benchmark peers` measures them; each is loaded when it is set up.
 
 RTK (the PyPI package itk-rtk): Joseph's forward projector and FDK. Volumes and projections are ours, [z, y, x] and
-[view, v, u] in mm, permuted by `ctsim.interop`. What RTK needs (its axis order, its pose matrices) is prepared when a
-`Rtk` is made, before the clock starts. Rit et al., J. Phys. Conf. Ser. 489, 2014,
+[view, v, u] in mm, permuted by `ctsim.dataset.interop`. What RTK needs (its axis order, its pose matrices) is prepared
+when a `Rtk` is made, before the clock starts. Rit et al., J. Phys. Conf. Ser. 489, 2014,
 doi:10.1088/1742-6596/489/1/012079.
 
 XCIST (the PyPI package gecatsim): polychromatic P of voxel volumes. A view goes through XCIST's own stages (gantry,
@@ -27,9 +27,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.dataset.interop import Library, angles_to, volume_from, volume_to
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.interop import Library, angles_to, volume_from, volume_to
 
 AXES = (1, 0, 2)  # RTK's x, y, z are our y, z, x
 _MODELS = ("detector", "source", "gantry", "ray_angles", "filters", "flux", "phantom")

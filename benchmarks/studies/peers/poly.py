@@ -10,6 +10,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.beam.quadrature import EnergyRule, full_rule
+from ctsim.beam.spectrum import spectrum
 from ctsim.benchmarks.engine import host
 from ctsim.benchmarks.engine.process import Process, Stopped
 from ctsim.benchmarks.oracles import measured_pixel, poly_scene, relative, scanner_of, voxelised
@@ -17,11 +19,9 @@ from ctsim.benchmarks.studies.peers.finding import OURS, RTK, XCIST, Measurement
 from ctsim.benchmarks.studies.peers.libraries import Rtk, Xcist
 from ctsim.materials import attenuation
 from ctsim.plan import make_plan
-from ctsim.project import Response, Tracer, transmit
-from ctsim.quadrature import EnergyRule, full_rule
 from ctsim.settings import Simulation, Truth
-from ctsim.spectrum import spectrum
-from ctsim.voxelise import fractions
+from ctsim.tracer.project import Response, Tracer, transmit
+from ctsim.tracer.voxelise import fractions
 
 BINS = 80
 CHECKED = 2  # views that the oracle measures

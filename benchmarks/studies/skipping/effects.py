@@ -9,10 +9,10 @@ from typing import Any
 
 import msgspec
 
+from ctsim.beam.spot import FocalSpot, OffFocal
 from ctsim.benchmarks.studies.skipping.simulator import P_IMAGES, Bench, Cases, Pair, image_difference
-from ctsim.panel import Blur, Lag
+from ctsim.detector.panel import Blur, Lag
 from ctsim.scatter import Scatter
-from ctsim.spot import FocalSpot, OffFocal
 
 NOTHING = 1e-9  # mm of a spot or of blur, share of lag: too little to change a bit
 COARSE = 0.05  # of the scatter, so that the photons of a pair take seconds

@@ -25,11 +25,11 @@ from ctsim.benchmarks.studies.methods.volumes import read_volume
 from ctsim.benchmarks.studies.skipping import effects, simulator
 from ctsim.benchmarks.studies.skipping.simulator import Bench, Cases, Pair, largest
 from ctsim.benchmarks.studies.skipping.study import Flags, Skip
+from ctsim.dataset.store import StoredScan, open_scan
 from ctsim.phantoms.scene import scene_to_toml
 from ctsim.reconstruct.fdk import fdk_stream
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.projector import forward_columns
-from ctsim.store import StoredScan, open_scan
 from ctsim.types import Scan
 
 HOW = "rows"

@@ -17,18 +17,18 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.beam.quadrature import full_rule
 from ctsim.benchmarks.engine.host import in_turns
 from ctsim.benchmarks.studies.skipping.study import CORE, Skip
 from ctsim.benchmarks.suites import load, select
-from ctsim.bricks import Bricks, make_bricks
 from ctsim.phantoms.bodies import Validation
 from ctsim.phantoms.scene import Scene, build, stream_id
 from ctsim.plan import Plan, make_plan
-from ctsim.project import EDGE_THRESHOLD, Response, Tracer, transmit
-from ctsim.quadrature import full_rule
 from ctsim.settings import Truth
-from ctsim.shadow import MOST_TIMES
 from ctsim.simulate import compact, simulate_views
+from ctsim.tracer.bricks import Bricks, make_bricks
+from ctsim.tracer.project import EDGE_THRESHOLD, Response, Tracer, transmit
+from ctsim.tracer.shadow import MOST_TIMES
 from ctsim.types import Phantom, Scanner
 
 LINES = Truth(noise_free=True)

@@ -13,16 +13,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.beam.quadrature import P_MAX
+from ctsim.beam.spectrum import Tube
 from ctsim.benchmarks.studies.stress import suite
 from ctsim.benchmarks.studies.stress.scans import FEW, Findings, Stacks, exact_p, few_views, lengths, simulated, usual
 from ctsim.benchmarks.studies.stress.suite import P_SURE, RODS, Scene, in_air
+from ctsim.detector.noise import Noise
 from ctsim.geometry import Geometry
-from ctsim.kernels import raytrace_cpu, raytrace_reference
 from ctsim.materials import attenuation
-from ctsim.noise import Noise
 from ctsim.plan import make_plan
-from ctsim.project import EDGE_THRESHOLD, STEP_THRESHOLD, Response, Tracer, work_order
-from ctsim.quadrature import P_MAX
 from ctsim.reconstruct.splat.densify import Schedule, densify
 from ctsim.reconstruct.splat.kernels import response_reference, splat_reference
 from ctsim.reconstruct.splat.model import Splats
@@ -30,10 +29,11 @@ from ctsim.reconstruct.splat.project import Projector
 from ctsim.reconstruct.splat.response import evaluate, make_response
 from ctsim.reconstruct.splat.volume import voxelise
 from ctsim.settings import Simulation, Truth
-from ctsim.shadow import everywhere, inflate
 from ctsim.simulate import REFERENCE_KEV, simulate_views
 from ctsim.solids import FRUSTUM, Primitive, Solid
-from ctsim.spectrum import Tube
+from ctsim.tracer.kernels import raytrace_cpu, raytrace_reference
+from ctsim.tracer.project import EDGE_THRESHOLD, STEP_THRESHOLD, Response, Tracer, work_order
+from ctsim.tracer.shadow import everywhere, inflate
 from ctsim.types import Phantom, Scanner
 
 CUTOFF = 6.0  # 2e-8 of a peak lies beyond it, so the choice of pixels within the cutoff does not matter

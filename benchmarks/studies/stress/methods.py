@@ -15,19 +15,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.beam.spectrum import TABLE_KVP
 from ctsim.benchmarks.methods import SPECTRUM, TABLE, Method, find
 from ctsim.benchmarks.studies.stress import scans
 from ctsim.benchmarks.studies.stress.scans import USUAL, Example, Findings, example
 from ctsim.benchmarks.studies.stress.suite import BOUNDS, GROUPS, NEAR, P_SURE, Machine, Scene, same_of
+from ctsim.detector.noise import Noise
 from ctsim.geometry import Geometry
-from ctsim.kernels.backproject_reference import backproject
-from ctsim.noise import Noise
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.filters import padded_length, ramp_kernel
+from ctsim.reconstruct.kernels.backproject_reference import backproject
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reconstruct.redundancy import ray_weights
 from ctsim.settings import Truth
-from ctsim.spectrum import TABLE_KVP
 from ctsim.types import Scan, Status, Volume
 
 

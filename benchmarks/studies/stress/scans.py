@@ -19,6 +19,8 @@ import torch
 from numpy.typing import NDArray
 
 from ctsim.baselines.morphology import dilate
+from ctsim.beam.quadrature import full_rule
+from ctsim.beam.spectrum import spectrum
 from ctsim.benchmarks.oracles import central_rays, relative, slab_span, upright_span
 from ctsim.benchmarks.studies.stress import suite
 from ctsim.benchmarks.studies.stress.suite import AnyChange, Machine, Scene, Twice
@@ -26,11 +28,9 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.plan import make_plan
-from ctsim.quadrature import full_rule
 from ctsim.reconstruct.redundancy import ray_weights
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import flat_image, simulate_views, truth_volumes
-from ctsim.spectrum import spectrum
 from ctsim.types import Phantom, Scan, Scanner
 
 FEW = 6  # views of simulator rows, unless the scene states a number

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from ctsim.beam.quadrature import P_MAX
 from ctsim.benchmarks.engine import host, study
 from ctsim.benchmarks.engine.record import Found, Record, Task, latest
 from ctsim.benchmarks.engine.table import Table, simple
@@ -19,7 +20,6 @@ from ctsim.benchmarks.studies.stress import Flags, suite
 from ctsim.benchmarks.studies.stress.suite import Scene, load
 from ctsim.errors import InputError
 from ctsim.human import human_choice
-from ctsim.quadrature import P_MAX
 
 SIMULATOR, SPLAT_KERNELS = "simulator", "splat kernels"  # subjects other than methods
 # of a row, short and full, for one idle core; derived from runs on a busy machine

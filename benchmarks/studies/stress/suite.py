@@ -13,17 +13,17 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
+from ctsim.beam.spectrum import Tube
 from ctsim.benchmarks.methods import TABLE
-from ctsim.detector import Detector
+from ctsim.detector.noise import Noise
+from ctsim.detector.response import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Count, Geometry, Pair, Triple
 from ctsim.materials import material
-from ctsim.noise import Noise
 from ctsim.phantoms.shapes import cylinder
 from ctsim.phantoms.suites import read_toml, scenes_of
 from ctsim.scatter import Scatter
 from ctsim.solids import Solid
-from ctsim.spectrum import Tube
 from ctsim.types import Phantom, Scanner
 
 FULL, SHORT = 24, 16  # voxels along a side

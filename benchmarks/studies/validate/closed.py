@@ -6,17 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim import rng
+from ctsim.beam.quadrature import P_MAX, EnergyRule, energy_rule, full_rule
+from ctsim.beam.spectrum import Filter, Tube, spectrum
 from ctsim.benchmarks import oracles
 from ctsim.benchmarks.studies.validate.finding import Check, check
-from ctsim.detector import Detector, response
+from ctsim.detector.noise import Noise, detect
+from ctsim.detector.response import Detector, response
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
-from ctsim.noise import Noise, detect
 from ctsim.phantoms.shapes import cylinder
-from ctsim.project import Tracer, path_lengths
-from ctsim.quadrature import P_MAX, EnergyRule, energy_rule, full_rule
 from ctsim.solids import BOX, ELLIPSOID, Primitive, Solid
-from ctsim.spectrum import Filter, Tube, spectrum
+from ctsim.tracer.project import Tracer, path_lengths
 from ctsim.types import Phantom
 
 TOLERANCE = 1e-4  # the default of simulation.tolerance

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from ctsim.benchmarks.engine.table import pictured
 from ctsim.benchmarks.studies.validate.finding import Check, Curves
-from ctsim.durable import replacing
+from ctsim.dataset.durable import replacing
 
 DPI = 110
 FARTHEST = 5.0  # tolerances; larger differences are drawn at the edge, with their number

@@ -15,14 +15,14 @@ from ctsim import rng
 from ctsim.benchmarks.studies.validate.finding import Check, Curves, check
 from ctsim.benchmarks.studies.validate.published import numbers
 from ctsim.benchmarks.studies.validate.scatter import source_of
+from ctsim.detector.noise import Noise, detect
 from ctsim.montecarlo.series import scatter_series
-from ctsim.noise import Noise, detect
 from ctsim.phantoms.scene import build, parse_suite
 from ctsim.plan import make_plan
-from ctsim.project import Response, Tracer, transmit
 from ctsim.scatter import constant_fraction
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import compact
+from ctsim.tracer.project import Response, Tracer, transmit
 
 Image = NDArray[np.float64]
 PHOTONS = 1e9

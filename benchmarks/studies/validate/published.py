@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim import materials
+from ctsim.beam.spectrum import Filter, Tube, spectrum
 from ctsim.benchmarks.studies.validate.finding import Check, Curves, check
-from ctsim.spectrum import Filter, Tube, spectrum
 
 DIGITS = 5e-4  # half a unit of the last of four digits, at most
 BINS = 0.9e-2  # SpekPy's HVL1 at 90 kVp and 0.5 mm Al: from 1.0157 (bins of 0.5 keV) to 1.0067 mm (0.05 keV)

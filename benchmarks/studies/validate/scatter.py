@@ -7,15 +7,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.beam.spectrum import spectrum
 from ctsim.benchmarks.studies.validate.finding import Check, Curves, check
 from ctsim.benchmarks.suites import load, select
 from ctsim.montecarlo.series import ScatterSeries, scatter_series
 from ctsim.montecarlo.transport import Source, scatter_image
 from ctsim.montecarlo.world import World
 from ctsim.phantoms.scene import Scene, build, parse_suite
-from ctsim.project import Tracer, path_lengths
 from ctsim.scatter import constant_fraction
-from ctsim.spectrum import spectrum
+from ctsim.tracer.project import Tracer, path_lengths
 from ctsim.types import Phantom, Scanner
 
 CELLS = 32  # along a side: 3 pixels each

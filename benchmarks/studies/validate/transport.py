@@ -3,17 +3,17 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.beam.quadrature import full_rule, gauss_rule
+from ctsim.beam.spectrum import Spectrum, Tube, spectrum
 from ctsim.benchmarks.studies.validate.finding import Check, check
 from ctsim.benchmarks.studies.validate.published import numbers
-from ctsim.detector import Detector, response
+from ctsim.detector.response import Detector, response
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.montecarlo.transport import Source, absorbed_energy, scatter_image
 from ctsim.montecarlo.world import World
-from ctsim.project import Tracer, path_lengths
-from ctsim.quadrature import full_rule, gauss_rule
 from ctsim.solids import FRUSTUM, Primitive, Solid
-from ctsim.spectrum import Spectrum, Tube, spectrum
+from ctsim.tracer.project import Tracer, path_lengths
 from ctsim.types import Phantom
 
 SIGMAS = 4.0

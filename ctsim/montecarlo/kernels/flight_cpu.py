@@ -10,10 +10,10 @@ import math
 import numpy as np
 from numba import njit
 
-from ctsim.kernels.bricks_cpu import CELLS, CODE_BITS, MIXED, SIDE, walk
-from ctsim.kernels.raytrace_cpu import _paint
-from ctsim.kernels.solids_cpu import intersect
-from ctsim.montecarlo.kernels.laws_cpu import E_MIN, PER_STEP, uniform
+from ctsim.kernels.laws_cpu import E_MIN, PER_STEP, uniform
+from ctsim.tracer.kernels.bricks_cpu import CELLS, CODE_BITS, MIXED, SIDE, walk
+from ctsim.tracer.kernels.raytrace_cpu import _paint
+from ctsim.tracer.kernels.solids_cpu import intersect
 
 FARTHEST = 1e30
 EDGE = 1e-9  # of a block: a photon that enters the grid may lie this far outside it by rounding

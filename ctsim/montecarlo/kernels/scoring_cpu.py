@@ -4,8 +4,8 @@ import math
 
 from numba import njit
 
+from ctsim.kernels.laws_cpu import HC, REST, at, bounded, rayleigh, turn, uniform
 from ctsim.montecarlo.kernels.flight_cpu import depth
-from ctsim.montecarlo.kernels.laws_cpu import HC, REST, at, bounded, rayleigh, turn, uniform
 
 COMPTON, RAYLEIGH = 2, 32
 """Directions that are scored of one collision. Rayleigh scatter is rare, and most of what reaches the detector."""

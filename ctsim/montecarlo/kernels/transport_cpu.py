@@ -9,9 +9,9 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from ctsim.kernels.laws_cpu import at, compton, start, turn, uniform
 from ctsim.kernels.once import compiled_once
 from ctsim.montecarlo.kernels.flight_cpu import fly
-from ctsim.montecarlo.kernels.laws_cpu import at, compton, start, turn, uniform
 from ctsim.montecarlo.kernels.scoring_cpu import COMPTON, CUT, PRIMARY, aim, force, scatter_coherently
 
 CHUNKS = 64
@@ -148,14 +148,14 @@ def _scratch(n_materials, n_prims, grid):
 def transport(volume, prims, blocks, tables, beam, regions, source, key, first, count, images, deposit):
     """Follow histories first … first + count − 1 of the stream `key`, and add up what they leave.
 
-    `volume` is (code, slot, pool, density, grid) of `ctsim.bricks.Bricks`; `prims` as in `ctsim.solids.pack`; `blocks`
-    (kind, most, first, listed, frame) of `ctsim.montecarlo.world.Blocks`; `tables` (mu, klein, bound, form, 1/d_q);
-    `beam` (pose, pixels (v, u), detector normal times area in mm², mean and mean squared signal by energy, distance of
-    the source from the detector's plane, or 0 for as many photons on every unit of its area, ratio of the grid or 0);
-    `regions` uint8 [z, y, x]; `source` (cumulative weights, energies, intensity of each pixel (at most 1), thickness in
-    mm of a layer before each pixel, attenuation of that layer by energy; images float32 [v, u] or empty). `images`
-    [chunk, plane, v, u] gets the signals, see SQUARED; `deposit` [chunk, region] the absorbed energy (keV). Either may
-    be empty.
+    `volume` is (code, slot, pool, density, grid) of `ctsim.tracer.bricks.Bricks`; `prims` as in `ctsim.solids.pack`;
+    `blocks` (kind, most, first, listed, frame) of `ctsim.montecarlo.world.Blocks`; `tables` (mu, klein, bound, form,
+    1/d_q); `beam` (pose, pixels (v, u), detector normal times area in mm², mean and mean squared signal by energy,
+    distance of the source from the detector's plane, or 0 for as many photons on every unit of its area, ratio of the
+    grid or 0); `regions` uint8 [z, y, x]; `source` (cumulative weights, energies, intensity of each pixel (at most 1),
+    thickness in mm of a layer before each pixel, attenuation of that layer by energy; images float32 [v, u] or empty).
+    `images` [chunk, plane, v, u] gets the signals, see SQUARED; `deposit` [chunk, region] the absorbed energy (keV).
+    Either may be empty.
     """
     scratch = _scratch(tables[0].shape[0], prims.shape[0], volume[4])
     _chunks(

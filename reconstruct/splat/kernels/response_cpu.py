@@ -10,7 +10,7 @@ from llvmlite import ir
 from numba import njit, prange, types
 from numba.extending import intrinsic
 
-from ctsim.kernels.exp_cpu import as_float, exp_minus
+from ctsim.tracer.kernels.exp_cpu import as_float, exp_minus
 
 BLOCK = 256  # pixels whose intermediate sums stay in the L1 cache
 CHUNK = 4096  # pixels of one task; sums over pixels are taken chunk by chunk, for any number of threads

@@ -19,7 +19,7 @@ from typing import Self
 
 import msgspec
 
-from ctsim import process
+from ctsim.dataset import process
 from ctsim.errors import InputError
 
 PATIENCE = 60.0  # seconds for which a line may take to be appended; it takes milliseconds

@@ -15,9 +15,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from ctsim.durable import append_synced, cut_torn, write_synced
+from ctsim.dataset.durable import append_synced, cut_torn, write_synced
+from ctsim.dataset.locks import locked
 from ctsim.errors import InputError
-from ctsim.locks import locked
 
 MANIFEST = "manifest.json"
 INDEX = "index.jsonl"
@@ -43,7 +43,7 @@ class FileEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All files of one finished scene by their path inside its folder.
 
-    `code` is the `ctsim.sources.source_hash` of what made it, empty in the format `WITHOUT_CODE`.
+    `code` is the `ctsim.dataset.sources.source_hash` of what made it, empty in the format `WITHOUT_CODE`.
     """
 
     format: int
@@ -307,7 +307,7 @@ def verify(data_dir: str | Path) -> list[str]:
         elif not is_listed(manifest, index):
             problems.append(f"{folder}: its content is not the one that {INDEX} names")
     for partial in sorted(data_dir.glob(".*.partial")):
-        if not (data_dir / partial.name[1:].removesuffix(".partial")).is_dir():  # else see `ctsim.folder.remarks`
+        if not (data_dir / partial.name[1:].removesuffix(".partial")).is_dir():  # else see `folder.remarks`
             problems.append(f"{partial}: unfinished, make the scene again to go on from there")
     return problems
 

@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim import shadow
-from ctsim.bricks import Bricks, make_bricks
-from ctsim.columns import Columns, make_columns
+from ctsim.beam.quadrature import EnergyRule
 from ctsim.geometry import Geometry
-from ctsim.kernels import bricks_cpu, columns_cpu, raytrace_cpu
 from ctsim.materials import attenuation
-from ctsim.quadrature import EnergyRule
 from ctsim.solids import pack
+from ctsim.tracer import shadow
+from ctsim.tracer.bricks import Bricks, make_bricks
+from ctsim.tracer.columns import Columns, make_columns
+from ctsim.tracer.kernels import bricks_cpu, columns_cpu, raytrace_cpu
 from ctsim.types import Phantom
 
 # Over a pixel in which the thickness changes linearly by R the intensity mean differs from the central
@@ -76,7 +76,7 @@ class Tracer:
         return out
 
     def shadows(self, pose: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.int64]:
-        """Columns (from, to) of each row in which each primitive is seen, as `ctsim.shadow.cast` has them."""
+        """Columns (from, to) of each row in which each primitive is seen, as `ctsim.tracer.shadow.cast` has them."""
         if not self.skip:
             return shadow.everywhere(shape, len(self.prims))
         return shadow.cast(pose, shape, shadow.primitive_corners(self.prims))

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.detector.kernels import slab_cpu
 from ctsim.errors import InputError
 from ctsim.materials import (
     E_MIN,
@@ -26,11 +27,10 @@ from ctsim.materials import (
     photoelectric,
     scattering_function,
 )
-from ctsim.montecarlo.kernels import slab_cpu
 from ctsim.rng import stream_key
 
 E_MAX = 500.0
-"""The greatest energy (keV), as in `ctsim.spectrum`."""
+"""The greatest energy (keV), as in `ctsim.beam.spectrum`."""
 _STEP = 0.005  # between logarithms of energies: linear between the nodes, E^-3 is wrong by 4e-5
 _EDGE = 1e-3  # xraylib's shells begin up to this share of an edge's energy away from it
 _N_Q = 2048

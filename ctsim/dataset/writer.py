@@ -21,13 +21,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim import durable
-from ctsim import manifest as mf
+from ctsim.dataset import durable
+from ctsim.dataset import manifest as mf
+from ctsim.dataset.folder import Progress, is_complete, lock_of, partial_of, read_progress
+from ctsim.dataset.locks import Lock
+from ctsim.dataset.sources import source_hash
+from ctsim.dataset.tiffstack import create_stack, write_all, write_image
 from ctsim.errors import InputError
-from ctsim.folder import Progress, is_complete, lock_of, partial_of, read_progress
-from ctsim.locks import Lock
-from ctsim.sources import source_hash
-from ctsim.tiffstack import create_stack, write_all, write_image
 
 __all__ = ["SceneWriter", "Stack", "is_complete"]
 

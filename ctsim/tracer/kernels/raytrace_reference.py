@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
-from ctsim.bricks import SIDE
-from ctsim.kernels.solids_reference import inside, intersect
+from ctsim.tracer.bricks import SIDE
+from ctsim.tracer.kernels.solids_reference import inside, intersect
 
 GOLDEN = 0.6180339887498949
 

@@ -160,8 +160,8 @@ def _blocks(block, columns, grid, pose, order, lengths):
 def fill_view(columns, grid, pose, order, lengths):
     """Fill `lengths` [material, v, u] (mm, float32) of one view with what the central rays cross in the volume.
 
-    `columns` is (first, change) of `ctsim.columns`, `grid` [9] as in `ctsim.bricks`; `pose` [12] must be upright:
-    u step horizontal, v step along +z. `order` [block] is the order of work on blocks of LANES detector columns.
-    Material 0 is left alone.
+    `columns` is (first, change) of `ctsim.tracer.columns`, `grid` [9] as in `ctsim.tracer.bricks`; `pose` [12] must be
+    upright: u step horizontal, v step along +z. `order` [block] is the order of work on blocks of LANES detector
+    columns. Material 0 is left alone.
     """
     _blocks(_block.address(), columns, grid, pose, order, lengths)

@@ -15,10 +15,10 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctsim import anode
+from ctsim.beam import anode
+from ctsim.beam.spot import FocalSpot, OffFocal
 from ctsim.errors import InputError
 from ctsim.materials import E_MIN, attenuation, mass_energy_transfer, material
-from ctsim.spot import FocalSpot, OffFocal
 
 TABLE_KVP = (20.0, 300.0)
 _TABLE_ANGLE_DEG = (1.0, 40.0)
@@ -232,7 +232,7 @@ def _anode(
 
 @functools.lru_cache(maxsize=1)
 def _table() -> dict[str, NDArray[np.float64]]:
-    with np.load(Path(__file__).with_name("data") / "tungsten_spectra.npz", allow_pickle=False) as file:
+    with np.load(Path(__file__).with_name("tungsten_spectra.npz"), allow_pickle=False) as file:
         return {name: file[name].astype(np.float64) for name in file.files}
 
 

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ctsim.beam.spectrum import Spectrum, Tube, spectrum
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
-from ctsim.spectrum import Spectrum, Tube, spectrum
 
 FEWEST, MOST = 1.0, 1e12  # photons per open pixel and view
 _CM2_PER_M2, _MM2_PER_CM2 = 1e4, 100.0

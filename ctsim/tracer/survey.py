@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from ctsim.geometry import Geometry, few_views
 from ctsim.materials import attenuation
-from ctsim.project import Response, Tracer, path_lengths, transmit
 from ctsim.settings import Simulation
-from ctsim.shadow import row_spans
+from ctsim.tracer.project import Response, Tracer, path_lengths, transmit
+from ctsim.tracer.shadow import row_spans
 
 VIEWS, PIXELS = 8, 48
 WINDOWS, WINDOW, FINER = 8, 8, 16  # windows, pixels along a window's side, finer pixels along a pixel's side

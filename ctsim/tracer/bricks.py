@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.kernels.bricks_cpu import MIXED, SIDE, reach
+from ctsim.tracer.kernels.bricks_cpu import MIXED, SIDE, reach
 from ctsim.types import Phantom
 
 

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.detector import Detector, response
+from ctsim.beam.spectrum import Spectrum
+from ctsim.beam.trials import Beam, climb, make_trials
+from ctsim.detector.response import Detector, response
 from ctsim.errors import InputError
 from ctsim.materials import Material, absorption_edges, attenuation
-from ctsim.spectrum import Spectrum
-from ctsim.trials import Beam, climb, make_trials
 
 P_MAX = 14.6  # −log of the faintest signal that a rule answers for
 _N_MAX = 60
@@ -70,8 +70,8 @@ def energy_rule(
     """Return the smallest Gauss rule whose |ΔP| stays within `tolerance`.
 
     `max_lengths` (mm) are the longest path per material. Each alone and several at once are tried from
-    P = `tolerance` to 14.6, and from the worst of them a search climbs to greater errors (`ctsim.trials`). Where 60
-    energies do not suffice the fine spectrum itself is the rule.
+    P = `tolerance` to 14.6, and from the worst of them a search climbs to greater errors (`ctsim.beam.trials`). Where
+    60 energies do not suffice the fine spectrum itself is the rule.
     """
     if len(materials) != len(max_lengths):
         raise InputError(f"max_lengths must have one entry per material ({len(materials)}), got {len(max_lengths)}")

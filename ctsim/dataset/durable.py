@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from ctsim import process
+from ctsim.dataset import process
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2

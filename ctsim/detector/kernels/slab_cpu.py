@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from ctsim.montecarlo.kernels.laws_cpu import HC, REST, start, uniform
+from ctsim.kernels.laws_cpu import HC, REST, start, uniform
 
 CHUNKS = 64
 CUT = 1.0  # keV; a photon below it stays where it is
@@ -170,7 +170,7 @@ def _chunks(tables, photon, key, count, scratch, out):
 def slab(tables, thickness, energy, share, key, count, out):
     """Follow `count` photons of `energy` keV into a slab of `thickness` mm and add to `out` float64 [chunk, tally].
 
-    `tables` is `ctsim.montecarlo.slab.Slab`. `share` is the share of the first free paths that may be drawn: 1 for
+    `tables` is `ctsim.detector.slab.Slab`. `share` is the share of the first free paths that may be drawn: 1 for
     photons as they are, 1 − exp(−μt) for photons that all collide, whose tallies count that much less. The tallies:
     photons that deposited energy, deposits (keV), squared deposits, energy that left by the front and by the back
     after a collision, and photons that passed without one.

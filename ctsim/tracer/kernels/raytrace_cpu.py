@@ -15,12 +15,12 @@ import functools
 import numpy as np
 from numba import njit, prange
 
-from ctsim.kernels.bricks_cpu import add_pieces, aim, walk
-from ctsim.kernels.exp_cpu import exp_minus
 from ctsim.kernels.once import compiled_once
-from ctsim.kernels.rows_cpu import columns_near, fill_open, seen_in_row, trim
-from ctsim.kernels.solids_cpu import intersect
-from ctsim.shadow import MOST_TIMES
+from ctsim.tracer.kernels.bricks_cpu import add_pieces, aim, walk
+from ctsim.tracer.kernels.exp_cpu import exp_minus
+from ctsim.tracer.kernels.rows_cpu import columns_near, fill_open, seen_in_row, trim
+from ctsim.tracer.kernels.solids_cpu import intersect
+from ctsim.tracer.shadow import MOST_TIMES
 
 STRIP = 8  # rows done one after the other: they compute 9 rows of pixel corners instead of 16
 GOLDEN = 0.6180339887498949
@@ -341,9 +341,9 @@ def _measure_strips(at, volume, solids, pose, order, spans, background, rule, ed
 def transmit_view(volume, solids, pose, order, spans, background, rule, edge, skip, m1, m2):
     """Measure one view: mean signal `m1` and second moment `m2` [v, u] relative to the open field.
 
-    `volume` is (code, slot, pool, density, grid) of `ctsim.bricks.Bricks` and `background` [material, v, u]
+    `volume` is (code, slot, pool, density, grid) of `ctsim.tracer.bricks.Bricks` and `background` [material, v, u]
     (mm, float32) what the central rays cross in it. `solids` is (prims, fat, shadows): primitive rows, their
-    inflated twins and the columns in which they are seen (`ctsim.shadow.inflate` and `cast`). `pose` [12];
+    inflated twins and the columns in which they are seen (`ctsim.tracer.shadow.inflate` and `cast`). `pose` [12];
     `order` [strip] is the order of work; only columns spans[row] = (from, to) are touched. `rule` is
     (mu [material, node] 1/mm, w1 [node], w2 [node]); `edge` is (edge_mu [material], least change of
     optical thickness that takes sub-rays, the same where a solid begins, most sub-rays of a pixel at first, estimated

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.kernels import voxelise_cpu
 from ctsim.solids import MATERIAL, PRIMITIVE_COLUMNS, pack
+from ctsim.tracer.kernels import voxelise_cpu
 from ctsim.types import Phantom
 
 _CELLS = 8

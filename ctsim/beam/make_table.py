@@ -1,4 +1,4 @@
-"""Make tungsten_spectra.npz from SpekPy (casim model); run once: python -m ctsim.data.make_spectrum_table.
+"""Make tungsten_spectra.npz from SpekPy (casim model); run once: python -m ctsim.beam.make_table.
 
 The table holds, on kVp × take-off angle × E/kVp, the logarithm of the unfiltered continuum divided by
 (kvp/E − 1) and by Philibert's self-absorption, which takes the anode's absorption edges out of it, and
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import spekpy  # pyright: ignore[reportMissingImports]
 
-from ctsim.anode import K_EDGE, L_EDGE, self_absorption
+from ctsim.beam.anode import K_EDGE, L_EDGE, self_absorption
 
 KVP = np.array([20, 25, 30, 35, 40, 50, 60, 70, 80, 90, 100, 110, 120, 130, 140, 150, 175, 200, 230, 260, 300.0])
 ANGLES_DEG = np.array([1, 2, 3, 4.5, 6, 8, 11, 15, 20, 28, 40.0])

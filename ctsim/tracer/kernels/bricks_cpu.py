@@ -1,6 +1,6 @@
 """The label volume traversed brick by brick, for rays of any direction.
 
-Uniform bricks are crossed in one step, mixed ones voxel by voxel (see `ctsim.bricks`). What runs once a ray
+Uniform bricks are crossed in one step, mixed ones voxel by voxel (see `ctsim.tracer.bricks`). What runs once a ray
 is inlined: a call would count references of its arrays atomically, which costs more than the ray.
 """
 
@@ -187,8 +187,8 @@ def _fill_row(volume, pose, v, span, lengths):
 def fill_view(volume, pose, order, spans, lengths):
     """Fill `lengths` [material, v, u] (mm, float32) of one view with what the central rays cross in the volume.
 
-    `volume` is (code, slot, pool, density, grid) of `ctsim.bricks.Bricks`; `pose` [12]; `order` [row] is the order
-    of work; outside columns spans[row] = (from, to) the lengths are 0. Material 0 is left alone.
+    `volume` is (code, slot, pool, density, grid) of `ctsim.tracer.bricks.Bricks`; `pose` [12]; `order` [row] is the
+    order of work; outside columns spans[row] = (from, to) the lengths are 0. Material 0 is left alone.
     """
     for index in prange(order.size):
         _fill_row(volume, pose, order[index], spans[order[index]], lengths)

@@ -3,7 +3,7 @@
 Where the rotation axis is z and the detector stands upright, all rays of a detector column share one
 footprint in the xy plane. A boundary between two labels in a voxel column then splits those rays into
 those below and those above it, so a view costs label changes, not voxels: about five a column for a
-thorax of 256 voxels. A density map varies from voxel to voxel and is left to `ctsim.bricks`.
+thorax of 256 voxels. A density map varies from voxel to voxel and is left to `ctsim.tracer.bricks`.
 """
 
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.kernels.columns_cpu import count_boundaries, list_boundaries
+from ctsim.tracer.kernels.columns_cpu import count_boundaries, list_boundaries
 from ctsim.types import Phantom
 
 

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import msgspec
 
-from ctsim import durable
-from ctsim import manifest as mf
+from ctsim.dataset import durable
+from ctsim.dataset import manifest as mf
+from ctsim.dataset.locks import Busy, Lock, lock
+from ctsim.dataset.sources import source_hash
 from ctsim.errors import InputError
-from ctsim.locks import Busy, Lock, lock
-from ctsim.sources import source_hash
 
 SHOWN = 10  # names in a sentence
 _UNWRITABLE = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOSPC, errno.EDQUOT)

@@ -1,4 +1,4 @@
-"""A scan on disk, read without copying, and the way to write one (see `ctsim.writer`).
+"""A scan on disk, read without copying, and the way to write one (see `ctsim.dataset.writer`).
 
 A scene's folder holds counts.tif [view, v, u], flat.tif, the references, labels and metal mask
 [z, y, x], scene.toml, scan.json, plan.json, manifest.json, the ground truth that was asked for, and
@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim import manifest as mf
+from ctsim.dataset import manifest as mf
+from ctsim.dataset.manifest import list_scans, verify
+from ctsim.dataset.tiffstack import map_array
+from ctsim.dataset.writer import SceneWriter, Stack, is_complete
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.manifest import list_scans, verify
 from ctsim.scaninfo import ScanInfo, read_info
-from ctsim.tiffstack import map_array
-from ctsim.writer import SceneWriter, Stack, is_complete
 
 if TYPE_CHECKING:
     from ctsim.types import Scan

@@ -1,8 +1,8 @@
-"""Make detector_response.npz by Monte Carlo: python -m ctsim.data.make_detector_table (20 minutes of CPU time).
+"""Make detector_response.npz by Monte Carlo: python -m ctsim.detector.make_table (20 minutes of CPU time).
 
 The table holds, for a slab of GOS and of CsI, moments 0, 1 and 2 of the deposit divided by those of
-`ctsim.detector.closed_form`: float32 [moment, thickness, energy]. The quotient is smooth between the breaks, where
-either one jumps, and each break lies between two nodes 0.2 % from each other. Nothing is smoothed.
+`ctsim.detector.response.closed_form`: float32 [moment, thickness, energy]. The quotient is smooth between the breaks,
+where either one jumps, and each break lies between two nodes 0.2 % from each other. Nothing is smoothed.
 
 Two million histories a node: the deposit of a photon that collides has a relative standard deviation of 1 at most (thin
 slabs at 500 keV), hence the mean deposit a standard error of 7e-4 at most. Each node has its own random numbers, and a
@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from ctsim.detector import closed_form
+from ctsim.detector.response import closed_form
+from ctsim.detector.slab import E_MAX, Slab, absorbed
 from ctsim.materials import E_MIN, SHARES_END, absorption_edges, compton, k_edges
-from ctsim.montecarlo.slab import E_MAX, Slab, absorbed
 
 THICKNESS = np.geomspace(0.01, 10.0, 19)  # mm
 HISTORIES = 2_000_000

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.geometry import crosswise
-from ctsim.kernels.shadow_cpu import cast_hulls
 from ctsim.solids import BOUND, BOX, CAPSULE, ELLIPSOID, FRUSTUM, KIND, MATERIAL, MATRIX, PARAMS, TORUS
+from ctsim.tracer.kernels.shadow_cpu import cast_hulls
 
 THIN = 1.5  # primitives thinner than this many pixels can hide between the corners of a pixel
 MOST_TIMES = 16  # and get at most this many times the usual sub-rays

@@ -2,7 +2,7 @@
 
 A sensitive slab hit head-on. In closed form every outcome of the first interaction has a probability and a deposit:
 all of E; E less a K-fluorescence photon that got out; the Compton electron alone. A table made by Monte Carlo
-(`ctsim.montecarlo.slab`) corrects it for everything later. Energies keV, thicknesses mm.
+(`ctsim.detector.slab`) corrects it for everything later. Energies keV, thicknesses mm.
 """
 
 import functools
@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expn
 
+from ctsim.detector.panel import Blur, Lag, check_lag
 from ctsim.errors import InputError
 from ctsim.materials import E_MIN, attenuation, compton, k_shell, k_vacancies, photoelectric
-from ctsim.panel import Blur, Lag, check_lag
 
 _SLAB = {"gos": "GOS", "csi": "CsI", "ideal": "GOS", "counting": "CdTe@5.85"}
 _DEPTHS = 24  # Gauss–Legendre nodes over the depth of the first interaction, in its own probability
@@ -107,7 +107,7 @@ def closed_form(which: str, thickness: float, energies: NDArray[np.float64]) -> 
 
 @functools.lru_cache(maxsize=1)
 def _table() -> dict[str, NDArray[np.float64]]:
-    with np.load(Path(__file__).with_name("data") / "detector_response.npz", allow_pickle=False) as file:
+    with np.load(Path(__file__).with_name("detector_response.npz"), allow_pickle=False) as file:
         return {name: file[name].astype(np.float64) for name in file.files}
 
 

@@ -1,0 +1,1 @@
+"""What leaves the source: spectrum, focal spot, dose, and the energies that stand for a spectrum."""

@@ -1,1 +1,0 @@
-"""Tables that travel with the package, and the scripts that made them."""

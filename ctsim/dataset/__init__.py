@@ -1,0 +1,1 @@
+"""Files: datasets on disk, written so that a crash loses nothing."""

@@ -1,0 +1,1 @@
+"""What the panel makes of photons: response, blur, lag, noise, ADC."""

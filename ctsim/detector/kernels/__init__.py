@@ -1,0 +1,1 @@
+"""Photons and electrons in a scintillator's slab: a fast kernel and its reference."""

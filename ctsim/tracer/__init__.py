@@ -1,0 +1,1 @@
+"""Path lengths of all materials along rays, through voxels and analytic solids."""
