@@ -21,7 +21,7 @@ class Simulation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """Estimated error in P above which such a pixel gets up to 16 times as many rays; infinity: never."""
     spot_error: Annotated[float, msgspec.Meta(ge=1e-4, le=0.5)] = 0.02
     """Largest error at an edge, as a share of its step, of a focal spot made of points."""
-    scatter_error: Annotated[float, msgspec.Meta(ge=0.002, le=0.5)] = 0.02
+    scatter_error: Annotated[float, msgspec.Meta(ge=0.002, le=0.5)] = 0.05
     """RMS error of Monte Carlo scatter (level 3) over its mean at which no more photons are followed.
 
     Fewer are followed if the error falls to 2e-6 of the open field first.

@@ -479,7 +479,11 @@ def test_a_cluster_that_loses_all_its_workers_goes_on_with_those_that_come(clust
         assert next(answers) is None  # two are at work
         for pid in client.run(os.getpid).values():
             os.kill(pid, signal.SIGKILL)
-        assert sorted(a for a in answers if a) == [(0, None), (1, None), (2, None)]
+        # Dask's own restart of a killed worker fails now and then
+        command = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny"]
+        with subprocess.Popen([*command, "--no-dashboard"], stderr=subprocess.DEVNULL) as comes:
+            assert sorted(a for a in answers if a) == [(0, None), (1, None), (2, None)]
+            comes.terminate()
 
 
 def test_a_client_that_found_no_scheduler_is_gone_before_the_next(monkeypatch):
