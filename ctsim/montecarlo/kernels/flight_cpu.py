@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from ctsim.kernels.laws_cpu import E_MIN, PER_STEP, uniform
+from ctsim.kernels.once import compiled_once
 from ctsim.tracer.kernels.bricks_cpu import CELLS, CODE_BITS, MIXED, SIDE, walk
 from ctsim.tracer.kernels.raytrace_cpu import _paint
 from ctsim.tracer.kernels.solids_cpu import intersect
@@ -147,9 +148,13 @@ def fly(volume, prims, blocks, mu, energy, ray, pair, seen, hits, rng, found):
                 return -1
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+VOLUME = "Tuple((uint16[:,:,:,::1], int32[:,:,::1], uint8[::1], float32[::1], float64[::1]))"
+_WORK = "Tuple((float64[::1], float64[::1], float64[::1], float64[:,::1], float64[:,::1], float64[::1]))"
+
+
+@compiled_once(VOLUME, "float64[:,::1]", "float32[:,:,::1]", "float64", "float64[::1]", _WORK)
 def depth(volume, prims, mu, energy, ray, work):
-    """Return the optical thickness from a ray's start to its end, `ray[6]` mm along it."""
+    """Set `ray[7]` to the optical thickness from a ray's start to its end, `ray[6]` mm along it."""
     lengths, covered, painted, pieces, hits, pair = work
     place = (energy - E_MIN) * PER_STEP
     i = int(place)
@@ -178,4 +183,4 @@ def depth(volume, prims, mu, energy, ray, work):
             low = mu[m, i, 0] + mu[m, i, 1] + mu[m, i, 2]
             high = mu[m, i + 1, 0] + mu[m, i + 1, 1] + mu[m, i + 1, 2]
             tau += (low + part * (high - low)) * lengths[m]
-    return tau
+    ray[7] = tau

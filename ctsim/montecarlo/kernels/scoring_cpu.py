@@ -52,7 +52,7 @@ def _grid(beam, way, u, v):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def force(volume, prims, tables, beam, m, energy, order, ray, way, work, rng, images):
+def force(depths, volume, prims, tables, beam, m, energy, order, ray, way, work, rng, images):
     """Score what a Compton collision sends to a random place of the detector, on average over all its outcomes."""
     mu, klein, bound, _, per_q = tables
     pose, extent, normal, signals, _, _ = beam
@@ -76,12 +76,12 @@ def force(volume, prims, tables, beam, m, energy, order, ray, way, work, rng, im
     share = law * slant / (way[6] * way[6])
     share *= _grid(beam, way, u, v)
     if share > 0:
-        tau = depth(volume, prims, mu, later, way, work)
-        _score(images, order, v, u, share * math.exp(-tau) / COMPTON, signals, later)
+        depth(depths, volume, prims, mu, later, way, work)
+        _score(images, order, v, u, share * math.exp(-way[7]) / COMPTON, signals, later)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _reach(volume, prims, tables, beam, energy, order, ray, way, work, images):
+def _reach(depths, volume, prims, tables, beam, energy, order, ray, way, work, images):
     """Score a photon at the place of the detector that it flies to, by its chance to get there."""
     pose, extent, normal, signals, _, _ = beam
     towards = ray[3] * normal[0] + ray[4] * normal[1] + ray[5] * normal[2]
@@ -104,12 +104,12 @@ def _reach(volume, prims, tables, beam, energy, order, ray, way, work, images):
         way[6] = length
         share = _grid(beam, way, u, v) / RAYLEIGH
         if share > 0:
-            tau = depth(volume, prims, tables[0], energy, way, work)
-            _score(images, order, v, u, share * math.exp(-tau), signals, energy)
+            depth(depths, volume, prims, tables[0], energy, way, work)
+            _score(images, order, v, u, share * math.exp(-way[7]), signals, energy)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def scatter_coherently(volume, prims, tables, beam, m, energy, order, ray, way, work, rng, images):
+def scatter_coherently(depths, volume, prims, tables, beam, m, energy, order, ray, way, work, rng, images):
     """Turn a photon by Rayleigh scatter, and score several of the ways that it may take."""
     _, _, _, form, per_q = tables
     n = RAYLEIGH if images.size > 0 else 1
@@ -118,4 +118,4 @@ def scatter_coherently(volume, prims, tables, beam, m, energy, order, ray, way, 
         ray[3], ray[4], ray[5] = x, y, z
         turn(ray, rayleigh(form, m, energy, per_q, rng), 2.0 * math.pi * uniform(rng))
         if images.size > 0:
-            _reach(volume, prims, tables, beam, energy, order, ray, way, work, images)
+            _reach(depths, volume, prims, tables, beam, energy, order, ray, way, work, images)

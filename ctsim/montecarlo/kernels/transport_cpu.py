@@ -11,14 +11,14 @@ from numba import njit, prange
 
 from ctsim.kernels.laws_cpu import at, compton, start, turn, uniform
 from ctsim.kernels.once import compiled_once
-from ctsim.montecarlo.kernels.flight_cpu import fly
+from ctsim.montecarlo.kernels.flight_cpu import VOLUME, depth, fly
 from ctsim.montecarlo.kernels.scoring_cpu import COMPTON, CUT, PRIMARY, aim, force, scatter_coherently
 
 CHUNKS = 64
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _history(volume, prims, blocks, tables, beam, regions, source, scratch, rng, images, deposit):
+def _history(depths, volume, prims, blocks, tables, beam, regions, source, scratch, rng, images, deposit):
     """Follow one photon from the source until it is absorbed or leaves."""
     mu, _, bound, _, per_q = tables
     pose, extent, _, signals, nearest, _ = beam
@@ -68,14 +68,14 @@ def _history(volume, prims, blocks, tables, beam, regions, source, scratch, rng,
         if pick < found[0] + found[1]:
             if images.size > 0:
                 for _ in range(COMPTON):
-                    force(volume, prims, tables, beam, m, energy, order, ray, way, work, rng, images)
+                    force(depths, volume, prims, tables, beam, m, energy, order, ray, way, work, rng, images)
             ratio, cos = compton(bound, m, energy, per_q, rng)
             if where >= 0:
                 deposit[where] += energy * (1.0 - ratio)
             energy *= ratio
             turn(ray, cos, 2.0 * math.pi * uniform(rng))
         else:
-            scatter_coherently(volume, prims, tables, beam, m, energy, order, ray, way, work, rng, images)
+            scatter_coherently(depths, volume, prims, tables, beam, m, energy, order, ray, way, work, rng, images)
         if energy < CUT:
             if where >= 0:
                 deposit[where] += energy
@@ -90,7 +90,6 @@ def _region(regions, grid, ray):
     return 0
 
 
-VOLUME = "Tuple((uint16[:,:,:,::1], int32[:,:,::1], uint8[::1], float32[::1], float64[::1]))"
 BLOCKS = "Tuple((int64[:,:,::1], float32[:,::1], int64[::1], int64[::1], float64[::1]))"
 TABLES = "Tuple((float32[:,:,::1], float32[:,::1], float32[:,::1], float64[:,::1], float64))"
 BEAM = "Tuple((float64[::1], float64[::1], float64[::1], float64[:,::1], float64, float64))"
@@ -102,29 +101,32 @@ SCRATCH = (  # of a chunk
 
 
 @compiled_once(
-    *(VOLUME, "float64[:,::1]", BLOCKS, TABLES, BEAM, "uint8[:,:,::1]", SOURCE, SCRATCH, "uint64"),
+    *("int64", VOLUME, "float64[:,::1]", BLOCKS, TABLES, BEAM, "uint8[:,:,::1]", SOURCE, SCRATCH, "uint64"),
     *("int64", "int64", "float64[:,:,::1]", "float64[::1]"),
 )
-def _histories(volume, prims, blocks, tables, beam, regions, source, scratch, key, first, last, images, deposit):
+def _histories(
+    depths, volume, prims, blocks, tables, beam, regions, source, scratch, key, first, last, images, deposit
+):
     rays, lengths, pieces, hits, found, seen, rng = scratch
     work = lengths[0], lengths[1], lengths[2], pieces, hits, rays[2]
     parts = rays[0], rays[1], found, seen, work
     for history in range(first, last):
         start(rng, key, np.uint64(history))
-        _history(volume, prims, blocks, tables, beam, regions, source, parts, rng, images, deposit)
+        _history(depths, volume, prims, blocks, tables, beam, regions, source, parts, rng, images, deposit)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def _chunks(
-    histories, volume, prims, blocks, tables, beam, regions, source, scratch, key, first, count, images, deposit
+    histories, depths, volume, prims, blocks, tables, beam, regions, source, scratch, key, first, count, images,
+    deposit,
 ):  # fmt: skip
     rays, lengths, pieces, hits, found, seen, rng = scratch
     for chunk in prange(CHUNKS):
         begin, stop = first + chunk * count // CHUNKS, first + (chunk + 1) * count // CHUNKS
         mine = rays[chunk], lengths[chunk], pieces[chunk], hits[chunk], found[chunk], seen[chunk], rng[chunk]
         _histories(
-            histories, volume, prims, blocks, tables, beam, regions, source, mine, key, begin, stop, images[chunk],
-            deposit[chunk],
+            histories, depths, volume, prims, blocks, tables, beam, regions, source, mine, key, begin, stop,
+            images[chunk], deposit[chunk],
         )  # fmt: skip
 
 
@@ -159,6 +161,6 @@ def transport(volume, prims, blocks, tables, beam, regions, source, key, first, 
     """
     scratch = _scratch(tables[0].shape[0], prims.shape[0], volume[4])
     _chunks(
-        _histories.address(), volume, prims, blocks, tables, beam, regions, source, scratch, key, first, count,
-        images, deposit,
+        _histories.address(), depth.address(), volume, prims, blocks, tables, beam, regions, source, scratch, key,
+        first, count, images, deposit,
     )  # fmt: skip
