@@ -20,7 +20,7 @@ EVERY = 10.0
 """Seconds between lines of progress in a log."""
 PATIENCE = 1.0
 """Seconds of compiling that need no message."""
-COMPILING = "compiling kernels, once (about 20 s) …"
+COMPILING = "compiling kernels, once (20 to 45 s) …"
 
 T = TypeVar("T")
 
