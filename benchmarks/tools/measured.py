@@ -58,9 +58,8 @@ STUDIES, SUITES = "benchmarks/studies/", "benchmarks/suites/"
 PAGES: dict[str, Page] = {
     "results": Page(
         title="Results",
-        command="run-benchmark report quick --markdown docs/measured/results.md --also core",
-        sources=(*METHODS, "benchmarks/scores/", f"{SUITES}quick.toml", f"{SUITES}core.toml",
-                 f"{SUITES}core-scatter.toml", f"{SUITES}real.toml"),
+        command="run-benchmark report quick --markdown docs/measured/results.md --also core-scatter",
+        sources=(*METHODS, "benchmarks/scores/", f"{SUITES}quick.toml", f"{SUITES}core-scatter.toml"),
     ),
     "methods": Page(
         title="Methods: settings and experiments",
