@@ -29,7 +29,9 @@ _SHARES_END_LIGHT, _LAST_LIGHT = 100.0, 8  # the same up to oxygen
 
 # Compositions in percent by weight, densities in g/cm3. Tissues: ICRU Report 44 (1989), lung inflated.
 # Compounds and elements: NIST, physics.nist.gov/PhysRefData/XrayMassCoef. Enamel and dentin: 95 and 70 %
-# hydroxyapatite, 4 and 10 % water, the rest collagen. Alloys: nominal ASTM F75, AISI 316L and 6061.
+# hydroxyapatite, 4 and 10 % water, the rest collagen. Alloys: nominal ASTM F75, AISI 316L and 6061. Spongiosa, kidney
+# and urine: ICRU Report 46 (1992). Amalgam: equal weights of mercury and an admixed high-copper powder (Anusavice,
+# Phillips' Science of Dental Materials, 12th ed., ch. 15).
 _TABLE: dict[str, tuple[str, float]] = {
     "air": ("C 0.0124 N 75.5268 O 23.1781 Ar 1.2827", 1.20479e-3),
     "water": ("H2O", 1.0),
@@ -40,6 +42,9 @@ _TABLE: dict[str, tuple[str, float]] = {
     "brain": ("H 10.7 C 14.5 N 2.2 O 71.2 Na 0.2 P 0.4 S 0.2 Cl 0.3 K 0.3", 1.04),
     "blood": ("H 10.2 C 11.0 N 3.3 O 74.5 Na 0.1 P 0.1 S 0.2 Cl 0.3 K 0.2 Fe 0.1", 1.06),
     "cortical_bone": ("H 3.4 C 15.5 N 4.2 O 43.5 Na 0.1 Mg 0.2 P 10.3 S 0.3 Ca 22.5", 1.92),
+    "spongiosa": ("H 8.5 C 40.4 N 2.8 O 36.7 Na 0.1 Mg 0.1 P 3.4 S 0.2 Cl 0.2 K 0.1 Ca 7.4 Fe 0.1", 1.18),
+    "kidney": ("H 10.3 C 13.2 N 3.0 O 72.4 Na 0.2 P 0.2 S 0.2 Cl 0.2 K 0.2 Ca 0.1", 1.05),
+    "urine": ("H 11.0 C 0.5 N 1.0 O 86.2 Na 0.4 P 0.1 Cl 0.6 K 0.2", 1.02),
     "enamel": ("H 0.7 C 0.5 N 0.2 O 43.1 P 17.6 Ca 37.9", 2.96),
     "dentin": ("H 2.7 C 10.2 N 3.4 O 42.9 P 12.9 Ca 27.9", 2.14),
     "PLA": ("C3H4O2", 1.24),
@@ -57,6 +62,7 @@ _TABLE: dict[str, tuple[str, float]] = {
     "Au": ("Au", 19.32),
     "CoCr": ("Co 64.0 Cr 28.5 Mo 6.0 Si 0.7 Mn 0.5 Fe 0.3", 8.30),
     "steel": ("Fe 65.5 Cr 17.0 Ni 12.0 Mo 2.5 Mn 2.0 Si 1.0", 7.99),
+    "amalgam": ("Hg 50.0 Ag 34.5 Sn 9.0 Cu 6.0 Zn 0.5", 11.6),
     "GOS": ("Gd2O2S", 7.34),
     "CsI": ("CsI", 4.51),
 }

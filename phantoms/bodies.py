@@ -49,10 +49,14 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
                 f"insert_mm must be at least 0.001 mm and at most a quarter of size {self.size}: {self.insert_mm}"
             )
         if self.metal != "none":
-            try:
-                material(self.metal)
-            except InputError as error:
-                raise InputError(f"metal: {error}") from None
+            self.known("metal")
+
+    def known(self, key: str) -> None:
+        """Raise `InputError` unless the setting `key` names a material."""
+        try:
+            material(getattr(self, key))
+        except InputError as error:
+            raise InputError(f"{key}: {error}") from None
 
     def within(self, key: str, low: float, high: float) -> None:
         """Raise `InputError` unless the setting `key` lies within [low, high]."""

@@ -58,6 +58,16 @@ class Inserts:
         size = (diameter / 2, max(math.hypot(*along), least))
         return make(name, self.material, size, centre=middle, axis=along)
 
+    def cone(self, name: str, a: ArrayLike, b: ArrayLike, diameters: tuple[float, float]) -> Solid:
+        """Return a truncated cone from a to b, of these diameters there."""
+        middle, along = self._mm(np.add(a, b) / 2), self._mm(np.subtract(b, a))
+        size = (diameters[0] / 2, diameters[1] / 2, math.hypot(*along))
+        return shapes.cone(name, self.material, size, centre=middle, axis=along)
+
+    def dome(self, name: str, centre: ArrayLike, diameter: float, axis: ArrayLike) -> Solid:
+        """Return a half ball about `centre`, round towards `axis`."""
+        return shapes.dome(name, self.material, diameter / 2, centre=self._mm(centre), axis=self._mm(axis))
+
     def rivet(self, name: str, head: ArrayLike, axis: ArrayLike, diameter: float, length: float) -> Solid:
         """Return a blind rivet: a domed head at `head`, a shank of `length` along `axis` (inwards), a bulge."""
         diameters = (1.9 * diameter, diameter, 1.3 * diameter)

@@ -19,9 +19,13 @@ from ctsim.phantoms.body_organic import BellPepper, Chicken, Walnut, bell_pepper
 from ctsim.phantoms.body_random import Random, random
 from ctsim.phantoms.body_teeth import Teeth, teeth
 from ctsim.phantoms.body_volume import CtVolume, ct_volume
+from ctsim.phantoms.patients.hip import Hip, hip
+from ctsim.phantoms.patients.spine import Spine, spine
 from ctsim.types import Phantom
 
-AnyRecipe = Validation | MetalRods | Lung | Teeth | Broccoli | Walnut | Chicken | BellPepper | Random | CtVolume
+AnyRecipe = (
+    Validation | MetalRods | Lung | Teeth | Broccoli | Walnut | Chicken | BellPepper | Random | CtVolume | Hip | Spine
+)
 
 Builder = Callable[[Shape, Triple, np.random.Generator, Any], Phantom]
 
@@ -36,6 +40,8 @@ BUILDERS: dict[type[Recipe], Builder] = {
     BellPepper: bell_pepper,
     Random: random,
     CtVolume: ct_volume,
+    Hip: hip,
+    Spine: spine,
 }
 
 NAMES = tuple(str(kind.__struct_config__.tag) for kind in BUILDERS)

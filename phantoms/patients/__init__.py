@@ -1,0 +1,1 @@
+"""Bodies of patients with several implants of several metals."""
