@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from ctsim.errors import InputError
 from ctsim.geometry import Triple
 from ctsim.phantoms.bodies import Recipe, Shape, assemble
 from ctsim.phantoms.fields import Canvas, Field, Mask, Noise
-from ctsim.phantoms.inserts import count, diameter, inserts
-from ctsim.solids import Solid
+from ctsim.phantoms.inserts import Inserts, count, diameter, inserts
+from ctsim.solids import BOX, Primitive, Solid, Vector
 from ctsim.types import Phantom
 
 MATERIALS = ("air", "soft_tissue", "cortical_bone", "dentin", "enamel")
@@ -30,12 +31,21 @@ class Teeth(Recipe, frozen=True, kw_only=True, tag="teeth"):
     """How many inserts are metal crowns; the others are implant screws."""
     missing: int = 1
     """Missing teeth, which leave gaps."""
+    fillings: int = 0
+    """Amalgam fillings in molars and premolars of both jaws."""
+    gold_crowns: int = 0
+    """Crowns of gold on upper teeth."""
+    bridges: int = 0
+    """Bridges of CoCr, each over three upper teeth of one side."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         Recipe.__post_init__(self)
         self.within("crowns", 0, 16)
         self.within("missing", 0, 14)
+        self.within("fillings", 0, 12)
+        self.within("gold_crowns", 0, 4)
+        self.within("bridges", 0, 2)
 
 
 class Kind(NamedTuple):
@@ -69,20 +79,24 @@ class Tooth(NamedTuple):
 
 
 def teeth(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Teeth) -> Phantom:
-    """Draw the jaws; metal: implants under crowns of their own, and crowns over whole teeth."""
+    """Draw the jaws; metal: implants under crowns of their own, crowns over whole teeth, and restorations."""
     body, metal = rng.spawn(2)
     canvas = Canvas(n, d_voxel, shrink=0.9)
     _soft(canvas, body)
     spongy = Noise(body, 56)
     rows = [_row(body, jaw) for jaw in (-1, 1)]
+    present: list[dict[int, Tooth]] = []
     for jaw, row in zip((-1, 1), rows, strict=True):
         _bone(canvas, jaw, spongy)
         gone = body.permutation(14)[: params.missing]
         implants, _ = _sites(params) if jaw < 0 else ([], [])
-        for tooth in row:
-            if tooth.slot not in gone or (jaw < 0 and tooth.slot in SITES):
-                _tooth(canvas, tooth, body, rootless=tooth.slot in implants)
-    return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit, rows[0]))
+        present.append({t.slot: t for t in row if t.slot not in gone or (jaw < 0 and t.slot in SITES)})
+        for tooth in present[-1].values():
+            _tooth(canvas, tooth, body, rootless=tooth.slot in implants)
+    solids = _metal(metal, params, canvas.unit, rows[0])
+    if params.metal != "none":
+        solids += _restorations(params, canvas.unit, present, rows[1])
+    return assemble(canvas.labels, d_voxel, MATERIALS, solids)
 
 
 def _arch(t: Field | float) -> tuple[Field, Field]:
@@ -255,9 +269,73 @@ def _metal(rng: np.random.Generator, params: Teeth, unit: float, row: list[Tooth
         foot, top = tooth.neck, tooth.neck + 0.6 * tooth.kind.crown * tooth.frame[2]
         solids.append(make.rod(f"abutment{slot}", foot, top, 0.62 * d, round_ends=False))
     for slot in crowns:
-        tooth = by_slot[slot]
-        kind = tooth.kind
-        centre = tooth.neck + 0.55 * kind.crown * tooth.frame[2]
-        radii = (0.98 * kind.along * unit, 0.98 * kind.across * unit, 0.50 * kind.crown * unit)
-        solids.append(make.ellipsoid(f"crown{slot}", centre, radii, tooth.frame[2]))
+        solids.append(_crown(make, f"crown{slot}", by_slot[slot]))
     return solids
+
+
+def _crown(make: Inserts, name: str, tooth: Tooth) -> Solid:
+    kind = tooth.kind
+    centre = tooth.neck + 0.55 * kind.crown * tooth.frame[2]
+    radii = (0.98 * kind.along * make.unit, 0.98 * kind.across * make.unit, 0.50 * kind.crown * make.unit)
+    return make.ellipsoid(name, centre, radii, tooth.frame[2])
+
+
+BRIDGED = ((3, 4, 5), (10, 11, 12))  # upper slots, of which the middle one may be a gap
+GILDED = (13, 6, 9, 2, 5, 12)  # upper slots that can carry a gold crown, in order of use
+FILLED = (6, 13, 4, 11, 5, 12, 3, 10)  # slots of either jaw that can be filled, in order of use
+
+
+def _restorations(params: Teeth, unit: float, present: list[dict[int, Tooth]], upper: list[Tooth]) -> list[Solid]:
+    """Return bridges, gold crowns and fillings, each on teeth that carry no other metal.
+
+    `present` are the teeth of the lower and of the upper jaw by slot.
+    """
+    cobalt, gold, amalgam = (Inserts(material, unit) for material in ("CoCr", "Au", "amalgam"))
+    lower_used = {slot for slots in _sites(params) for slot in slots}
+    upper_used = {slot for trio in BRIDGED[: params.bridges] for slot in trio}
+    by_slot = {tooth.slot: tooth for tooth in upper}
+    solids = [_bridge(cobalt, f"bridge{k}", [by_slot[slot] for slot in BRIDGED[k]]) for k in range(params.bridges)]
+    free = [present[1][slot] for slot in GILDED if slot in present[1] and slot not in upper_used]
+    _enough("gold_crowns", params.gold_crowns, len(free))
+    crowned = free[: params.gold_crowns]
+    solids += [_crown(gold, f"gold{tooth.slot}", tooth) for tooth in crowned]
+    upper_used |= {tooth.slot for tooth in crowned}
+    teeth = [
+        (name, jaw[slot])
+        for slot in FILLED
+        for name, jaw, used in (("upper", present[1], upper_used), ("lower", present[0], lower_used))
+        if slot in jaw and slot not in used
+    ]
+    _enough("fillings", params.fillings, len(teeth))
+    for name, tooth in teeth[: params.fillings]:
+        kind = tooth.kind
+        centre = tooth.neck + 0.80 * kind.crown * tooth.frame[2]  # its top a little under the cusps
+        edges = (1.1 * kind.along * unit, 0.75 * kind.across * unit, 0.34 * kind.crown * unit)
+        spin = _spin(tooth)
+        solids.append(amalgam.box(f"filling-{name}{tooth.slot}", centre, edges, tooth.frame[2], spin))
+    return solids
+
+
+def _enough(key: str, wanted: int, found: int) -> None:
+    if wanted > found:
+        raise InputError(f"{key}: {wanted} are asked for, but only {found} teeth are there and free of other metal")
+
+
+def _spin(tooth: Tooth) -> float:
+    """Return the turn about its axis that lays a box's first edge along the arch."""
+    first, second, _ = Primitive(kind=BOX, centre=(0, 0, 0), params=(1, 1, 1), axis=_vector(tooth.frame[2])).rotation()
+    return float(np.arctan2(tooth.frame[0] @ second, tooth.frame[0] @ first))
+
+
+def _vector(at: NDArray[np.float64]) -> Vector:
+    x, y, z = (float(c) for c in at)
+    return x, y, z
+
+
+def _bridge(make: Inserts, name: str, row: list[Tooth]) -> Solid:
+    """Return crowns over neighbouring teeth and the bars between them, as one piece of metal."""
+    crowns = [_crown(make, name, tooth) for tooth in row]
+    middles = np.array([tooth.neck + 0.5 * tooth.kind.crown * tooth.frame[2] for tooth in row])
+    bar = make.wire(name, middles, 0.9 * min(tooth.kind.crown for tooth in row) * make.unit)
+    pieces = tuple(p for solid in (*crowns, bar) for p in solid.primitives)
+    return Solid(name=name, material=make.material, primitives=pieces, metal=True)

@@ -34,9 +34,9 @@ class Inserts:
         """Return an ellipsoid with semi-axes `radii`, the third along `axis`."""
         return shapes.ellipsoid(name, self.material, radii, centre=self._mm(centre), axis=self._mm(axis))
 
-    def box(self, name: str, centre: ArrayLike, edges: Triple, axis: ArrayLike) -> Solid:
-        """Return a box with full `edges`, the third along `axis`."""
-        return shapes.box(name, self.material, edges, centre=self._mm(centre), axis=self._mm(axis))
+    def box(self, name: str, centre: ArrayLike, edges: Triple, axis: ArrayLike, spin: float = 0.0) -> Solid:
+        """Return a box with full `edges`, the third along `axis`, turned about it by `spin` (radians)."""
+        return shapes.box(name, self.material, edges, centre=self._mm(centre), axis=self._mm(axis), spin=spin)
 
     def ring(self, name: str, centre: ArrayLike, radii: tuple[float, float], axis: ArrayLike) -> Solid:
         """Return a torus with (major, minor) `radii` about `axis`."""
