@@ -126,7 +126,7 @@ def names() -> tuple[str, ...]:
 
 @functools.lru_cache(maxsize=256)
 def material(name: str) -> Material:
-    """Look a material up by name or element symbol, or build one from "formula@density" ("NaI@3.67").
+    """Look a material up by name or element symbol, or build one from "formula@density" ("NaI@3.67", "muscle@1.1").
 
     Raises InputError naming near matches where the name is unknown.
     """
@@ -139,7 +139,7 @@ def material(name: str) -> Material:
             density = float(density_text)
         except ValueError:
             raise InputError(f"material {name!r}: expected formula@density with a density in g/cm3") from None
-        return Material(name=name, formula=formula, density=density)
+        return Material(name=name, formula=_TABLE[formula][0] if formula in _TABLE else formula, density=density)
     if (tabulated := _element_density(name)) is not None:
         return Material(name=name, formula=name, density=tabulated)
     lower = {known.lower(): known for known in _TABLE}
@@ -148,6 +148,17 @@ def material(name: str) -> Material:
     raise InputError(
         f"unknown material {name!r}: {hint} (or give an element's symbol, 'Pb', or a formula and density, 'NaI@3.67')"
     )
+
+
+def at_density(name: str, relative: float) -> str:
+    """Name a tabulated material at `relative` times its nominal density; 1 is the material itself."""
+    return name if relative == 1 else f"{name}@{relative * _TABLE[name][1]:.6g}"
+
+
+def nominal(name: str) -> tuple[str, float]:
+    """Return a material's tabulated name and its density relative to nominal ("muscle@1.1" is muscle at 1.048)."""
+    base, at, _ = name.partition("@")
+    return (base, material(name).density / _TABLE[base][1]) if at and base in _TABLE else (name, 1.0)
 
 
 def _element_density(symbol: str) -> float | None:

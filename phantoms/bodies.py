@@ -17,6 +17,9 @@ from ctsim.types import Phantom
 REACH = 0.92
 """Every object stays within this share of its cube: radius and half height are REACH·size/2."""
 
+FINEST = 200
+"""The finest texture, in correlation lengths along the cube's edge."""
+
 Shape = tuple[int, int, int]
 Millimetres = Annotated[float, msgspec.Meta(ge=1e-3, le=2000)]
 Side = Annotated[int, msgspec.Meta(ge=1, le=2048)]
@@ -36,6 +39,12 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Number of inserts, instead of the recipe's own."""
     insert_mm: Millimetres | None = None
     """Diameter of the inserts in mm, instead of the recipe's own."""
+    grid_shift: Triple = (0.0, 0.0, 0.0)
+    """Shift of the label grid (z, y, x) in its voxels, at most half a one; the object stays where it is."""
+    texture: float = 0.0
+    """Relative standard deviation of the density within each tissue, in seven levels; 0 to 0.2."""
+    texture_mm: Millimetres | None = None
+    """Distance (mm) over which the density's correlation falls to a half; by default a thirtieth of `size`."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.size) and 1e-3 <= self.size <= 2000):
@@ -47,6 +56,13 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         if self.insert_mm is not None and not 1e-3 <= self.insert_mm <= 0.25 * self.size:
             raise InputError(
                 f"insert_mm must be at least 0.001 mm and at most a quarter of size {self.size}: {self.insert_mm}"
+            )
+        if not all(abs(s) <= 0.5 for s in self.grid_shift):
+            raise InputError(f"grid_shift must be within -0.5 to 0.5 voxels along every axis, got {self.grid_shift}")
+        self.within("texture", 0.0, 0.2)
+        if self.texture_mm is not None and not self.size / FINEST <= self.texture_mm <= self.size:
+            raise InputError(
+                f"texture_mm must be within size / {FINEST} and size = {self.size} mm, got {self.texture_mm}"
             )
         if self.metal != "none":
             self.known("metal")
@@ -80,12 +96,18 @@ def half_box(n: Shape, d_voxel: Triple) -> float:
     return min(k * d for k, d in zip(n, d_voxel, strict=True)) / 2
 
 
-def assemble(labels: np.ndarray, d_voxel: Triple, materials: Sequence[str], solids: Sequence[Solid]) -> Phantom:
+def assemble(
+    labels: np.ndarray,
+    d_voxel: Triple,
+    materials: Sequence[str],
+    solids: Sequence[Solid],
+    shift: Triple = (0.0, 0.0, 0.0),
+) -> Phantom:
     """Make a phantom, adding the solids' materials to the table and clearing labels beyond the reach.
 
     The cleared rim makes the bounding cylinder that scene checks rely on hold for every seed.
     """
-    z, y, x = (((np.arange(k) + 0.5 - k / 2) * d) for k, d in zip(labels.shape, d_voxel, strict=True))
+    z, y, x = ((np.arange(k) + 0.5 - k / 2 + s) * d for k, d, s in zip(labels.shape, d_voxel, shift, strict=True))
     limit = REACH * half_box(labels.shape, d_voxel)
     labels[:, np.hypot(y[:, None], x) > limit] = 0
     labels[np.abs(z) > limit] = 0
@@ -93,7 +115,10 @@ def assemble(labels: np.ndarray, d_voxel: Triple, materials: Sequence[str], soli
     for solid in solids:
         if solid.material not in names:
             names.append(solid.material)
-    return Phantom(labels=labels, materials=tuple(names), d_voxel=d_voxel, solids=tuple(solids))
+    z, y, x = (s * d for s, d in zip(shift, d_voxel, strict=True))
+    return Phantom(
+        labels=labels, materials=tuple(names), d_voxel=d_voxel, off_origin=(z, y, x), solids=tuple(solids)
+    )
 
 
 class Validation(Recipe, frozen=True, kw_only=True, tag="validation"):

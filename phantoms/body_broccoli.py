@@ -40,7 +40,7 @@ class Broccoli(Recipe, frozen=True, kw_only=True, tag="broccoli"):
 def broccoli(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Broccoli) -> Phantom:
     """Draw the head; metal: rivets through the stem, then in the crown."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel)
+    canvas = Canvas(n, d_voxel, shift=params.grid_shift)
     buds = _branches(canvas, body, params)
     grains = body.standard_normal((32, 6, 3))
     grains /= np.linalg.norm(grains, axis=2, keepdims=True)
@@ -51,7 +51,7 @@ def broccoli(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Brocco
         for way in grains[k % len(grains)]:
             canvas.ellipsoid(WATER, at + 0.95 * r * way, 0.36 * r)
     _stem(canvas, body)
-    return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit))
+    return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit), params.grid_shift)
 
 
 def _stem(canvas: Canvas, rng: np.random.Generator) -> None:

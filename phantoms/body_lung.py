@@ -41,7 +41,7 @@ class Lung(Recipe, frozen=True, kw_only=True, tag="lung"):
 def lung(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Lung) -> Phantom:
     """Draw a thorax; metal: two rods along the spine, then balls in muscle, heart and chest wall."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel, shrink=0.95)
+    canvas = Canvas(n, d_voxel, shrink=0.95, shift=params.grid_shift)
     wall = _wall(canvas, body)
     _lungs(canvas, body, params.vessels)
     _pleura(canvas, wall)
@@ -49,7 +49,7 @@ def lung(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Lung) -> P
     _ribs(canvas, body, params.ribs, wall)
     _shoulders(canvas, wall)
     _spine(canvas, body, wall)
-    return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit))
+    return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit), params.grid_shift)
 
 
 class Wall(NamedTuple):

@@ -89,7 +89,7 @@ def _drop_crumbs(labels: NDArray[np.uint8], of: int) -> None:
 def walnut(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Walnut) -> Phantom:
     """Draw a shell with seam, two folded kernel halves (fat) joined by a neck, a membrane between, and air gaps."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel)
+    canvas = Canvas(n, d_voxel, shift=params.grid_shift)
     dents, rough, warp = Noise(body, 9), Noise(body, 8), Noise(body, 4)
     radii = np.array([0.74, 0.70, 0.84]) * (1 + 0.03 * body.uniform(-1, 1, 3))
     folds = _ripples(body, 10.0)
@@ -135,7 +135,7 @@ def walnut(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Walnut) 
         middle = np.array([0.0, 0.0, 0.14 * (k % 3 - 1)])  # the pins cross the axis at heights of their own
         head = _held(_skin(level, middle, way), 0.9 * d / canvas.unit)
         solids.append(make.pin(f"pin{k}", head, -way, d, 0.95 * canvas.unit))
-    return assemble(canvas.labels, d_voxel, ("air", "cellulose", "adipose"), solids)
+    return assemble(canvas.labels, d_voxel, ("air", "cellulose", "adipose"), solids, params.grid_shift)
 
 
 def _drumstick(z: Field, bump: Field, sink: float = 0.0) -> tuple[Field, Field]:
@@ -156,7 +156,7 @@ JOINTS = (((0.03, 0.0, 0.6), 0.15), ((0.17, 0.02, 0.6), 0.14), ((-0.05, 0, -0.76
 def chicken(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Chicken) -> Phantom:
     """Draw skin, fat, muscle bundles, a long bone with marrow and knobs, a splint bone; a wire wound on the skin."""
     body, _ = rng.spawn(2)
-    canvas = Canvas(n, d_voxel)
+    canvas = Canvas(n, d_voxel, shift=params.grid_shift)
     _, meat, fat, bone = range(4)
     bumps, sheets, spongy = Noise(body, 6), Noise(body, 7), Noise(body, 50)
 
@@ -195,7 +195,7 @@ def chicken(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Chicken
     solids = [
         make.wire(f"wire{k}", _winding(bumps, params.turns, k / total, d / 2 / canvas.unit), d) for k in range(total)
     ]
-    return assemble(canvas.labels, d_voxel, ("air", "soft_tissue", "adipose", "cortical_bone"), solids)
+    return assemble(canvas.labels, d_voxel, ("air", "soft_tissue", "adipose", "cortical_bone"), solids, params.grid_shift)
 
 
 def _winding(bumps: Noise, turns: float, start: float, radius: float) -> NDArray[np.float64]:
@@ -219,7 +219,7 @@ def _winding(bumps: Noise, turns: float, start: float, radius: float) -> NDArray
 def bell_pepper(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: BellPepper) -> Phantom:
     """Draw a hollow lobed wall with skin, ribs within, the seeded core and the stem."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel)
+    canvas = Canvas(n, d_voxel, shift=params.grid_shift)
     air, water, fibre = range(3)
     wobble, phase, lobes = Noise(body, 4), body.uniform(0, 2 * math.pi), params.lobes
 
@@ -271,4 +271,4 @@ def bell_pepper(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Bel
         out = np.array([math.cos(a), math.sin(a), 0.0])
         head = _held(_skin(level, [0.0, 0.0, metal.uniform(-0.2, 0.15)], out), 0.4 * d / canvas.unit)
         solids.append(make.rivet(f"rivet{k}", head, -out, d, 0.24 * canvas.unit))
-    return assemble(canvas.labels, d_voxel, ("air", "water", "cellulose"), solids)
+    return assemble(canvas.labels, d_voxel, ("air", "water", "cellulose"), solids, params.grid_shift)

@@ -81,7 +81,7 @@ class Tooth(NamedTuple):
 def teeth(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Teeth) -> Phantom:
     """Draw the jaws; metal: implants under crowns of their own, crowns over whole teeth, and restorations."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel, shrink=0.9)
+    canvas = Canvas(n, d_voxel, shrink=0.9, shift=params.grid_shift)
     _soft(canvas, body)
     spongy = Noise(body, 56)
     rows = [_row(body, jaw) for jaw in (-1, 1)]
@@ -96,7 +96,7 @@ def teeth(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Teeth) ->
     solids = _metal(metal, params, canvas.unit, rows[0])
     if params.metal != "none":
         solids += _restorations(params, canvas.unit, present, rows[1])
-    return assemble(canvas.labels, d_voxel, MATERIALS, solids)
+    return assemble(canvas.labels, d_voxel, MATERIALS, solids, params.grid_shift)
 
 
 def _arch(t: Field | float) -> tuple[Field, Field]:

@@ -50,6 +50,8 @@ class CtVolume(Recipe, frozen=True, kw_only=True, tag="ct_volume"):
         """Check the ranges; take the file's hash, so that the recipe says what is scanned."""
         Recipe.__post_init__(self)
         self.within("kev", 20, 200)
+        if self.texture:
+            raise InputError("texture: expected none, for a CT volume has a density of its own in every voxel")
         if not np.isfinite(self.rescale).all() or self.rescale[0] <= 0:
             raise InputError(f"rescale must be a positive slope and an intercept in HU, got {self.rescale}")
         if self.at and self.n_inserts not in (None, len(self.at)):
@@ -68,11 +70,12 @@ def ct_volume(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: CtVol
     """
     hu = _read(params)
     labels, density = _tissues(_resampled(hu, params, n, d_voxel), params.kev)
-    phantom = assemble(labels, d_voxel, TISSUES, _inserts(hu, params, half_box(n, d_voxel), rng))
+    phantom = assemble(labels, d_voxel, TISSUES, _inserts(hu, params, half_box(n, d_voxel), rng), params.grid_shift)
     return Phantom(
         labels=phantom.labels,
         materials=phantom.materials,
         d_voxel=d_voxel,
+        off_origin=phantom.off_origin,
         density=density,
         solids=phantom.solids,
     )
@@ -113,7 +116,7 @@ def _resampled(hu: NDArray[np.float32], params: CtVolume, n: Shape, d_voxel: Tri
             f"spacing: {params.spacing} mm makes more than {MOST} places of the object's cube; expected less"
         )
     fine, step = np.multiply(n, times), np.divide(d_voxel, params.spacing) / times
-    first: Any = (0.5 - fine / 2) * step + np.divide(hu.shape, 2) - 0.5
+    first: Any = (0.5 - fine / 2 + np.multiply(params.grid_shift, times)) * step + np.divide(hu.shape, 2) - 0.5
     out = np.empty(fine, np.float32)
     ndimage.affine_transform(hu, step, first, output=out, order=1, mode="nearest")
     for axis, (count_fine, size) in enumerate(zip(fine, hu.shape, strict=True)):

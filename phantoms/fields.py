@@ -60,12 +60,13 @@ class Canvas:
     """A label volume that shapes are painted on; later paint covers earlier, unless `over` restricts it.
 
     Coordinates are relative: x, y, z in units of `shrink` times half the shortest edge of the box. `over` lists the
-    labels that may be replaced (None: all).
+    labels that may be replaced (None: all). `shift` (z, y, x) moves the grid, not the shapes, by a share of a voxel.
     """
 
     n: tuple[int, int, int]
     d_voxel: Triple
     shrink: float = 1.0
+    shift: Triple = (0.0, 0.0, 0.0)
     unit: float = field(init=False)
     labels: NDArray[np.uint8] = field(init=False)
     axes: tuple[Field, Field, Field] = field(init=False)
@@ -74,8 +75,8 @@ class Canvas:
         self.unit = self.shrink * min(k * d for k, d in zip(self.n, self.d_voxel, strict=True)) / 2
         self.labels = np.zeros(self.n, np.uint8)
         z, y, x = (
-            ((np.arange(k) + 0.5 - k / 2) * d / self.unit).astype(np.float32)
-            for k, d in zip(self.n, self.d_voxel, strict=True)
+            ((np.arange(k) + 0.5 - k / 2 + s) * d / self.unit).astype(np.float32)
+            for k, d, s in zip(self.n, self.d_voxel, self.shift, strict=True)
         )
         self.axes = (x, y, z)
 

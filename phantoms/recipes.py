@@ -21,6 +21,7 @@ from ctsim.phantoms.body_teeth import Teeth, teeth
 from ctsim.phantoms.body_volume import CtVolume, ct_volume
 from ctsim.phantoms.patients.hip import Hip, hip
 from ctsim.phantoms.patients.spine import Spine, spine
+from ctsim.phantoms.texture import textured
 from ctsim.types import Phantom
 
 AnyRecipe = (
@@ -59,4 +60,4 @@ def build_recipe(params: Recipe, seed: int) -> Phantom:
         raise InputError(
             f"recipe {params.recipe!r}: the scene is empty at n_voxel = {params.n_voxel}; expected a finer grid"
         )
-    return phantom
+    return textured(phantom, params, seed) if params.texture else phantom

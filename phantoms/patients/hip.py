@@ -58,7 +58,7 @@ class Hip(Recipe, frozen=True, kw_only=True, tag="hip"):
 def hip(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Hip) -> Phantom:
     """Draw a pelvis with muscles, bladder, bowel and vessels; metal: a cup, a head and a stem a side."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel, shrink=0.95)
+    canvas = Canvas(n, d_voxel, shrink=0.95, shift=params.grid_shift)
     wall = _body(canvas, body)
     _muscles(canvas, body, wall)
     _organs(canvas, body)
@@ -67,7 +67,7 @@ def hip(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Hip) -> Pha
         _joint(canvas, side)
     _sacrum(canvas)
     trabeculae(canvas, body)
-    return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit))
+    return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit), params.grid_shift)
 
 
 class _Wall(NamedTuple):

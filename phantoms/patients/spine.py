@@ -58,7 +58,7 @@ class Spine(Recipe, frozen=True, kw_only=True, tag="spine"):
 def spine(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Spine) -> Phantom:
     """Draw an abdomen with kidneys, aorta, bowel and five vertebrae; metal: screws in pedicles, two rods."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel, shrink=0.95)
+    canvas = Canvas(n, d_voxel, shrink=0.95, shift=params.grid_shift)
     wall = _body(canvas, body)
     _muscles(canvas, wall)
     _organs(canvas, body)
@@ -66,7 +66,7 @@ def spine(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Spine) ->
         _vertebra(canvas, k)
     trabeculae(canvas, body)
     canvas.fill(AIR, lambda x, y, z: np.abs(z) >= END + 0 * x * y)
-    return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit))
+    return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit), params.grid_shift)
 
 
 class _Wall(NamedTuple):
