@@ -21,7 +21,7 @@ from ctsim.detector.response import response
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.human import human_bytes, human_time
-from ctsim.materials import attenuation
+from ctsim.materials import attenuation, nominal
 from ctsim.montecarlo.series import expected_histories
 from ctsim.notes import metal_notes
 from ctsim.scatter import open_fraction
@@ -60,7 +60,8 @@ class Output:
 class Plan:
     """The work for one scan. `seconds` is an estimate for this machine, the only entry that differs between runs.
 
-    `materials` are the ones that rays meet, air first. In P = −ln(signal/open), `error` is the greatest found of the
+    `materials` are the ones that rays meet, air first; `tissues` names for each the one that it is a level of density
+    of, mostly itself. In P = −ln(signal/open), `error` is the greatest found of the
     energy quadrature and `edge_error` is the largest found in eight windows at edges of inserts, in one view (see
     `ctsim.tracer.survey`); `scatter_error` is the RMS error of scatter by Monte Carlo over its mean, None for other
     scatter; `scatter_fraction` is the constant of level 1, whose error is not known. `spot` holds the points of a focal
@@ -75,6 +76,7 @@ class Plan:
     stages: tuple[Stage, ...]
     outputs: tuple[Output, ...]
     materials: tuple[str, ...]
+    tissues: tuple[str, ...]
     rule: EnergyRule
     spectrum: Spectrum
     dose: Dose
@@ -94,6 +96,11 @@ class Plan:
     def error(self) -> float:
         """Greatest |ΔP| found of the energy quadrature."""
         return self.rule.error
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """The materials that labels and path lengths tell apart, air first: those of `tissues`, each once."""
+        return tuple(dict.fromkeys(self.tissues))
 
     def runs(self, name: str) -> bool:
         """Say whether a stage is carried out."""
@@ -166,7 +173,9 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
     twin = _has_twin(phantom, truth)
     seen = Response.of(rule, tracer.materials)
     tried = trial(tracer, scanner.geometry, seen, settings=simulation, twin=twin)
-    outputs = _outputs(phantom, scanner, truth, present)
+    levels = density_levels(phantom)
+    tissues = tuple(levels[m][0] for m in present)
+    outputs = _outputs(phantom, scanner, truth, len(set(tissues)))
     spot = _spot(tracer, scanner, simulation)
     n_rays, n_voxels = int(np.prod(scanner.geometry.shape)), int(np.prod(scanner.geometry.n_voxel))
     draws = n_rays * (2 if twin else 1) * (scanner.noise.model != "none")
@@ -179,9 +188,10 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
         stream_id=stream_id,
         settings=simulation,
         truth=truth,
-        stages=_stages(phantom, scanner, truth, present, rule) + _blurs(scanner, spot),
+        stages=_stages(phantom, scanner, truth, tissues, rule) + _blurs(scanner, spot),
         outputs=outputs,
         materials=present,
+        tissues=tissues,
         rule=rule,
         spectrum=source,
         dose=dose_of(scanner.tube, scanner.geometry, scanner.i0),
@@ -209,7 +219,11 @@ def _rule(
     """Return the energies for the thickest rays of the survey, `lengths` [material, view, v, u]."""
     if not simulation.skip:
         return full_rule(source, scanner.detector)
-    thickest = {m: THICKNESS_MARGIN * float(np.max(lengths[k])) for k, m in enumerate(phantom.materials)}
+    levels, along = density_levels(phantom), dict[str, NDArray[np.float64]]()
+    for k, m in enumerate(phantom.materials):
+        base, share = levels[m]
+        along[base] = along.get(base, 0.0) + share * lengths[k]
+    thickest = {m: THICKNESS_MARGIN * float(np.max(length)) for m, length in along.items()}
     bowtie = scanner.tube.bowtie
     if bowtie is not None:
         thickest[bowtie.material] = thickest.get(bowtie.material, 0.0) + max(bowtie.center, bowtie.edge)
@@ -245,11 +259,23 @@ def present_materials(phantom: Phantom) -> tuple[str, ...]:
     return tuple(m for k, m in enumerate(phantom.materials) if k == 0 or k in used or m in solid)
 
 
+def density_levels(phantom: Phantom) -> dict[str, tuple[str, float]]:
+    """Return, for each material, the one of the phantom's that it is a level of density of, and its relative density.
+
+    A material of solids is itself, whatever its density.
+    """
+    solid, found = {s.material for s in phantom.solids}, {}
+    for m in phantom.materials:
+        base, share = (m, 1.0) if m in solid else nominal(m)
+        found[m] = (base, share) if base in phantom.materials else (m, 1.0)
+    return found
+
+
 def _has_twin(phantom: Phantom, truth: Truth) -> bool:
     return truth.twin and any(s.metal for s in phantom.solids)
 
 
-def _outputs(phantom: Phantom, scanner: Scanner, truth: Truth, present: tuple[str, ...]) -> tuple[Output, ...]:
+def _outputs(phantom: Phantom, scanner: Scanner, truth: Truth, n_tissues: int) -> tuple[Output, ...]:
     image = scanner.geometry.n_detector
     counts = np.dtype(scanner.noise.dtype).name
     asked = [Output(name="counts", shape=image, dtype=counts)]
@@ -266,7 +292,7 @@ def _outputs(phantom: Phantom, scanner: Scanner, truth: Truth, present: tuple[st
         if truth.metal_path:
             asked.append(Output(name="metal_path", shape=image, dtype="float32"))
     if truth.paths:
-        asked.append(Output(name="paths", shape=(len(present) - 1, *image), dtype="float32"))
+        asked.append(Output(name="paths", shape=(n_tissues - 1, *image), dtype="float32"))
     return tuple(asked)
 
 
@@ -293,11 +319,13 @@ def _lag_bytes(scanner: Scanner, outputs: tuple[Output, ...]) -> int:
 
 
 def _stages(
-    phantom: Phantom, scanner: Scanner, truth: Truth, present: tuple[str, ...], rule: EnergyRule
+    phantom: Phantom, scanner: Scanner, truth: Truth, tissues: tuple[str, ...], rule: EnergyRule
 ) -> tuple[Stage, ...]:
     metal = any(s.metal for s in phantom.solids)
-    stages = [Stage(name=m, runs=True) for m in present[1:]]
-    stages += [Stage(name=m, runs=False, reason="absent") for m in phantom.materials if m not in present]
+    met = {m: tissues.count(m) for m in tissues[1:]}
+    stages = [Stage(name=m, runs=True, reason=f"{n} densities" if n > 1 else "") for m, n in met.items()]
+    bases = dict.fromkeys(base for base, _ in density_levels(phantom).values())
+    stages += [Stage(name=m, runs=False, reason="absent") for m in bases if m not in tissues]
     stages.append(Stage(name=f"{len(rule.energies)} energies", runs=True))
     why = "no solids" if not phantom.solids else ""
     stages.append(Stage(name="sub-rays", runs=not why, reason=why or "edges only"))

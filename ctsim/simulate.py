@@ -6,7 +6,7 @@ before it, which are made again where a run that was interrupted goes on. It giv
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -21,7 +21,7 @@ from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.montecarlo.series import ScatterSeries, scatter_series
 from ctsim.montecarlo.transport import Source
-from ctsim.plan import Plan
+from ctsim.plan import Plan, density_levels
 from ctsim.rng import stream_key
 from ctsim.tracer.project import Response, Tracer, path_lengths, transmit
 from ctsim.tracer.shadow import join, row_spans
@@ -47,6 +47,14 @@ def compact(phantom: Phantom, materials: tuple[str, ...]) -> Phantom:
         density=phantom.density,
         solids=phantom.solids,
     )
+
+
+def undivided(phantom: Phantom, plan: Plan) -> Phantom:
+    """Return a phantom of the plan's materials with the levels of density put together: labels of `plan.told`."""
+    if plan.told == plan.materials:
+        return phantom
+    table = np.array([plan.told.index(m) for m in plan.tissues], np.uint8)
+    return replace(phantom, labels=table[phantom.labels], materials=plan.told)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,12 +101,23 @@ def _panel(scanner: Scanner) -> Panel | None:
     return Panel(detector.blur, detector.lag, scanner.geometry.d_detector)
 
 
+def _fold(plan: Plan, phantom: Phantom) -> NDArray[np.float32] | None:
+    """Relative density [told, material] of each material in the one it is told as; None where all are themselves."""
+    if plan.told == plan.materials:
+        return None
+    levels, fold = density_levels(phantom), np.zeros((len(plan.told), len(plan.materials)), np.float32)
+    for k, (name, base) in enumerate(zip(plan.materials, plan.tissues, strict=True)):
+        fold[plan.told.index(base), k] = levels[name][1]
+    return fold
+
+
 class _Simulator:
     """One scan being simulated; holds what the views share."""
 
     def __init__(self, plan: Plan, phantom: Phantom, scanner: Scanner) -> None:
         self.plan, self.scanner, self.geometry = plan, scanner, scanner.geometry
         self.beam = _beam(plan, scanner)
+        self.fold = _fold(plan, phantom)
         body = compact(phantom, plan.materials)
         self.tracer = Tracer.of(body, skip=plan.settings.skip, extra=self.beam.layer_material)
         self.bare = self.tracer.without_metal()
@@ -225,6 +244,10 @@ class _Simulator:
             m1, m2 = m1 + np.float32(s), m2 + np.float32(s * self.plan.rule.w2.sum())
         return m1, m2
 
+    def _told(self, lengths: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Put lengths [material, v, u] in levels of density together, as lengths at nominal density."""
+        return lengths if self.fold is None else np.tensordot(self.fold, lengths, 1)
+
     def _images(self, moments: Moments, lit: Moments, prefix: str = "") -> dict[str, NDArray]:
         """Return the noise-free images that were asked for, of the moments without and with scatter."""
         m1, out = moments[0], {}
@@ -271,7 +294,7 @@ class _Simulator:
             self._cross(self.geometry, k)  # the rays from the spot's centre
         lengths = path_lengths(self.tracer, self.geometry, k, self.lengths)[: len(self.plan.materials)]
         metal = lengths[self.metal[: len(lengths)]].sum(0)
-        all_paths = {"trace": (metal > 0).astype(np.uint8), "metal_path": metal, "paths": lengths[1:]}
+        all_paths = {"trace": (metal > 0).astype(np.uint8), "metal_path": metal, "paths": self._told(lengths)[1:]}
         out: dict[str, NDArray] = {name: all_paths[name] for name in wanted}
         twin = None
         if "metal_free/counts" in self.names and energies:
@@ -332,7 +355,7 @@ def truth_volumes(plan: Plan, phantom: Phantom, scanner: Scanner) -> Iterator[tu
     scans = [("", body)] + ([("metal_free/", body.without_metal())] if plan.runs("metal-free twin") else [])
     yield "metal", metal_mask(body, geometry)
     for prefix, content in scans:
-        yield prefix + "labels", label_volume(content, geometry)
+        yield prefix + "labels", label_volume(undivided(content, plan), geometry)
         yield prefix + "reference_effective", attenuation_volume(content, geometry, effective)
         yield prefix + "reference_50kev", attenuation_volume(content, geometry, at_50)
 
@@ -357,6 +380,6 @@ def scan_info(plan: Plan, phantom: Phantom, scanner: Scanner) -> dict:
         "l0": plan.l0,
         "mean_detected_kev": float(np.average(plan.spectrum.energies, weights=plan.spectrum.weights * a1)),
         "scatter_fraction": plan.scatter_fraction,
-        "materials": list(plan.materials),
+        "materials": list(plan.told),
         "metal": sorted({s.material for s in phantom.solids if s.metal}),
     } | ({"notes": list(plan.notes)} if plan.notes else {})

@@ -181,7 +181,7 @@ def test_the_twin_is_the_scan_of_the_body_without_metal_to_the_last_count(skip):
     machine = machine_of(given["spot"], geometry, Noise())
     alone = dataclasses.replace(
         make_plan(bare, machine, given["settings"], Truth(), "scene"),
-        rule=plan.rule, materials=plan.materials, spot=plan.spot,
+        rule=plan.rule, materials=plan.materials, tissues=plan.tissues, spot=plan.spot,
     )  # fmt: skip
     for out, (_, other) in zip(views, simulate_views(alone, bare, machine), strict=True):
         np.testing.assert_array_equal(out["metal_free/counts"], other["counts"])

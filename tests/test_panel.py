@@ -206,7 +206,7 @@ def scan(phantom, scanner, first_view=0, truth=None, **changes):
 def test_the_twin_is_the_scan_of_the_body_without_metal_to_the_last_count(detector):
     scanner = machine(noise=Noise(fixed_pattern=0.02), **detector)
     plan, out = scan(BODY, scanner)
-    _, alone = scan(BODY.without_metal(), scanner, rule=plan.rule, materials=plan.materials)
+    _, alone = scan(BODY.without_metal(), scanner, rule=plan.rule, materials=plan.materials, tissues=plan.tissues)
     np.testing.assert_array_equal(out["metal_free/counts"], alone["counts"])
     changed = out["counts"] != out["metal_free/counts"]
     assert 0 < changed.mean() < 0.6

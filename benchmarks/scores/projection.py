@@ -98,7 +98,7 @@ def _simulated(scene: Any, geometry: Geometry, stored: StoredScan) -> HeldOut:
     asked = settings.Truth(twin=False, noise_free=True, paths=True, trace=True, mono_kev=(REFERENCE_KEV,))
     plan = make_plan(phantom, scanner, scene.simulation, asked, stream_id(scene))
     energies, weights = effective_weights(plan.spectrum, scanner.detector, stored.l0)
-    mu = np.array([float(attenuation(m, energies) @ weights) for m in plan.materials[1:]])
+    mu = np.array([float(attenuation(m, energies) @ weights) for m in plan.told[1:]])
     views = [images for _, images in simulate_views(plan, phantom, scanner)]
     paths = np.stack([images["paths"] for images in views])
     body = paths.sum(1) > 0
