@@ -1,0 +1,151 @@
+"""Hips, spines and restored teeth: bone under the skin, metal in bone and in touch, several metals in one body."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+from ctsim.materials import attenuation, material
+from ctsim.phantoms.body_teeth import Teeth
+from ctsim.phantoms.patients.hip import Hip
+from ctsim.phantoms.patients.spine import Spine
+from ctsim.phantoms.recipes import build_recipe
+from ctsim.solids import Solid
+from ctsim.tracer.voxelise import fractions
+from ctsim.types import Phantom
+
+N = 96
+KINDS = pytest.mark.parametrize("kind", (Hip, Spine))
+SEEDED = pytest.mark.parametrize("seed", (1, 2, 3))
+BONES = ("cortical_bone", "spongiosa")
+CAPPED = slice(int(N * 0.22), int(N * 0.78))  # slices between the planes in which these bodies are cut, and 1 mm
+
+
+@cache
+def body(kind, seed: int = 1, **changes) -> Phantom:
+    return build_recipe(kind(n_voxel=(N, N, N), **changes), seed)
+
+
+def part(phantom: Phantom, *names: str) -> NDArray[np.bool_]:
+    return np.isin(phantom.labels, [phantom.materials.index(name) for name in names])
+
+
+def grid(phantom: Phantom) -> Geometry:
+    d = phantom.d_voxel
+    detector = {"n_detector": (8, 8), "d_detector": (10.0, 10.0)}
+    return Geometry(dso=500.0, dsd=900.0, n_voxel=(N, N, N), d_voxel=d, n_views=1, **detector)
+
+
+def cells(phantom: Phantom, solids: list[Solid]) -> NDArray[np.bool_]:
+    """Voxels that some of a phantom's solids fill by more than a tenth."""
+    bare = Phantom(
+        labels=np.zeros_like(phantom.labels),
+        materials=phantom.materials,
+        d_voxel=phantom.d_voxel,
+        solids=tuple(solids),
+    )
+    return fractions(bare, grid(phantom))["air"] < 0.9
+
+
+@KINDS
+@SEEDED
+def test_bone_and_metal_lie_deep_under_the_skin(kind, seed: int) -> None:
+    phantom = body(kind, seed)
+    inner = cells(phantom, list(phantom.solids))[CAPPED] | part(phantom, *BONES)[CAPPED]
+    for shown, inside in zip(phantom.labels[CAPPED], inner, strict=True):
+        filled = ndimage.binary_fill_holes(shown > 0)
+        deep = ndimage.distance_transform_edt(np.pad(filled, 1), phantom.d_voxel[1:])[1:-1, 1:-1]
+        # skin, fat and muscle: at least 2 mm in a 60 mm cube, 6 mm and more in a patient
+        assert not inside.any() or deep[inside].min() > 2.0
+
+
+@KINDS
+@SEEDED
+def test_the_body_is_one_piece_and_no_gas_lies_against_bone(kind, seed: int) -> None:
+    phantom = body(kind, seed)
+    _, n = ndimage.label(phantom.labels > 0)
+    assert n == 1
+    beside_air = ndimage.binary_dilation(phantom.labels == 0)
+    assert not (part(phantom, *BONES) & beside_air)[CAPPED].any()
+    assert not phantom.labels[: int(N * 0.2)].any()  # a slice: nothing beyond its planes
+    assert not phantom.labels[-int(N * 0.2) :].any()
+
+
+@SEEDED
+def test_the_head_fills_its_cup_and_the_stem_stands_in_the_shaft(seed: int) -> None:
+    phantom = body(Hip, seed)
+    solids = {s.name: s for s in phantom.solids}
+    assert {s.material for s in solids.values()} == {"Ti", "CoCr"} and len(solids) == 10
+    for side in ("left", "right"):
+        cup, head = (cells(phantom, [solids[f"{name}-{side}"]]) for name in ("cup", "head"))
+        (ball,) = solids[f"head-{side}"].primitives
+        assert ball.params[0] > 0.8 * max(p.radius for p in solids[f"cup-{side}"].primitives)
+        assert (cup & head).any()  # the head lies in the cup: it is painted after it
+        around = ndimage.binary_dilation(cup, iterations=2) & ~cup & ~head
+        assert part(phantom, *BONES)[around].mean() > 0.35  # the socket about the dome; the rest is the open side
+        stem = cells(phantom, [solids[f"stem-{side}"], solids[f"tip-{side}"]])
+        assert (ndimage.binary_dilation(stem) & cells(phantom, [solids[f"neck-{side}"]])).any()
+        low = stem & (np.arange(N) < N * 0.4)[:, None, None]
+        assert low.any() and part(phantom, *BONES, "adipose")[low].all()  # marrow or bone, not muscle
+    assert sum("left" in name for name in (s.name for s in body(Hip, seed, n_inserts=1).solids)) == 5
+
+
+@SEEDED
+def test_screws_run_through_pedicles_and_rods_through_their_heads(seed: int) -> None:
+    phantom = body(Spine, seed)
+    assert {s.material for s in phantom.solids} == {"Ti", "CoCr"}
+    rods = {s.name: s for s in phantom.solids if s.material == "CoCr"}
+    assert set(rods) == {"rod-left", "rod-right"}
+    for solid in phantom.solids:
+        if solid.name.startswith("head"):
+            side = "left" if "left" in solid.name else "right"
+            gap = np.array([p.centre for p in rods[f"rod-{side}"].primitives])
+            (head,) = solid.primitives
+            ends = [gap[k] - head.centre for k in range(len(gap))]
+            assert min(np.linalg.norm(e[:2]) for e in ends) < head.params[1]  # its axis passes within the head
+        if solid.name.startswith("screw"):
+            shank = cells(phantom, [solid])
+            assert part(phantom, *BONES, "adipose")[shank].mean() > 0.9  # marrow counts as bone
+            canal = part(phantom, "soft_tissue") & shank
+            assert canal.mean() < 1e-5  # never in the dural sac
+    assert len(body(Spine, seed, n_inserts=3).solids) == 3 * 2 + 1  # the third vertebra's side has one head: no rod
+
+
+@SEEDED
+def test_restorations_sit_in_teeth_and_need_free_ones(seed: int) -> None:
+    plain = body(Teeth, seed)
+    full = body(Teeth, seed, fillings=4, gold_crowns=2, bridges=1)
+    assert np.array_equal(plain.labels, full.labels) and full.solids[: len(plain.solids)] == plain.solids
+    more = full.solids[len(plain.solids) :]
+    assert [s.material for s in more] == ["CoCr"] + ["Au"] * 2 + ["amalgam"] * 4
+    assert all(s.metal for s in more)
+    for solid in more:
+        inside = cells(full, [solid])
+        if solid.material == "CoCr":
+            assert ndimage.label(inside)[1] == 1  # one piece over three teeth
+        else:
+            assert part(full, "enamel", "dentin")[inside].mean() > 0.5, solid.name
+    others = [s for s in more if s.material == "amalgam"]
+    metal = cells(full, [s for s in full.solids if s not in others])
+    assert not any((cells(full, [s]) & metal).sum() > 0.2 * cells(full, [s]).sum() for s in others)
+    with pytest.raises(InputError, match="fillings: 12 are asked for"):
+        body(Teeth, seed, fillings=12, bridges=2, missing=10)
+    assert not any(s.metal for s in body(Teeth, seed, metal="none", fillings=4, bridges=2).solids)
+
+
+def test_the_second_metal_is_checked_and_told() -> None:
+    for kind, key in ((Hip, "head"), (Spine, "rods")):
+        with pytest.raises(InputError, match=f"^{key}: unknown material"):
+            kind(**{key: "CoCrr"})
+        assert any(s.material == "W" for s in body(kind, 1, **{key: "W"}).solids)
+
+
+def test_amalgam_lies_between_its_metals() -> None:
+    energies = np.array([40.0, 60.0, 100.0])
+    mercury, silver, amalgam = (attenuation(m, energies) for m in ("Hg", "Ag", "amalgam"))
+    assert sum(material("amalgam").mass_fractions.values()) == pytest.approx(1)
+    assert (amalgam > 0.5 * np.minimum(mercury, silver)).all() and (amalgam < np.maximum(mercury, silver)).all()
