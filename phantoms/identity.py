@@ -24,6 +24,8 @@ FIRST_KEYS: dict[str, frozenset[str]] = {
         "BellPepper": f"{_BODY} lobes",
         "Random": f"{_BODY} organs",
         "CtVolume": f"{_BODY} path spacing rescale kev at sha256",
+        "Hip": f"{_BODY} head",
+        "Spine": f"{_BODY} rods",
         "ScannerSettings": "preset n_views n_detector n_voxel field_mm start_deg arc_deg angles_deg off_detector "
         "off_origin geometry tube detector noise scatter i0",
         "Geometry": "dso dsd n_voxel d_voxel n_detector d_detector n_views off_origin off_detector start_deg arc_deg "

@@ -21,7 +21,7 @@ from ctsim.detector.response import Detector
 from ctsim.errors import InputError
 from ctsim.phantoms.body_lung import Lung
 from ctsim.phantoms.identity import FIRST_KEYS, identity
-from ctsim.phantoms.recipes import NAMES
+from ctsim.phantoms.recipes import BUILDERS, NAMES
 from ctsim.phantoms.scanners import MACHINES, ScannerSettings, preset
 from ctsim.phantoms.scene import Scene, build, load_suite, parse_suite, scene_id, scene_to_toml, stream_id
 from ctsim.plan import make_plan
@@ -144,7 +144,9 @@ def test_a_later_key_is_part_of_an_id_only_where_it_is_used() -> None:
 
 def test_the_defaults_of_later_keys_stay() -> None:
     """An id without such a key means its default: a new key is added here, and no entry ever changes."""
-    known = {
+    body = {"grid_shift": (0.0, 0.0, 0.0), "texture": 0.0, "texture_mm": None}
+    known = {kind.__name__: body for kind in BUILDERS} | {
+        "Teeth": {**body, "fillings": 0, "gold_crowns": 0, "bridges": 0},
         "ScannerSettings": {"scan_kerma": None, "scan_mas": None},
         "Tube": {"falloff": False, "focal_spot": None, "off_focal": None},
         "Detector": {"blur": None, "lag": ()},
