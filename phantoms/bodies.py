@@ -116,9 +116,7 @@ def assemble(
         if solid.material not in names:
             names.append(solid.material)
     z, y, x = (s * d for s, d in zip(shift, d_voxel, strict=True))
-    return Phantom(
-        labels=labels, materials=tuple(names), d_voxel=d_voxel, off_origin=(z, y, x), solids=tuple(solids)
-    )
+    return Phantom(labels=labels, materials=tuple(names), d_voxel=d_voxel, off_origin=(z, y, x), solids=tuple(solids))
 
 
 class Validation(Recipe, frozen=True, kw_only=True, tag="validation"):

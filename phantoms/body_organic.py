@@ -195,7 +195,9 @@ def chicken(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Chicken
     solids = [
         make.wire(f"wire{k}", _winding(bumps, params.turns, k / total, d / 2 / canvas.unit), d) for k in range(total)
     ]
-    return assemble(canvas.labels, d_voxel, ("air", "soft_tissue", "adipose", "cortical_bone"), solids, params.grid_shift)
+    return assemble(
+        canvas.labels, d_voxel, ("air", "soft_tissue", "adipose", "cortical_bone"), solids, params.grid_shift
+    )
 
 
 def _winding(bumps: Noise, turns: float, start: float, radius: float) -> NDArray[np.float64]:

@@ -264,7 +264,7 @@ def test_the_scanned_broccoli_is_not_the_synthetic_one() -> None:
             grown[small, one.seed] = build_recipe(small, one.seed).labels > 0
         return grown[small, one.seed]
 
-    own = head("real")
+    own = head("lookalike")
     for suite in ("quick", "core", "paper"):
         # two heads that fill the same part of the cube share some voxels; a head shares all with itself
         assert (own & head(suite)).sum() / (own | head(suite)).sum() < 0.9

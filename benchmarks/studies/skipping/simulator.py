@@ -130,7 +130,7 @@ class Bench:
 
     def inside_and_outside(self) -> Iterator[PlannedScan]:
         """Yield a scan with metal seen only through the body, and one with metal also seen next to the body."""
-        yield from map(self.planned, (self.scene(), self.scene("real", "chicken-Fe")))
+        yield from map(self.planned, (self.scene(), self.scene("lookalike", "chicken-Fe")))
 
     def planned(
         self, scene: Scene | None = None, truth: Truth = LINES, *, phantom: Phantom | None = None, **changes: Any
