@@ -236,7 +236,7 @@ def test_a_shifted_grid_shows_the_same_object_elsewhere_sampled(kind) -> None:
         return
     assert moved.off_origin == pytest.approx((0.625,) * 3) and not np.array_equal(plain.labels, moved.labels)
     where = geometry(plain, 40)
-    mu = {m: 1.0 for m in plain.materials}
+    mu = dict.fromkeys(plain.materials, 1.0)
     first, second = (attenuation_volume(p, where, mu) for p in (plain, moved))
     # half a voxel is 0.63 mm. Walls thinner than a voxel come and go, which moved the pepper's centre by 0.17 mm
     assert np.abs(centroid(first, 1.5) - centroid(second, 1.5)).max() < 0.2
@@ -248,6 +248,6 @@ def test_a_ct_volume_stays_where_it_is_on_a_shifted_grid(tmp_path) -> None:
     made = CtVolume(path=str(tmp_path / "ball.npy"), spacing=(1.0,) * 3, size=40.0, n_voxel=(36,) * 3, metal="none")
     for shift in ((0.0, 0.0, 0.0), SHIFT):
         phantom = build_recipe(msgspec.structs.replace(made, grid_shift=shift), 0)
-        volume = attenuation_volume(phantom, geometry(phantom, 20), {m: 1.0 for m in phantom.materials})
+        volume = attenuation_volume(phantom, geometry(phantom, 20), dict.fromkeys(phantom.materials, 1.0))
         # the file's own ball is a staircase of 1 mm; not shifted it would lie up to 0.48 mm off
         assert np.abs(centroid(volume, 2.0) - [0, -4, 3]).max() < 0.15

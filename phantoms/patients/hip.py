@@ -10,7 +10,7 @@ import numpy as np
 
 from ctsim.geometry import Triple
 from ctsim.phantoms.bodies import Recipe, Shape, assemble
-from ctsim.phantoms.fields import Canvas, Field, Mask, Noise
+from ctsim.phantoms.fields import Canvas, Field, Inside, Mask, Noise
 from ctsim.phantoms.inserts import Inserts, count, inserts
 from ctsim.phantoms.patients.tissue import (
     AIR,
@@ -24,7 +24,7 @@ from ctsim.phantoms.patients.tissue import (
     URINE,
     Part,
     bone,
-    box_section,
+    cut,
     mirrored,
     trabeculae,
 )
@@ -67,6 +67,7 @@ def hip(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Hip) -> Pha
         _joint(canvas, side)
     _sacrum(canvas)
     trabeculae(canvas, body)
+    cut(canvas, END)
     return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit), params.grid_shift)
 
 
@@ -93,7 +94,7 @@ def _body(canvas: Canvas, rng: np.random.Generator) -> _Wall:
     wall = _Wall(0.925 + 0.01 * rng.uniform(-1, 1), 0.60 + 0.02 * rng.uniform(-1, 1), rng.uniform(0.10, 0.13))
     wobble = Noise(rng, 5)
 
-    def inside(scale: float, wave: float, behind: float = 0.0):  # noqa: ANN202 -- of Inside
+    def inside(scale: float, wave: float, behind: float = 0.0) -> Inside:
         def test(x: Field, y: Field, z: Field) -> Mask:
             thick = np.float32(scale) - behind * np.clip(-y / wall.b, 0, 1) ** 2
             return (_level(x, y, z, wall) + np.float32(wave) * wobble(x, y, z) <= thick) & (np.abs(z) < END)
@@ -154,12 +155,12 @@ def _organs(canvas: Canvas, rng: np.random.Generator) -> None:
     canvas.ellipsoid(URINE, bladder, size)
     rectum = [(0.03, -0.10, 0.34), (0.02, -0.24, 0.18), (0.0, -0.25, 0.0), (0.0, -0.20, -0.20)]
     canvas.tube(SOFT, rectum, (0.075, 0.085, 0.08, 0.05))
-    canvas.tube(AIR, np.array(rectum)[:3] + [0, 0.02, 0], (0.025, 0.035, 0.02), over=(SOFT,))
+    canvas.tube(AIR, np.add(rectum[:3], (0, 0.02, 0)), (0.025, 0.035, 0.02), over=(SOFT,))
 
 
 def _hip_bone(canvas: Canvas, side: int) -> None:
     """Ilium, ischium and pubis about the socket."""
-    roof = np.array([0.46, -0.04, 0.15])
+    roof = (0.46, -0.04, 0.15)
     crest = [(0.70, 0.16, 0.66), (0.71, 0.03, 0.68), (0.68, -0.12, 0.68), (0.58, -0.26, 0.66), (0.45, -0.36, 0.60)]
     wing = [Part(mirrored([roof + 0.25 * (c - roof), c], side), (0.085, 0.034)) for c in np.array(crest)]
     front = [(0.42, 0.08, 0.02), (0.22, 0.27, -0.05), (0.07, 0.34, -0.11)]
@@ -204,7 +205,6 @@ def _joint(canvas: Canvas, side: int) -> None:
     canvas.tube(BONE, shaft, 0.078)
     bone(canvas, parts, 0.014)
     canvas.tube(FAT, [neck + 0.28 * (knee - neck), knee], 0.046, over=(SPONGY, BONE))
-    canvas.fill(AIR, lambda x, y, z: np.abs(z) >= END + 0 * x * y)
 
 
 def _sacrum(canvas: Canvas) -> None:
@@ -219,7 +219,6 @@ def _sacrum(canvas: Canvas) -> None:
     bone(canvas, parts, 0.016)
     canvas.tube(FAT, [(0, -0.36, END + 0.1), (0, -0.40, 0.34)], (0.04, 0.02), over=(BONE, SPONGY))
     canvas.ellipsoid(SOFT, (0, 0.34, -0.12), (0.02, 0.05, 0.07))
-    canvas.fill(AIR, lambda x, y, z: np.abs(z) >= END + 0 * x * y)
 
 
 def _metal(rng: np.random.Generator, params: Hip, unit: float) -> list[Solid]:

@@ -4,13 +4,13 @@ One relative unit is about 170 mm in a patient; the cube's `size` scales it. Pat
 +z; the third lumbar vertebra is at z = 0.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ctsim.geometry import Triple
 from ctsim.phantoms.bodies import Recipe, Shape, assemble
-from ctsim.phantoms.fields import Canvas, Field, Mask, Noise
+from ctsim.phantoms.fields import Canvas, Field, Inside, Mask, Noise
 from ctsim.phantoms.inserts import Inserts, count, diameter, inserts
 from ctsim.phantoms.patients.tissue import (
     AIR,
@@ -25,6 +25,7 @@ from ctsim.phantoms.patients.tissue import (
     Part,
     bone,
     box_section,
+    cut,
     mirrored,
     trabeculae,
 )
@@ -65,7 +66,7 @@ def spine(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Spine) ->
     for k in range(-3, 4):
         _vertebra(canvas, k)
     trabeculae(canvas, body)
-    canvas.fill(AIR, lambda x, y, z: np.abs(z) >= END + 0 * x * y)
+    cut(canvas, END)
     return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit), params.grid_shift)
 
 
@@ -87,10 +88,10 @@ def _body(canvas: Canvas, rng: np.random.Generator) -> _Wall:
     wall = _Wall(0.92 + 0.015 * rng.uniform(-1, 1), 0.64 + 0.02 * rng.uniform(-1, 1), rng.uniform(0.08, 0.11))
     wobble = Noise(rng, 5)
 
-    def inside(less: float, wave: float, front: float = 0.0):  # noqa: ANN202 -- of Inside
+    def inside(less: float, wave: float) -> Inside:
         def test(x: Field, y: Field, z: Field) -> Mask:
             groove = 0.05 * np.exp(-((x / 0.10) ** 2)) * (y < 0)  # over the spine
-            section = box_section(x, y, wall.a - less, wall.b - less - front, 2.3)
+            section = box_section(x, y, wall.a - less, wall.b - less, 2.3)
             return (section + groove + np.float32(wave) * wobble(x, y, z) <= 1) & (np.abs(z) < END)
 
         return test
@@ -108,7 +109,7 @@ def _muscles(canvas: Canvas, wall: _Wall) -> None:
     """Muscles along the spine, with fat between them."""
     back = wall.b - wall.fat - 0.03
 
-    def along(x: Field, y: Field, at: tuple[float, float], radii: tuple[float, float]) -> Mask:
+    def along(x: Field, y: Field, at: tuple[float, float], radii: tuple[Any, Any]) -> Mask:
         return ((np.abs(x) - at[0]) / radii[0]) ** 2 + ((y - at[1]) / radii[1]) ** 2 <= 1
 
     canvas.fill(
@@ -117,7 +118,9 @@ def _muscles(canvas: Canvas, wall: _Wall) -> None:
             (
                 along(x, y, (0.155, -0.37), (0.135, 0.125))  # erector spinae
                 | along(x, y, (0.36, -0.29), (0.12, 0.065))  # quadratus lumborum
-                | along(x, y - _middle(z), (0.215 - 0.10 * z, 0.0), (0.085 - 0.035 * z, 0.105 - 0.035 * z))  # psoas
+                | along(
+                    x + 0.10 * z * np.sign(x), y - _middle(z), (0.215, 0.0), (0.085 - 0.035 * z, 0.105 - 0.035 * z)
+                )  # psoas
             )
             & (box_section(x, y, wall.a - 0.06, back, 2.3) < 1)
             & (np.abs(z) < END)
@@ -152,7 +155,7 @@ def _organs(canvas: Canvas, rng: np.random.Generator) -> None:
         hilum = centre - [0.085 * side, -0.03, 0.0]
         canvas.ellipsoid(FAT, hilum, (0.085, 0.07, 0.16), frame, over=(KIDNEY,))
         canvas.ellipsoid(SOFT, hilum, (0.045, 0.03, 0.08), frame, over=(FAT,))
-        renal = [hilum, hilum * [0.5, 1, 1] + [0, 0.06, 0], (0.03, _middle(0.16) + 0.17, 0.16)]
+        renal = [hilum, hilum * [0.5, 1, 1] + [0, 0.06, 0], (0.03, float(_middle(0.16)) + 0.17, 0.16)]
         canvas.tube(BLOOD, renal, 0.02, over=(FAT,))
     z = np.linspace(-END - 0.1, END + 0.1, 13)
     for x, radius in ((0.045, 0.058), (-0.10, 0.065)):  # aorta, inferior vena cava
@@ -168,7 +171,7 @@ def _organs(canvas: Canvas, rng: np.random.Generator) -> None:
     for side in (-1, 1):  # ascending and descending colon
         colon = [(0.66 * side, 0.06, -END), (0.70 * side, 0.04, -0.1), (0.64 * side, 0.08, 0.1)]
         canvas.tube(SOFT, colon, 0.085, over=(FAT, SOFT))
-        canvas.tube(AIR, np.array(colon) + [0, 0.02, 0], (0.05, 0.035, 0.05), over=(SOFT,))
+        canvas.tube(AIR, np.add(colon, (0, 0.02, 0)), (0.05, 0.035, 0.05), over=(SOFT,))
 
 
 def _vertebra(canvas: Canvas, k: int) -> None:

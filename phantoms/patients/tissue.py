@@ -45,6 +45,11 @@ def trabeculae(canvas: Canvas, rng: np.random.Generator) -> None:
     canvas.fill(BONE, struts, over=(SPONGY,))
 
 
+def cut(canvas: Canvas, end: float) -> None:
+    """Take away what reaches beyond the planes |z| = end."""
+    canvas.labels[np.abs(canvas.axes[2]) >= end] = AIR
+
+
 def mirrored(points: ArrayLike, side: int) -> np.ndarray:
     """Return points [k, 3] of the left side, or their mirror image on the right for side −1."""
     return np.asarray(points, np.float64) * [side, 1, 1]
