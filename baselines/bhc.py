@@ -18,6 +18,7 @@ from ctsim.baselines.morphology import dilate
 from ctsim.baselines.prior import NO_BODY, RING, Prior, choose_prior
 from ctsim.geometry import few_views
 from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.filters import Filter
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reconstruct.projector import forward_columns
 from ctsim.reconstruct.settings import keywords
@@ -30,7 +31,7 @@ FIT_VIEWS = 64  # six numbers need no more
 Array = NDArray[np.float32]
 
 
-class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Settings(Filter, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As those of the same names in `ctsim.baselines.nmar.Settings`."""
 
     mask: Mask = "oracle"
@@ -51,13 +52,13 @@ def bhc_poly(scan: Scan, settings: Settings) -> Volume:
     Keywords are those of `Settings`. Without metal, where the mask is not to be relied on, and where nothing can be
     fitted, the result is FDK's to the last bit. Raises InputError as LIMAR does.
     """
-    first = fdk(scan)
+    first = fdk(scan, window=settings.window, cutoff=settings.cutoff)
     x_0 = first.values.numpy()
     metal = find_metal(scan, x_0, settings.mask)
     if first.status is not Status.OK or not metal.found:
         return uncorrected(first, metal)
     trace = Trace(metal, scan)
-    choice = choose_prior(trace, metal, first.values, settings.prior)
+    choice = choose_prior(trace, metal, first.values, settings, settings.prior)
     if choice is None:
         return uncorrected(first, metal, NO_BODY)
     fit = _fit(scan, trace, choice.columns, choice.water)
@@ -74,7 +75,7 @@ def bhc_poly(scan: Scan, settings: Settings) -> Volume:
             negative += int((added < 0).sum())
             p[k - views.start][held] -= np.maximum(added, 0).astype(np.float32)
 
-    values, shown = mended(trace, first.values, correct)
+    values, shown = mended(trace, first.values, correct, settings)
     reinsert(values, x_0, metal, settings.insert)
     counted = {
         "negative_pixels": negative,

@@ -18,7 +18,7 @@ from ctsim.baselines.kernels.dot_cpu import dot_by_row
 from ctsim.baselines.metal import Trace, auto_mask
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.fdk import ramp
 from ctsim.reconstruct.log import NO_SIGNAL, is_blind, line_integrals
 from ctsim.reconstruct.projector import Views, adjoint_columns, forward_columns
 from ctsim.reconstruct.redundancy import ray_weights
@@ -189,7 +189,7 @@ def _weights(given: Weights, scan: Scan, data: Array) -> tuple[Array, dict[str, 
         return np.exp(-np.maximum(data, 0), dtype=np.float32), {}
     weights, about = np.ones_like(data), {}
     if given == "trace":
-        metal = auto_mask(fdk(scan).values.numpy())
+        metal = auto_mask(ramp(scan).values.numpy())
         about = metal.details()
         if metal.found:
             trace = Trace(metal, scan)

@@ -27,6 +27,7 @@ from ctsim.geometry import few_views
 from ctsim.materials import attenuation, material
 from ctsim.reconstruct.beam import DetectorTable, Given, TubeTable, check_tables, known_detector, known_tube
 from ctsim.reconstruct.fdk import fdk_stream
+from ctsim.reconstruct.filters import Filter
 from ctsim.reconstruct.log import count_floor, how_it_ended, is_blind, line_integrals
 from ctsim.reconstruct.projector import forward_columns
 from ctsim.reconstruct.redundancy import ray_weights
@@ -113,8 +114,8 @@ def _median_path(scan: Scan, table: Table) -> float:
     return float(np.interp(np.median(met), table.poly, table.lengths)) if met.size else 0.0
 
 
-class Known(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is known of the spectrum: a scan does not carry it."""
+class Known(Filter, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The filter, and what is known of the spectrum: a scan does not carry it."""
 
     tube: TubeTable = None
     detector: DetectorTable = None
@@ -132,7 +133,7 @@ def water_precorrection(scan: Scan, settings: Known) -> Volume:
     """
     beam = Beam.of(scan, settings.tube, settings.detector)
     table = beam.table()
-    return _ended(*_changed(scan, lambda p, _: precorrect(p, table)), scan, beam, 1, {})
+    return _ended(*_changed(scan, lambda p, _: precorrect(p, table), settings), scan, beam, 1, {})
 
 
 class Ibhc(Known, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -161,7 +162,7 @@ def ibhc(scan: Scan, settings: Ibhc) -> Volume:
     bone, metal = settings.bone, settings.metal
     beam = Beam.of(scan, settings.tube, settings.detector)
     table = beam.table()
-    values, clamped = _changed(scan, lambda p, _: precorrect(p, table))
+    values, clamped = _changed(scan, lambda p, _: precorrect(p, table), settings)
     found = auto_mask(values.numpy()) if metal else None
     names = ("water", bone, metal) if found is not None and found.found else ("water", bone)
     longest = math.hypot(*(n * d for n, d in zip(scan.geometry.n_voxel, scan.geometry.d_voxel, strict=True)))
@@ -177,7 +178,7 @@ def ibhc(scan: Scan, settings: Ibhc) -> Volume:
             add_excess(p.reshape(-1), lengths.reshape(len(columns), -1), mu, rule.w1, mono)
             return p
 
-        values, clamped = _changed(scan, change)
+        values, clamped = _changed(scan, change, settings)
         runs += 1
     more = {"materials": names} | (found.details() if found is not None else {})
     return _ended(values, clamped, scan, beam, runs, more)
@@ -208,7 +209,7 @@ def _material(key: str, which: str) -> None:
         raise InputError(f"{key}: {error}") from None
 
 
-def _changed(scan: Scan, change: Callable[[Array, slice], Array]) -> tuple[torch.Tensor, int]:
+def _changed(scan: Scan, change: Callable[[Array, slice], Array], by: Filter) -> tuple[torch.Tensor, int]:
     """Return FDK of line integrals that `change` may alter a few views at a time, and the number of clamped pixels."""
     clamped = 0
 
@@ -218,7 +219,7 @@ def _changed(scan: Scan, change: Callable[[Array, slice], Array]) -> tuple[torch
         clamped += int(mask.sum())
         return change(p.numpy(), views)
 
-    return fdk_stream(read, scan.geometry), clamped
+    return fdk_stream(read, scan.geometry, window=by.window, cutoff=by.cutoff), clamped
 
 
 def _ended(values: torch.Tensor, clamped: int, scan: Scan, beam: Beam, runs: int, more: dict[str, object]) -> Volume:

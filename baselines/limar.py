@@ -16,6 +16,7 @@ from ctsim.baselines.inpaint import Filled, Interpolation, fill
 from ctsim.baselines.metal import Insert, Mask, Metal, Trace, check_mask, find_metal, reinsert
 from ctsim.reconstruct.fdk import add_fdk
 from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.filters import Filter
 from ctsim.reconstruct.log import finite_or_not
 from ctsim.reconstruct.settings import about, keywords
 from ctsim.types import Scan, Status, Volume
@@ -23,8 +24,8 @@ from ctsim.types import Scan, Status, Volume
 Pixels = Annotated[int, msgspec.Meta(ge=0, le=1000)]
 
 
-class Bridging(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where the metal is, how its trace is bridged, and how it comes back.
+class Bridging(Filter, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The filter, where the metal is, how its trace is bridged, and how it comes back.
 
     See `ctsim.baselines.metal.find_metal`, `ctsim.baselines.inpaint.fill`, `ctsim.baselines.metal.reinsert` and, for
     `dilation`, `ctsim.baselines.metal.Trace`.
@@ -48,35 +49,41 @@ def reconstruct(scan: Scan, settings: Bridging) -> Volume:
     Without metal, or where the mask is not to be relied on, the result is FDK's to the last bit and nothing is
     projected. Raises InputError as `find_metal` and FDK do, and for settings that are not there.
     """
-    first = fdk(scan)
+    first = fdk(scan, window=settings.window, cutoff=settings.cutoff)
     metal = find_metal(scan, first.values.numpy(), settings.mask)
     if first.status is not Status.OK or not metal.found:
         return uncorrected(first, metal)
     trace = Trace(metal, scan, settings.dilation)
-    values, filled = interpolated(trace, first.values, settings.interpolation)
+    values, filled = interpolated(trace, first.values, settings.interpolation, settings)
     reinsert(values, first.values.numpy(), metal, settings.insert)
     details: dict[str, object] = {"view_updates": 2 * scan.geometry.n_views, "dilation": settings.dilation}
     details["intermediates"] = filled.intermediates(trace.view(filled.shown))
     return finished(values, first, metal, details | filled.details())
 
 
-def interpolated(trace: Trace, first: torch.Tensor, how: str) -> tuple[torch.Tensor, Filled]:
-    """Return FDK of the projections with the trace interpolated, and what was filled; `first` is FDK without."""
+def interpolated(trace: Trace, first: torch.Tensor, how: str, by: Filter) -> tuple[torch.Tensor, Filled]:
+    """Return FDK of the projections with the trace interpolated, and what was filled.
+
+    `first` is FDK without, and `by` the filter that it was made with.
+    """
 
     def bridge(p: NDArray[np.float32], views: slice, filled: Filled) -> None:
         for k, view in enumerate(range(views.start, views.stop)):
             fill(p[k], trace.view(view), how, filled)
 
-    return mended(trace, first, bridge)
+    return mended(trace, first, bridge, by)
 
 
 def mended(
-    trace: Trace, first: torch.Tensor, bridge: Callable[[NDArray[np.float32], slice, Filled], None]
+    trace: Trace,
+    first: torch.Tensor,
+    bridge: Callable[[NDArray[np.float32], slice, Filled], None],
+    by: Filter,
 ) -> tuple[torch.Tensor, Filled]:
     """Return FDK of the projections with the trace filled, and what was filled.
 
     `first` [z, y, x] is FDK of the projections as they are; `bridge` changes those of some views [view, v, u], only in
-    the trace. What it changes is reconstructed and added.
+    the trace. What it changes is reconstructed with the filter of `first`, `by`, and added.
     """
     filled = Filled(shown=trace.geometry.n_views // 4)
 
@@ -89,7 +96,7 @@ def mended(
         return p
 
     values = first.clone()
-    add_fdk(change, trace.geometry, trace.rows(), values)
+    add_fdk(change, trace.geometry, trace.rows(), values, by)
     return values, filled
 
 

@@ -19,6 +19,7 @@ from ctsim.baselines.limar import Bridging, finished, mended, uncorrected
 from ctsim.baselines.metal import Trace, find_metal, reinsert
 from ctsim.baselines.prior import NO_BODY, Prior, choose_prior
 from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.filters import Filter
 from ctsim.reconstruct.projector import forward_columns
 from ctsim.reconstruct.settings import about, keywords
 from ctsim.types import Scan, Status, Volume
@@ -86,18 +87,18 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     Without metal, or where the mask is not to be relied on, the result is FDK's to the last bit and nothing is
     projected. Raises InputError as LIMAR does.
     """
-    first = fdk(scan)
+    first = fdk(scan, window=settings.window, cutoff=settings.cutoff)
     x_0 = first.values.numpy()
     metal = find_metal(scan, x_0, settings.mask)
     if first.status is not Status.OK or not metal.found:
         return uncorrected(first, metal)
     trace = Trace(metal, scan, settings.dilation)
-    choice = choose_prior(trace, metal, first.values, settings.prior, settings.interpolation)
+    choice = choose_prior(trace, metal, first.values, settings, settings.prior, settings.interpolation)
     if choice is None:
         return uncorrected(first, metal, NO_BODY)
     rule = Normalise(kind=settings.normalisation, floor=settings.floor)
     bridge = functools.partial(rule.fill, largest=choice.largest, how=settings.interpolation)
-    values, filled = normalised(trace, first.values, choice.columns, bridge)
+    values, filled = normalised(trace, first.values, choice.columns, bridge, settings)
     reinsert(values, x_0, metal, settings.insert)
     details: dict[str, object] = {"dilation": settings.dilation, "largest_prior": choice.largest}
     shown = filled.intermediates(trace.view(filled.shown))
@@ -110,11 +111,11 @@ Bridge = Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], 
 
 
 def normalised(
-    trace: Trace, first: torch.Tensor, columns: NDArray[np.float32], bridge: Bridge
+    trace: Trace, first: torch.Tensor, columns: NDArray[np.float32], bridge: Bridge, by: Filter
 ) -> tuple[torch.Tensor, Filled]:
     """Return FDK of the projections, their trace bridged with those of a prior, and what was filled.
 
-    `first` [z, y, x] is FDK without, the prior is stored as `columns` [y, x, z]. `bridge(p, q, trace, filled)` gets the
+    `first` [z, y, x] is FDK without, made with the filter `by`; the prior is stored as `columns` [y, x, z]. `bridge(p, q, trace, filled)` gets the
     rows [v, u] of a view that hold metal; only those are projected.
     """
 
@@ -130,4 +131,4 @@ def normalised(
             rows = slice(at[0], at[-1] + 1)
             p[k, rows] = bridge(p[k, rows], q[k, rows], traces[k, rows], filled)
 
-    return mended(trace, first, through_prior)
+    return mended(trace, first, through_prior, by)

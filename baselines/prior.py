@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ctsim.baselines.limar import interpolated
 from ctsim.baselines.metal import Metal, Trace, around, reach, water_value
 from ctsim.baselines.morphology import dilate, opened, spread
+from ctsim.reconstruct.filters import Filter
 from ctsim.reconstruct.projector import forward_columns
 from ctsim.reconstruct.settings import about, names_of
 
@@ -55,11 +56,13 @@ class Choice:
         return int("limar" in self.misfit)
 
 
-def choose_prior(trace: Trace, metal: Metal, first: torch.Tensor, prior: str, how: str = "rows") -> Choice | None:
+def choose_prior(
+    trace: Trace, metal: Metal, first: torch.Tensor, by: Filter, prior: str, how: str = "rows"
+) -> Choice | None:
     """Return the prior from FDK's volume `first`, from LIMAR's, or ("auto") the better of both; None where all is air.
 
     The better one is LIMAR's where its projections fit the measured ones on a ring around the trace better by a
-    twentieth: at a draw FDK's has the finer detail. `how` is LIMAR's interpolation.
+    twentieth: at a draw FDK's has the finer detail. `by` is the filter of `first`, `how` LIMAR's interpolation.
     """
     water = water_value(first.numpy())
     if water <= 0:
@@ -68,7 +71,7 @@ def choose_prior(trace: Trace, metal: Metal, first: torch.Tensor, prior: str, ho
     found: dict[str, tuple[Array, float]] = {}
     misfit: dict[str, float] = {}
     for name in names:
-        volume = (first if name == "fdk" else interpolated(trace, first, how)[0]).numpy()
+        volume = (first if name == "fdk" else interpolated(trace, first, how, by)[0]).numpy()
         columns = np.ascontiguousarray(tissue_prior(volume, metal, water).transpose(1, 2, 0))
         misfit[name], largest = _misfit(trace, columns)
         found[name] = columns, largest

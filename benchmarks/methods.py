@@ -33,9 +33,18 @@ if TYPE_CHECKING:
 
 OURS = ("ctsim",)
 COUNTS_ONLY, METAL_MASK, SPECTRUM = "counts only", "metal mask", "spectrum"
+ASSUMED = "assumed spectrum"
+"""Told no spectrum, but built on the tube, filter and scintillator that the simulator has by default."""
+CONTROL, TWIN = "control", "control, told the twin"
+CONTROLS = (CONTROL, TWIN)
+"""The classes of rows that are no methods: tables show them and never rank them."""
 
 TABLE: dict[str, tuple[str, str]] = {
     "fdk": ("ctsim.reconstruct.fdk:reconstruct", COUNTS_ONLY),
+    "fdk-ramp": ("ctsim.reconstruct.fdk:ramp", COUNTS_ONLY),
+    "zero": ("ctsim.baselines.control:zero", CONTROL),
+    "hull": ("ctsim.baselines.control:hull", CONTROL),
+    "twin-fdk": ("ctsim.baselines.control:twin_fdk", TWIN),
     "limar": ("ctsim.baselines.limar:reconstruct", METAL_MASK),
     "nmar": ("ctsim.baselines.nmar:reconstruct", METAL_MASK),
     "bhc-poly": ("ctsim.baselines.bhc:bhc_poly", METAL_MASK),
@@ -48,11 +57,13 @@ TABLE: dict[str, tuple[str, str]] = {
     "fista-tv": ("ctsim.baselines.tv_methods:fista_tv", COUNTS_ONLY),
     "asd-pocs": ("ctsim.baselines.tv_methods:asd_pocs", COUNTS_ONLY),
     "awpcsd": ("ctsim.baselines.tv_methods:awpcsd", COUNTS_ONLY),
-    "splat": ("ctsim.reconstruct.splat.fast:reconstruct", COUNTS_ONLY),
+    "splat": ("ctsim.reconstruct.splat.fast:reconstruct", ASSUMED),
     "splat-paper": ("ctsim.reconstruct.splat.published:paper", COUNTS_ONLY),
     "splat-r2": ("ctsim.reconstruct.splat.published:r2", COUNTS_ONLY),
 }
 """name -> ("module:function", what it needs in addition to the counts)."""
+ASKED = {"known": SPECTRUM, "tube": ASSUMED}
+"""A splat's `response` -> what it needs then."""
 GONE = {("splat", "preset"): "presets are methods of their own; expected --method splat-paper or --method splat-r2"}
 """(method, removed parameter) -> what to do instead."""
 WIDEST = 24  # characters; a longer default is not aligned with the others
@@ -74,6 +85,19 @@ class Method:
         """The name with the parameters that differ from the defaults, as tables show it."""
         given = ", ".join(f"{k}={v}" for k, v in sorted(self.overrides.items()))
         return f"{self.name}[{given}]" if given else self.name
+
+    @property
+    def control(self) -> bool:
+        """Whether it is a row to compare with, not a method."""
+        return self.inputs in CONTROLS
+
+    @property
+    def told_twin(self) -> bool:
+        """Whether it is handed the metal-free twin in place of the scan.
+
+        Only the table can say so: the `INPUTS` of a module of your own is a text that tables show.
+        """
+        return TABLE.get(self.name) == (self.target, TWIN)
 
     @property
     def mask(self) -> str:
@@ -128,8 +152,8 @@ def find(name: str, overrides: dict[str, Any] | None = None) -> Method:
     params, changed = _settings(name, function, overrides or {})
     if inputs == METAL_MASK and params["mask"] == "auto":
         inputs = COUNTS_ONLY  # it finds the metal itself
-    if inputs == COUNTS_ONLY and params.get("response") == "known":
-        inputs = SPECTRUM
+    if inputs in (COUNTS_ONLY, ASSUMED) and (response := params.get("response")) in ASKED:
+        inputs = ASKED[response]
     return Method(
         name=name,
         target=target,

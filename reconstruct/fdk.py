@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.reconstruct.filters import Cutoff, Window, filter_rows, padded_length, ramp_response
+from ctsim.reconstruct.filters import RAMP, Filter, filter_rows, padded_length, ramp_response
 from ctsim.reconstruct.kernels.backproject_cpu import backproject
 from ctsim.reconstruct.log import LineIntegrals, how_it_ended, is_blind
 from ctsim.reconstruct.redundancy import RayWeights, ray_weights
@@ -23,11 +23,18 @@ from ctsim.types import Scan, Volume
 CHUNK_BYTES = 1 << 25
 
 
-class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Settings(Filter, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The filter."""
 
-    window: Window = "ram-lak"
-    cutoff: Cutoff = 1.0
+
+class Plain(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Nothing to set."""
+
+
+@keywords(Plain)
+def ramp(scan: Scan, settings: Plain) -> Volume:
+    """Reconstruct `scan` by FDK with the plain ramp up to the Nyquist frequency; otherwise as `reconstruct`."""
+    return reconstruct(scan, window=RAMP.window, cutoff=RAMP.cutoff)
 
 
 @keywords(Settings)
@@ -93,12 +100,17 @@ def fdk_stream(
 
 
 def add_fdk(
-    read: Callable[[slice], NDArray[np.float32]], geometry: Geometry, rows: slice, volume: torch.Tensor
+    read: Callable[[slice], NDArray[np.float32]],
+    geometry: Geometry,
+    rows: slice,
+    volume: torch.Tensor,
+    how: Filter = RAMP,
 ) -> None:
     """Add to a volume [z, y, x] what line integrals add to it that are 0 outside some detector rows.
 
     `read` as in `fdk_stream`, with all rows. Only those are filtered, and only the slices that they reach are gone
-    through: FDK is linear, so a correction of few rows need not reconstruct the rest again.
+    through: FDK is linear, so a correction of few rows need not reconstruct the rest again. `how` is the filter that
+    the volume was made with.
     """
     last = geometry.n_detector[0]
     rows = slice(max(rows.start - 1, 0), min(rows.stop + 1, last))  # the 0 next to them belongs to their interpolation
@@ -119,7 +131,7 @@ def add_fdk(
     def cut(views: slice) -> NDArray[np.float32]:
         return np.ascontiguousarray(read(views)[:, rows])
 
-    volume[planes] += torch.from_numpy(_run(cut, part, _orbit_weights(geometry), "ram-lak", 1.0))
+    volume[planes] += torch.from_numpy(_run(cut, part, _orbit_weights(geometry), how.window, how.cutoff))
 
 
 def _moved(offset: float, pitch: float, n: int, part: slice) -> float:

@@ -2,6 +2,7 @@
 
 from typing import Annotated, Any, Literal, cast
 
+import msgspec
 import numba
 import numpy as np
 import scipy.fft
@@ -12,6 +13,20 @@ from ctsim.reconstruct.settings import about, names_of, value_of
 Window = Annotated[Literal["ram-lak", "shepp-logan", "cosine", "hamming", "hann"], about("window of the ramp filter")]
 WINDOWS = names_of(Window)
 Cutoff = Annotated[float, about("frequency where the filter ends", "of the Nyquist frequency", gt=0, le=1)]
+
+
+class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The filter of a method that ends in filtered backprojection.
+
+    The defaults were chosen on the suite `tune` by `ctsim.benchmarks.tools.tune_filter`.
+    """
+
+    window: Window = "hann"
+    cutoff: Cutoff = 1.0
+
+
+RAMP = Filter(window="ram-lak", cutoff=1.0)
+"""The ramp up to the Nyquist frequency, without a window: the exact inverse, which oracles compare with."""
 
 
 def padded_length(n: int) -> int:

@@ -47,5 +47,5 @@ def test_harm_names_its_scenes():
 
 def test_the_row_to_compare_with():
     assert row_of("nmar", ["nmar[mask=auto]", "nmar"]) == "nmar"
-    assert row_of("nmar", ["fdk", "nmar-oracle", "nmar[a=1]"]) == "nmar-oracle"
+    assert row_of("nmar", ["fdk", "nmar-oracle", "nmar[a=1]"]) == "nmar[a=1]"
     assert row_of("nmar", ["fdk", "nmarlite"]) is None

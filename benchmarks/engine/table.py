@@ -68,6 +68,7 @@ class Table:
     """Rows of cells under columns, with a title, a caption and notes.
 
     Rows are ranked within classes: those with equal text in the column number `rank_within`; None for no ranks.
+    Classes in `unranked` have none.
     """
 
     columns: Sequence[Column]
@@ -76,6 +77,7 @@ class Table:
     caption: str = ""
     notes: Sequence[str] = ()
     rank_within: int | None = None
+    unranked: Sequence[str] = ()
 
     def places(self) -> dict[tuple[int, int], str]:
         """Return {(row, column): "best" or "second"} within each class."""
@@ -83,7 +85,8 @@ class Table:
             return {}
         classes: dict[str, list[int]] = {}
         for i, row in enumerate(self.rows):
-            classes.setdefault(row[self.rank_within].text, []).append(i)
+            if (name := row[self.rank_within].text) not in self.unranked:
+                classes.setdefault(name, []).append(i)
         found: dict[tuple[int, int], str] = {}
         for k, column in enumerate(self.columns):
             for group in classes.values() if column.better else ():

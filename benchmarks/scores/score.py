@@ -161,9 +161,12 @@ class SeedValue(NamedTuple):
 
 
 def row_of(name: str, labels: Iterable[str]) -> str | None:
-    """Return the label to compare with: `name` itself, else the first with parameters, such as nmar[mask=oracle]."""
+    """Return the label to compare with: `name` itself, else the first with parameters, such as nmar[mask=oracle].
+
+    A name that goes on behind a hyphen, such as fdk-ramp, is another method.
+    """
     labels = list(dict.fromkeys(labels))
-    return name if name in labels else next((x for x in labels if x.startswith((f"{name}[", f"{name}-"))), None)
+    return name if name in labels else next((x for x in labels if x.startswith(f"{name}[")), None)
 
 
 def error(metric: str, value: float) -> float:

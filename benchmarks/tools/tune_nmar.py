@@ -28,7 +28,8 @@ from ctsim.benchmarks.scores.artefact import water_attenuation
 from ctsim.benchmarks.scores.protocol import truth_of
 from ctsim.dataset.store import StoredScan, list_scans, open_scan
 from ctsim.errors import InputError
-from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.fdk import ramp as fdk
+from ctsim.reconstruct.filters import RAMP
 
 DILATIONS = (0, None, 1)
 PRIORS = ("fdk", "limar")
@@ -82,12 +83,12 @@ def rows(stored: StoredScan) -> list[dict[str, object]]:
         mended = dataclasses.replace(scan, counts=torch.where(_held(trace), bare.counts, scan.counts))
         values, misfit = by_prior(trace, metal, first)
         errors = {name: error(v) for name, v in values.items()}
-        best = choose_prior(trace, metal, twin, "fdk")  # FDK, of the twin
+        best = choose_prior(trace, metal, twin, RAMP, "fdk")  # FDK, of the twin
         chosen = better(misfit)
         found.append({
             "scene": stored.name, "dilation": "rule" if dilation is None else dilation,
             "fdk": error(first),
-            "mended": error(fdk(mended).values), "limar": error(interpolated(trace, first, "rows")[0]),
+            "mended": error(fdk(mended).values), "limar": error(interpolated(trace, first, "rows", RAMP)[0]),
             **{f"nmar_{name}": e for name, e in errors.items()},
             "nmar_twin": None if best is None else error(nmar_with(trace, first, best)),
             "misfit_ratio": round(misfit["limar"] / misfit["fdk"], 3), "chosen": chosen,
@@ -100,7 +101,7 @@ def by_prior(trace: Trace, metal: Metal, first: torch.Tensor) -> tuple[dict[str,
     """Return NMAR's volume with either prior, and its misfit on the ring."""
     values, misfit = {}, {}
     for name in PRIORS:
-        choice = choose_prior(trace, metal, first, name)
+        choice = choose_prior(trace, metal, first, RAMP, name)
         if choice is None:
             raise InputError("nothing stands out from air: there is no prior to choose")
         values[name] = nmar_with(trace, first, choice)
@@ -111,7 +112,7 @@ def by_prior(trace: Trace, metal: Metal, first: torch.Tensor) -> tuple[dict[str,
 def nmar_with(trace: Trace, first: torch.Tensor, choice: Choice) -> torch.Tensor:
     """Return NMAR's volume with a prior, metal not put back."""
     bridge = functools.partial(nmar.Normalise().fill, largest=choice.largest, how="rows")
-    return nmar.normalised(trace, first, choice.columns, bridge)[0]
+    return nmar.normalised(trace, first, choice.columns, bridge, RAMP)[0]
 
 
 def _held(trace: Trace) -> torch.Tensor:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from ctsim.benchmarks.engine.host import measured
 from ctsim.benchmarks.methods import Method
+from ctsim.benchmarks.scores.score import NO_TWIN
 from ctsim.benchmarks.studies.methods.records import METAL, Cost
 from ctsim.benchmarks.studies.methods.volumes import Intermediates, attached, recordable
 from ctsim.dataset.store import StoredScan
@@ -63,9 +64,10 @@ class Outcome:
 def scan_for(method: Method, stored: StoredScan, variant: str) -> Scan:
     """Return the scan or its metal-free twin, with the true mask for a method of mask "oracle" (the twin's is empty).
 
-    The arrays are not shared. Raises InputError where there is no twin.
+    A row of the table that is told the twin gets the twin as its scan: nothing else leads a method there. The arrays
+    are not shared. Raises InputError where there is no twin.
     """
-    found = stored if variant == METAL else stored.metal_free
+    found = stored if variant == METAL and not method.told_twin else stored.metal_free
     if found is None:
         raise InputError(f"scan {stored.name!r} has no metal-free twin")
     if method.mask != "oracle":
@@ -91,6 +93,8 @@ def run_here(stored: StoredScan, variant: str, method: Method, warm_up_seconds: 
 
 def skip(method: Method, stored: StoredScan, variant: str) -> Outcome | None:
     """Ask a method whether it skips this scan; None where it runs."""
+    if method.told_twin and stored.metal_free is None:
+        return Outcome(status="skipped", reason=f"{NO_TWIN}: there is nothing to reconstruct without the metal")
     try:
         scan = scan_for(method, stored, variant)
     except InputError as error:

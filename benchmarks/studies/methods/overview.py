@@ -12,6 +12,7 @@ from rich.text import Text
 from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.table import one_line, ranked
 from ctsim.benchmarks.engine.terminal import rendered, width
+from ctsim.benchmarks.methods import CONTROLS
 from ctsim.benchmarks.scores.score import COLUMNS
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest
 from ctsim.benchmarks.studies.methods.tables import Numbers, numbers
@@ -113,7 +114,7 @@ def _best(rows: Sequence[Row], column: str, k: int, values: Values) -> set[Row]:
     """Return the rows that are best of their inputs in a number."""
     found: set[Row] = set()
     protocol, metric, _ = SHOWN[k]
-    for inputs in dict.fromkeys(row[0] for row in rows):
+    for inputs in dict.fromkeys(row[0] for row in rows if row[0] not in CONTROLS):
         group = [row for row in rows if row[0] == inputs]
         places = ranked([values[column, row][k] for row in group], COLUMNS[protocol][metric].better)
         found |= {group[n] for n, place in places.items() if place == "best"}

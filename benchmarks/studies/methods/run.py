@@ -167,6 +167,10 @@ def _alone(task: RunTask) -> Outcome:
 
 FDKS = {
     "fdk": 1.0,
+    "fdk-ramp": 1.0,
+    "zero": 0.01,
+    "hull": 2.6,
+    "twin-fdk": 1.0,
     "limar": 2.0,
     "nmar": 4.4,
     "bhc-poly": 6.8,

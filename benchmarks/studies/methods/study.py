@@ -28,7 +28,7 @@ from ctsim.reconstruct.watch import Progress, listen
 
 log = logging.getLogger(__name__)
 RUN = "ctsim.benchmarks.studies.methods.run"  # by name: it loads torch
-DEFAULT = ("fdk", "limar", "nmar", "splat")
+DEFAULT = ("fdk", "zero", "hull", "twin-fdk", "limar", "nmar", "splat")
 FEW = 20  # scenes that a warning names
 
 
@@ -47,7 +47,7 @@ class Flags(study.Options):
     """Folder for records, tables, volumes and pictures; created if missing."""
     method: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
     """A method's name, such as fdk, or module:function of your own; may be given several times (default: fdk, limar,
-    nmar and splat)."""
+    nmar, splat, and the controls zero, hull and twin-fdk)."""
     set: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="METHOD.PARAMETER=VALUE")] = ()
     """A method's parameter, one of those that `run-benchmark methods` lists; may be given several times."""
     scene: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()

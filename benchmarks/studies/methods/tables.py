@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Literal
 
 from ctsim.benchmarks.engine.record import OK, uncollected
 from ctsim.benchmarks.engine.table import Cell, Column, Table, escape, harmless, tex_comment
+from ctsim.benchmarks.methods import CONTROLS
 from ctsim.benchmarks.scores.score import (
     AS_RETURNED,
     COLUMNS,
@@ -168,7 +169,7 @@ def _tables(shown: Sequence[RunRecord], found: Numbers, protocols: Iterable[str]
         columns, rows = _grid(chosen[protocol], protocol, own)
         if len(columns) > len(STUBS):
             text, notes = caption(shown, protocol), _notes(shown, protocol)
-            made.append(Table(title=protocol, columns=columns, rows=rows, caption=text, notes=notes, rank_within=0))
+            made.append(Table(title=protocol, columns=columns, rows=rows, caption=text, notes=notes, rank_within=0, unranked=CONTROLS))
     return made
 
 

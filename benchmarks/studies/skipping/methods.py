@@ -28,7 +28,8 @@ from ctsim.benchmarks.studies.skipping.study import Flags, Skip
 from ctsim.dataset.store import StoredScan, open_scan
 from ctsim.phantoms.scene import scene_to_toml
 from ctsim.reconstruct.fdk import fdk_stream
-from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.fdk import ramp as fdk
+from ctsim.reconstruct.filters import RAMP
 from ctsim.reconstruct.projector import forward_columns
 from ctsim.types import Scan
 
@@ -74,7 +75,7 @@ def begun(scan: Scan) -> tuple[torch.Tensor, Trace]:
 
 def chosen(trace: Trace, scan: Scan, first: torch.Tensor) -> Choice:
     """Return NMAR's prior."""
-    choice = choose_prior(trace, find_metal(scan, first.numpy(), "oracle"), first, "auto", HOW)
+    choice = choose_prior(trace, find_metal(scan, first.numpy(), "oracle"), first, RAMP, "auto", HOW)
     if choice is None:
         raise RuntimeError("the thorax has no tissue to make a prior of")
     return choice
@@ -93,7 +94,7 @@ def metal_free(setup: Bench) -> Iterator[Pair]:
     """Yield LIMAR and NMAR on the twin, where they stop after FDK, and the full correction of an empty trace."""
     stored = made(setup)
     for name in ("limar", "nmar"):
-        method = find(name)
+        method = find(name, {"window": RAMP.window, "cutoff": RAMP.cutoff})
         scan = scan_for(method, stored, "metal_free")
         yield Pair(
             scene=f"{stored.name}, twin",
@@ -116,8 +117,8 @@ def rows(setup: Bench) -> Iterator[Pair]:
     choice, touched = chosen(trace, scan, first), trace.rows()
     bridge = functools.partial(Normalise().fill, largest=choice.largest, how=HOW)
     ways: dict[str, tuple[Callable[[], torch.Tensor], Choice | None]] = {
-        "LIMAR": (lambda: interpolated(trace, first, HOW)[0], None),
-        "NMAR": (lambda: normalised(trace, first, choice.columns, bridge)[0], choice),
+        "LIMAR": (lambda: interpolated(trace, first, HOW, RAMP)[0], None),
+        "NMAR": (lambda: normalised(trace, first, choice.columns, bridge, RAMP)[0], choice),
     }
     for name, (part, prior) in ways.items():
         most = float(part().abs().max())

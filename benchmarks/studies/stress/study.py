@@ -15,7 +15,7 @@ from ctsim.beam.quadrature import P_MAX
 from ctsim.benchmarks.engine import host, study
 from ctsim.benchmarks.engine.record import Found, Record, Task, latest
 from ctsim.benchmarks.engine.table import Table, simple
-from ctsim.benchmarks.methods import TABLE, Method, code_version, find
+from ctsim.benchmarks.methods import CONTROLS, TABLE, Method, code_version, find
 from ctsim.benchmarks.studies.stress import Flags, suite
 from ctsim.benchmarks.studies.stress.suite import Scene, load
 from ctsim.errors import InputError
@@ -99,8 +99,9 @@ def catalogue(path: Path | None = None, methods: tuple[str, ...] = ()) -> dict[t
 
 
 def subjects(names: Sequence[str] = ()) -> list[tuple[str, dict[str, Any]]]:
-    """Return the named methods, by default all of the table, each with its parameter sets."""
-    return [(name, given) for name in dict.fromkeys(names or TABLE) for given in VARIANTS.get(name, ({},))]
+    """Return the named methods, by default all of the table but its controls, each with its parameter sets."""
+    usual = [name for name, (_, inputs) in TABLE.items() if inputs not in CONTROLS]
+    return [(name, given) for name in dict.fromkeys(names or usual) for given in VARIANTS.get(name, ({},))]
 
 
 def label(name: str, given: dict[str, Any]) -> str:

@@ -39,7 +39,7 @@ def recovered(short: bool) -> list[Check]:
 def of_counts(scene: Scene) -> list[Check]:
     """Compare FDK and splat of counts, whose deviations are known."""
     phantom, (scan, _) = build(scene), _scanned(scene)
-    found = _rows("FDK of counts", find("fdk").reconstruct(scan).values.numpy(), phantom, scan, known=True)
+    found = _rows("FDK of counts", find("fdk-ramp").reconstruct(scan).values.numpy(), phantom, scan, known=True)
     volume = find("splat").reconstruct(scan)
     if volume.at_energy is None:
         raise RuntimeError(f"splat gave no volume at an energy: {volume.reason}")

@@ -1,0 +1,78 @@
+"""Which window and cutoff the methods that end in filtered backprojection are best with.
+
+    python -m ctsim.benchmarks.tools.tune_filter DATA OUT METHOD …
+
+DATA is a dataset of scenes that no table shows (`make-dataset tune DATA`). A line of OUT/filter.csv is a method with one
+filter on one scene, and its PSNR3D under protocol `tissue` (dB). The filter of a method that is printed last has the
+greatest mean over all scenes, each with the same weight, so one filter serves all sizes.
+"""
+
+import csv
+import itertools
+import statistics
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from ctsim.benchmarks.cli import guarded
+from ctsim.benchmarks.methods import find
+from ctsim.benchmarks.scores.metrics import psnr3d
+from ctsim.benchmarks.scores.protocol import tissue_range, truth_of
+from ctsim.benchmarks.studies.methods.attempt import scan_for
+from ctsim.benchmarks.studies.methods.records import METAL
+from ctsim.dataset.store import StoredScan, list_scans, open_scan
+from ctsim.errors import InputError
+from ctsim.reconstruct.filters import RAMP, WINDOWS
+
+CUTOFFS = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5)
+FILTERS = tuple(itertools.product(WINDOWS, CUTOFFS))
+NAMES = ("scene", "method", "window", "cutoff", "psnr3d")
+Row = tuple[str, str, str, float, float]
+
+
+def main(arguments: list[str]) -> int:
+    """Write the table, a scene at a time, and print the best filter of each method; return 0."""
+    if len(arguments) < 3:
+        raise InputError("expected DATA, OUT and the names of methods")
+    out, found = Path(arguments[1]), list[Row]()
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / "filter.csv").open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(NAMES)
+        for folder in list_scans(Path(arguments[0])):
+            for row in rows(open_scan(folder), arguments[2:]):
+                found.append(row)
+                writer.writerow(row)
+                file.flush()
+    for method in arguments[2:]:
+        means = mean_over_scenes(found, method)
+        best = max(means, key=lambda filter: means[filter])
+        plain = means[RAMP.window, RAMP.cutoff]
+        sys.stdout.write(f"{method}: {best[0]} {best[1]:g}, {means[best]:.2f} dB; plain ramp {plain:.2f} dB\n")
+    return 0
+
+
+def rows(stored: StoredScan, methods: Sequence[str]) -> Iterator[Row]:
+    """Yield the score of each method with each filter on a scene."""
+    truth = truth_of(stored)
+    largest = tissue_range(truth, "effective")
+    for name, (window, cutoff) in itertools.product(methods, FILTERS):
+        method = find(name, {"window": window, "cutoff": cutoff})
+        values = method.reconstruct(scan_for(method, stored, METAL)).values.numpy()
+        score = psnr3d(values, truth.references["effective"], data_range=largest, region=truth.tissue)
+        if score is None:
+            raise InputError(f"{stored.name}, {name}: the volume is the reference itself")
+        yield stored.name, name, window, cutoff, round(score, 3)
+
+
+def mean_over_scenes(found: Sequence[Row], method: str) -> dict[tuple[str, float], float]:
+    """Return a method's mean score by window and cutoff."""
+    by: dict[tuple[str, float], list[float]] = {}
+    for _, name, window, cutoff, score in found:
+        if name == method:
+            by.setdefault((window, cutoff), []).append(score)
+    return {filter: statistics.fmean(scores) for filter, scores in by.items()}
+
+
+if __name__ == "__main__":
+    sys.exit(guarded("tune_filter", "ctsim.benchmarks.tools.tune_filter", sys.argv[1:], resumes=False))
