@@ -20,7 +20,9 @@ from ctsim.types import Scan, Status, Volume
 
 FAINTEST = 0.02  # P of a millimetre of water: the least that counts as shadow
 SIGMAS = 5.0  # of photon noise of an open pixel, above which a pixel is in the shadow
-CUT = 0.5  # of a voxel's shortest side: how much of an open ray may pass through a voxel of the hull
+OPEN = 0.03
+"""How much of the length of rays through a voxel of the hull may be open: a voxel of side h whose centre is on the edge
+of a round body of radius R has (2/π)(2/3)(1/2)√(h/R), 0.05 to 0.03 for radii of 20 to 60 voxels."""
 CHUNK = 16  # views at a time
 Array = NDArray[np.float32]
 
@@ -40,8 +42,7 @@ def hull(scan: Scan, settings: Nothing) -> Volume:
     """Return one attenuation, in 1/mm, in the hull of the object's shadows and 0 outside.
 
     A pixel is in the shadow where P is above five standard deviations of an open pixel's photon noise and above 0.02,
-    or where nothing was seen. A voxel is in the hull if rays of the shadow meet it and open rays pass through at most
-    half a voxel of it, in all views together. The attenuation is the one whose line integrals through the hull fit P
+    or where nothing was seen. A voxel is in the hull if rays meet it, of whose length in it at most `OPEN` is open. The attenuation is the one whose line integrals through the hull fit P
     best by least squares over all pixels that saw something: near that of water for a body that is mostly water.
     Details hold "attenuation" and "voxels", the number of voxels in the hull.
     """
@@ -56,7 +57,7 @@ def hull(scan: Scan, settings: Nothing) -> Volume:
         shadow = (p > faintest) | unseen
         dark_length += adjoint_columns(shadow.astype(np.float32), geometry, views)
         open_length += adjoint_columns((~shadow).astype(np.float32), geometry, views)
-    inside = (dark_length > 0) & (open_length <= CUT * min(geometry.d_voxel))
+    inside = (dark_length > 0) & (open_length <= OPEN * (open_length + dark_length))
     if is_blind(scan, clamped):
         return Volume(values=torch.zeros(geometry.n_voxel), status=Status.ERROR, reason=NO_SIGNAL)
     attenuation = _least_squares(inside.astype(np.float32), logarithm, scan)

@@ -115,8 +115,8 @@ def normalised(
 ) -> tuple[torch.Tensor, Filled]:
     """Return FDK of the projections, their trace bridged with those of a prior, and what was filled.
 
-    `first` [z, y, x] is FDK without, made with the filter `by`; the prior is stored as `columns` [y, x, z]. `bridge(p, q, trace, filled)` gets the
-    rows [v, u] of a view that hold metal; only those are projected.
+    `first` [z, y, x] is FDK without, made with the filter `by`; the prior is stored as `columns` [y, x, z].
+    `bridge(p, q, trace, filled)` gets the rows [v, u] of a view that hold metal; only those are projected.
     """
 
     def through_prior(p: NDArray[np.float32], views: slice, filled: Filled) -> None:

@@ -21,7 +21,7 @@ class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     The defaults were chosen on the suite `tune` by `ctsim.benchmarks.tools.tune_filter`.
     """
 
-    window: Window = "hann"
+    window: Window = "hamming"
     cutoff: Cutoff = 1.0
 
 

@@ -34,6 +34,9 @@ def test_a_method_gives_a_finite_volume_of_the_scans_grid(name, stored):
     assert volume.values.dtype == torch.float32
     assert tuple(volume.values.shape) == stored.geometry.n_voxel
     assert bool(torch.isfinite(volume.values).all())
+    if name == "zero":
+        assert not volume.values.any()
+        return
     # 1/mm, not 1/cm, HU or counts: water at 90 kV is near 0.025, so a factor of 2 tells the units apart
     water = stored.reference("effective")[stored.labels == 1]
     measured = volume.values.numpy()[stored.labels == 1]
@@ -79,10 +82,7 @@ def unlit(scan, kind):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["zero", "dark", "nan", "inf", "negative"])
-@pytest.mark.parametrize(
-    "name",
-    TABLE,
-)
+@pytest.mark.parametrize("name", [name for name in TABLE if name != "zero"])
 def test_a_scan_in_which_no_pixel_has_signal_does_not_end_well(name, kind, stored):
     method = find(name, SHORT.get(name))
     scan = scan_for(method, stored, "metal")

@@ -7,17 +7,19 @@ import numpy as np
 import pytest
 import torch
 
-from ctsim.baselines import limar, nmar
+from ctsim.baselines import bhc, limar, nmar
 from ctsim.baselines.inpaint import Filled, fill, harmonic
 from ctsim.baselines.metal import Metal, Trace, auto_mask, find_metal, reach, reinsert, water_value
 from ctsim.baselines.morphology import dilate, spread
-from ctsim.baselines.prior import choice_views, tissue_prior
+from ctsim.baselines.prior import choice_views, choose_prior, tissue_prior
 from ctsim.benchmarks.methods import find
 from ctsim.detector.noise import Noise
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.plan import make_plan
+from ctsim.reconstruct.fdk import ramp
 from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.filters import RAMP
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import flat_image, simulate_views
 from ctsim.solids import FRUSTUM, Primitive, Solid
@@ -118,11 +120,30 @@ def test_only_rows_that_hold_metal_are_touched(iron):
     trace = Trace(short, scan, dilation=0)
     seen = np.stack([trace.view(k) for k in range(scan.geometry.n_views)])
     assert seen.any() and not seen[:, 14:].any()
-    first = fdk(scan).values
-    values, filled = limar.interpolated(trace, first, "rows")
+    first = ramp(scan).values
+    values, filled = limar.interpolated(trace, first, "rows", RAMP)
     assert filled.pixels == seen.sum() and filled.rows == seen.any(2).sum() and filled.views == seen.any((1, 2)).sum()
     # the filter runs along rows and the cone spreads them: voxels above the highest row touched are FDK's
     assert torch.equal(values[-2:], first[-2:]) and not torch.equal(values[:4], first[:4])
+
+
+@pytest.mark.parametrize("name", ["limar", "nmar", "bhc-poly", "water-precorrection"])
+def test_the_correction_is_filtered_as_the_volume_that_it_is_added_to(iron, name, monkeypatch):
+    """FDK is linear in the window's gain: Hann is 0.5 + 0.5 cos and Hamming 0.54 + 0.46 cos, so 0.92 Hann + 0.08."""
+    scan, _ = iron
+    first = ramp(scan).values
+    metal = find_metal(scan, first.numpy(), "oracle")
+    prior = choose_prior(Trace(metal, scan), metal, first, RAMP, "fdk")  # the same for all windows
+    for module in (nmar, bhc):
+        monkeypatch.setattr(module, "choose_prior", lambda *_: prior)
+    kept = {"insert": "none"} if name != "water-precorrection" else {}
+    by = {w: find(name, {"window": w, **kept}).reconstruct(scan) for w in ("hann", "ram-lak", "hamming")}
+    values = {w: volume.values.double() for w, volume in by.items()}
+    expected = 0.92 * values["hann"] + 0.08 * values["ram-lak"]
+    assert not torch.equal(values["hann"], values["ram-lak"])
+    assert all(volume.details.get("corrected", True) for volume in by.values())
+    # float32 sums of 60 views
+    torch.testing.assert_close(values["hamming"], expected, rtol=0, atol=2e-6 * float(expected.abs().max()) * 60**0.5)
 
 
 def test_a_ratio_with_a_tiny_floor_diverges_on_a_protruding_rod_and_the_offset_does_not():
@@ -281,12 +302,16 @@ def test_wrong_settings_are_refused_by_name(iron, name, setting, words):
 
 
 def test_settings_are_set_by_name_and_carry_their_defaults():
-    assert find("limar").params == {"mask": "oracle", "interpolation": "rows", "insert": "fdk", "dilation": None}
+    filtered = {"window": "hamming", "cutoff": 1.0}
+    bridged = {"mask": "oracle", "interpolation": "rows", "insert": "fdk", "dilation": None}
+    assert find("limar").params == filtered | bridged
     method = find("nmar", {"normalisation": "ratio", "mask": "auto"})
     assert method.params == {
         **find("limar").params, "mask": "auto", "prior": "auto", "normalisation": "ratio", "floor": None,
     }  # fmt: skip
-    with pytest.raises(InputError, match=r"nmar\.margin: unknown parameter; expected one of mask, interp"):
+    with pytest.raises(
+        InputError, match=r"nmar\.margin: unknown parameter; expected one of window, cutoff, mask, interp"
+    ):
         find("nmar", {"margin": 0.9})
 
 

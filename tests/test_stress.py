@@ -58,7 +58,9 @@ def test_a_case_is_as_expected(row):
 def test_every_method_and_kernel_has_its_cases():
     assert {subject for _, subject in ROWS} == {"simulator", "splat kernels", *SUBJECTS}
     assert [find(*method).label for method in study.subjects()] == SUBJECTS
-    assert {name for name, _ in study.subjects()} == {name for name, (_, inputs) in TABLE.items() if inputs not in CONTROLS}
+    assert {name for name, _ in study.subjects()} == {
+        name for name, (_, inputs) in TABLE.items() if inputs not in CONTROLS
+    }
     assert {row.subject for row in SOME} == set(SUBJECTS)
     assert {row.case for row in SOME} == {*(scene.name for scene in load() if scene.methods), "threads"}
 

@@ -169,7 +169,17 @@ def _tables(shown: Sequence[RunRecord], found: Numbers, protocols: Iterable[str]
         columns, rows = _grid(chosen[protocol], protocol, own)
         if len(columns) > len(STUBS):
             text, notes = caption(shown, protocol), _notes(shown, protocol)
-            made.append(Table(title=protocol, columns=columns, rows=rows, caption=text, notes=notes, rank_within=0, unranked=CONTROLS))
+            made.append(
+                Table(
+                    title=protocol,
+                    columns=columns,
+                    rows=rows,
+                    caption=text,
+                    notes=notes,
+                    rank_within=0,
+                    unranked=CONTROLS,
+                )
+            )
     return made
 
 
