@@ -42,8 +42,9 @@ def hull(scan: Scan, settings: Nothing) -> Volume:
     """Return one attenuation, in 1/mm, in the hull of the object's shadows and 0 outside.
 
     A pixel is in the shadow where P is above five standard deviations of an open pixel's photon noise and above 0.02,
-    or where nothing was seen. A voxel is in the hull if rays meet it, of whose length in it at most `OPEN` is open. The attenuation is the one whose line integrals through the hull fit P
-    best by least squares over all pixels that saw something: near that of water for a body that is mostly water.
+    or where nothing was seen. A voxel is in the hull if rays meet it, of whose length in it at most `OPEN` is open.
+    The attenuation is the one whose line integrals through the hull fit P best by least squares over all pixels that
+    saw something: near that of water for a body that is mostly water.
     Details hold "attenuation" and "voxels", the number of voxels in the hull.
     """
     geometry, logarithm = scan.geometry, LineIntegrals(scan)

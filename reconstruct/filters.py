@@ -21,8 +21,8 @@ class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     The defaults were chosen on the suite `tune` by `ctsim.benchmarks.tools.tune_filter`.
     """
 
-    window: Window = "hamming"
-    cutoff: Cutoff = 1.0
+    window: Window = "cosine"
+    cutoff: Cutoff = 0.9
 
 
 RAMP = Filter(window="ram-lak", cutoff=1.0)

@@ -178,7 +178,7 @@ def test_without_annotations_values_are_passed_on_and_a_device_is_the_cpu(mine):
 
 
 def test_what_equals_a_default_changes_no_label_and_records_stay_plain_json():
-    assert methods.find("fdk", {"window": "hamming", "cutoff": 1}).label == "fdk"
+    assert methods.find("fdk", {"window": "cosine", "cutoff": 0.9}).label == "fdk"
     found = methods.find("splat", {"passes": [3, 4], "filtration": 1})
     assert found.label == "splat[filtration=1.0, passes=[3, 4]]"
     for name in TABLE:

@@ -2,9 +2,10 @@
 
     python -m ctsim.benchmarks.tools.tune_filter DATA OUT METHOD …
 
-DATA is a dataset of scenes that no table shows (`make-dataset tune DATA`). A line of OUT/filter.csv is a method with one
-filter on one scene, and its PSNR3D under protocol `tissue` (dB). The filter of a method that is printed last has the
-greatest mean over all scenes, each with the same weight, so one filter serves all sizes.
+DATA is a dataset of scenes that no table shows (`make-dataset tune DATA`). A line of OUT/filter.csv is a method with
+one filter on one scene, and its PSNR3D under protocol `tissue` (dB). It prints the filter with the greatest mean over
+all scenes, for each method and, as the last line, over all of them: all methods share one filter, so that LIMAR and
+NMAR without metal are FDK to the last bit.
 """
 
 import csv
@@ -44,11 +45,12 @@ def main(arguments: list[str]) -> int:
                 found.append(row)
                 writer.writerow(row)
                 file.flush()
-    for method in arguments[2:]:
-        means = mean_over_scenes(found, method)
+    for group in [*([method] for method in arguments[2:]), arguments[2:]]:
+        means = mean_scores(found, group)
         best = max(means, key=lambda filter: means[filter])
         plain = means[RAMP.window, RAMP.cutoff]
-        sys.stdout.write(f"{method}: {best[0]} {best[1]:g}, {means[best]:.2f} dB; plain ramp {plain:.2f} dB\n")
+        who = ", ".join(group)
+        sys.stdout.write(f"{who}: {best[0]} {best[1]:g}, {means[best]:.2f} dB; plain ramp {plain:.2f} dB\n")
     return 0
 
 
@@ -65,11 +67,11 @@ def rows(stored: StoredScan, methods: Sequence[str]) -> Iterator[Row]:
         yield stored.name, name, window, cutoff, round(score, 3)
 
 
-def mean_over_scenes(found: Sequence[Row], method: str) -> dict[tuple[str, float], float]:
-    """Return a method's mean score by window and cutoff."""
+def mean_scores(found: Sequence[Row], methods: Sequence[str]) -> dict[tuple[str, float], float]:
+    """Return the mean score of methods over all scenes, by window and cutoff."""
     by: dict[tuple[str, float], list[float]] = {}
     for _, name, window, cutoff, score in found:
-        if name == method:
+        if name in methods:
             by.setdefault((window, cutoff), []).append(score)
     return {filter: statistics.fmean(scores) for filter, scores in by.items()}
 
