@@ -239,8 +239,8 @@ def test_unusable_readings_are_clamped_and_counted():
 def test_reconstruct_equals_fdk_of_the_line_integrals():
     p = cylinder(GEOMETRY)
     scan = make_scan(GEOMETRY, 1e4 * torch.exp(-p))
-    volume = reconstruct(scan, window="hann")
-    torch.testing.assert_close(volume.values, fdk(p, GEOMETRY, window="hann"), rtol=0, atol=1e-6)
+    volume = reconstruct(scan, window="hann", cutoff=0.8)
+    torch.testing.assert_close(volume.values, fdk(p, GEOMETRY, window="hann", cutoff=0.8), rtol=0, atol=1e-6)
     assert volume.details["clamped_pixels"] == 0
     assert "limitation" not in volume.details
 

@@ -17,8 +17,8 @@ from ctsim.benchmarks.scores.protocol import truth_of
 from ctsim.benchmarks.scores.score import NOT_ASKED
 from ctsim.benchmarks.studies.methods import attempt, plan, records
 from ctsim.benchmarks.studies.methods import study as cli_run
+from ctsim.benchmarks.studies.methods.captions import caption
 from ctsim.benchmarks.studies.methods.panels import PanelRow, cut, draw, write_panels
-from ctsim.benchmarks.studies.methods.tables import caption
 from ctsim.benchmarks.studies.methods.volumes import (
     at_50kev_of,
     attached,

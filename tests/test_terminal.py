@@ -14,6 +14,10 @@ SCENES = ("lung-Fe", "teeth-Ti", "broccoli-Al")
 METHODS = {"fdk": "counts only", "splat": "counts only", "limar": "metal mask", "nmar": "metal mask"}
 
 
+MORE = ["–", "–", "1.5"]
+"""No cost of metal without a twin, and no record of false bone."""
+
+
 def records(scenes=SCENES, **more):
     return [
         record(name, scene, psnr=20.0 + n + k, inputs=inputs, **more)
@@ -23,27 +27,27 @@ def records(scenes=SCENES, **more):
 
 
 def row(text, method):
-    (line,) = [line for line in text.splitlines() if re.search(rf"(^|\s){re.escape(method)}\s", line)]
-    return re.findall(r"\S+", line.split(method, 1)[1])
+    lines = [line for line in text.splitlines() if re.search(rf"(^|\s){re.escape(method)}\s", line)]
+    return [cell for line in lines for cell in re.findall(r"\S+", line.split(method, 1)[1])]
 
 
 def test_scenes_stand_side_by_side_where_they_fit():
     text = overview.overview(records())
     assert max(map(len, text.splitlines())) <= WIDEST
     assert all(scene in text for scene in SCENES) and "mean" not in text
-    assert row(text, "nmar") == ["23.00", "0.500", "1.5", "24.00", "0.500", "1.5", "25.00", "0.500", "1.5"]
+    assert row(text, "nmar") == ["23.00", *MORE, "24.00", *MORE, "25.00", *MORE]
 
 
 def test_many_scenes_are_averaged():
     text = overview.overview(records([f"scene-{k}" for k in range(7)]))
     assert max(map(len, text.splitlines())) <= WIDEST
     assert "mean of 7 scenes" in text and "scene-0" not in text
-    assert row(text, "fdk") == ["23.00", "0.500", "1.5"]
+    assert row(text, "fdk") == ["23.00", *MORE]
 
 
-def test_scenes_that_do_not_fit_side_by_side_go_into_a_second_table():
+def test_scenes_that_do_not_fit_side_by_side_go_into_further_tables():
     text = overview.overview(records([f"scene-{k}" for k in range(5)]))
-    assert max(map(len, text.splitlines())) <= WIDEST and text.count("method") == 2
+    assert max(map(len, text.splitlines())) <= WIDEST and text.count("method") == 3
     assert all(f"scene-{k}" in text for k in range(5)) and "mean" not in text
 
 
@@ -52,7 +56,7 @@ def test_a_narrow_terminal_loses_no_number(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     text = re.sub(r"\x1b\[[\d;]*m", "", overview.overview(records()))
     assert max(map(len, text.splitlines())) <= 80 and text.count("method") == 2
-    assert "…" not in text and text.count("25.00") == 1 and text.count("0.500") == 12
+    assert "…" not in text and text.count("25.00") == 1 and text.count("1.5") == 12
 
 
 def test_of_many_failures_the_first_are_named(tmp_path):
@@ -63,18 +67,18 @@ def test_of_many_failures_the_first_are_named(tmp_path):
 
 def test_a_method_without_a_scene_has_no_mean_over_all():
     given = [r for r in records([f"s{k}" for k in range(7)]) if (r.label, r.run.scene) != ("splat", "s3")]
-    assert row(overview.overview(given), "splat") == ["–", "–", "–"]
+    assert row(overview.overview(given), "splat") == ["–"] * 4
 
 
 def test_seeds_are_averaged_and_twins_left_out():
     given = [record(psnr=20.0), record(psnr=23.0, seed=1), record(psnr=40.0, variant="metal_free")]
-    assert row(overview.overview(given), "fdk") == ["21.50", "0.500", "1.5"]
+    assert row(overview.overview(given), "fdk") == ["21.50", "20.00", "–", "1.5"]  # seed 0 alone has a twin
 
 
 def test_a_run_that_failed_shows_how_it_ended_and_why(tmp_path):
     given = [*records(), record("sirt", "lung-Fe", status="timeout")]
     text = overview.text(given, tmp_path / "r", tmp_path / "d")
-    assert row(text, "sirt")[:1] == ["timeout"] and "lung-Fe (metal), sirt: timeout – out | of luck" in text
+    assert "timeout" in row(text, "sirt") and "lung-Fe (metal), sirt: timeout – out | of luck" in text
     assert f"run-benchmark report {tmp_path}/r {tmp_path}/d" in text
 
 
@@ -82,7 +86,7 @@ def test_the_best_of_each_class_of_inputs_is_bold_on_a_terminal(monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")
     text = overview.overview(records(["lung-Fe"]))
     bold = re.findall(r"\x1b\[1m *([\d.]+)\x1b\[0m", text)
-    assert bold == ["0.500", "21.00", "0.500", "0.500", "23.00", "0.500"]  # the same SSIM is best four times
+    assert bold == ["21.00", "23.00"]
 
 
 def test_an_encoding_without_lines_gets_a_table_in_ascii(monkeypatch):

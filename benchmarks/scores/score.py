@@ -3,7 +3,7 @@
 This module is light; `.protocol`, `.artefact` and `.projection` compute scores and are loaded only for that.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -107,6 +107,12 @@ COLUMNS: dict[str, dict[str, Metric]] = {
         "50kev/outside": Metric("RMSE 50 keV, outside trace", 4, "min"),
         "50kev/trace": Metric("RMSE 50 keV, in trace", 3, "min"),
     },
+    "metal_cost": {
+        "own_db": Metric("against its own twin (dB)", 2, "min"),
+        "fdk_db": Metric("against FDK without metal (dB)", 2, "min"),
+        "own_hu": Metric("against its own twin (HU)", 1, "min"),
+        "fdk_hu": Metric("against FDK without metal (HU)", 1, "min"),
+    },
     "against": {
         "over_fdk": Metric("over FDK (dB)", 2, "max"),
         "over_nmar": Metric("over NMAR (dB)", 2, "max"),
@@ -129,7 +135,20 @@ COLUMNS: dict[str, dict[str, Metric]] = {
 }
 """The metrics that tables show of each protocol, in order."""
 
+MAIN: dict[tuple[str, str], Metric] = {
+    ("tissue", "psnr3d"): _IMAGE["psnr3d"],
+    ("tissue", "ssim3d"): _IMAGE["ssim3d"],
+    ("metal_cost", "own_db"): Metric("cost of metal (dB)", 2, "min"),
+    ("metal_cost", "fdk_db"): Metric("short of FDK without metal (dB)", 2, "min"),
+    ("structure", "false_bone"): Metric("false bone (%)", 2, "min", 100),
+    ("soft", "rmse"): Metric("soft tissue RMSE (HU)", 1, "min"),
+    ("cost", "wall"): Metric("wall (s)", 2, "min"),
+}
+"""Protocol and metric of the main table's columns: one or two of the protocols that matter most."""
+
 FDK, NMAR = "fdk", "nmar"
+FDK_ROWS = (FDK, "fdk-ramp")
+"""The rows without correction of any kind, with any filter: the best of them on the twin is what metal could leave."""
 ANCHORED = {
     "tissue": ("rmse", "ssim3d"),
     "aligned": ("rmse", "ssim3d"),
@@ -137,8 +156,12 @@ ANCHORED = {
     "artefact": ("roi_std", "cupping", "streak", "rmse", "rmse_near", "rmse_far"),
 }
 """The metrics that have an anchored score. FDK's `artefact` error without the metal is 0 by definition."""
-COMPARED = {**ANCHORED, "tissue": ("psnr3d", *ANCHORED["tissue"])}
-"""The metrics that gains or anchored scores are derived from."""
+LOST = {("tissue", "psnr3d"): ("db", -1.0), ("soft", "rmse"): ("hu", 1.0)}
+"""What the cost of metal is taken of: (protocol, metric) -> its name's end, and the sign of what is worse."""
+LEAST_LOSS = 0.1
+"""An anchored score exists where the metal raises FDK's error by at least this share of its error without."""
+COMPARED = {**ANCHORED, "tissue": ("psnr3d", *ANCHORED["tissue"]), "soft": ("rmse",)}
+"""The metrics that costs, gains or anchored scores are derived from."""
 
 Place = tuple[str, int, str, str, str, str]
 """Scene, seed, variant, method, protocol, metric."""
@@ -175,8 +198,9 @@ def error(metric: str, value: float) -> float:
 
 
 def anchored(e: float, e_reference: float, e_fdk: float) -> float | None:
-    """Return (e − e_ref) / (e_FDK − e_ref); None where FDK is no worse with the metal than without it."""
-    return (e - e_reference) / (e_fdk - e_reference) if e_fdk > e_reference else None
+    """Return (e − e_ref) / (e_FDK − e_ref); None where the metal costs FDK less than a tenth of its error without."""
+    loss = e_fdk - e_reference
+    return (e - e_reference) / loss if loss > LEAST_LOSS * e_reference else None
 
 
 def harm(scores: list[float | None]) -> tuple[float | None, str]:
@@ -193,24 +217,42 @@ def harm(scores: list[float | None]) -> tuple[float | None, str]:
 
 
 def derived(rows: list[SeedValue]) -> list[SeedValue]:
-    """Derive the rows of `against` (dB of tissue PSNR3D) and `anchored` ("protocol/metric") from scored rows.
+    """Derive the rows of `metal_cost`, `against` (dB of tissue PSNR3D) and `anchored` ("protocol/metric").
 
     Comparisons are made within one scene and seed, between runs that ended well.
     """
     scored = [row for row in rows if row.status == OK and row.value is not None and row.value == row.value]
     labels = dict.fromkeys(row.method for row in scored if row.variant == "metal")
     bases = {name: row_of(name, labels) for name in (FDK, NMAR)}
-    values = {_place(row, row.method, row.variant): row.value for row in scored if row.method in (FDK, *bases.values())}
+    values = {_place(row, row.method, row.variant): row.value for row in scored}
+    filtered = [label for label in labels if label.partition("[")[0] in FDK_ROWS]
     found = []
     for row in scored:
         if row.variant == "metal":
-            pairs = _gains(row, values, bases) + _anchors(row, values)
+            pairs = _costs(row, values, filtered) + _gains(row, values, bases) + _anchors(row, values)
             found += [row._replace(protocol=p, metric=m, value=v, identical=False) for p, m, v in pairs]
     return found
 
 
 def _place(row: SeedValue, method: str, variant: str) -> Place:
     return row.scene, row.seed, variant, method, row.protocol, row.metric
+
+
+def _costs(row: SeedValue, values: dict[Place, float | None], filtered: Sequence[str]) -> list[tuple[str, str, float]]:
+    """Return what the metal costs a method against its own twin, and against the best FDK of the twin.
+
+    The second is no win for a method that erases with and without metal alike.
+    """
+    if (row.protocol, row.metric) not in LOST or row.value is None:
+        return []
+    unit, sign = LOST[row.protocol, row.metric]
+    own = values.get(_place(row, row.method, "metal_free"))
+    clean = [v for label in filtered if (v := values.get(_place(row, label, "metal_free"))) is not None]
+    found = [] if own is None else [("metal_cost", f"own_{unit}", sign * (row.value - own) + 0.0)]
+    if clean:
+        best = min(clean, key=lambda v: sign * v)
+        found.append(("metal_cost", f"fdk_{unit}", sign * (row.value - best) + 0.0))
+    return found
 
 
 def _gains(

@@ -13,19 +13,26 @@ from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.table import one_line, ranked
 from ctsim.benchmarks.engine.terminal import rendered, width
 from ctsim.benchmarks.methods import CONTROLS
-from ctsim.benchmarks.scores.score import COLUMNS
+from ctsim.benchmarks.scores.score import MAIN
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest
 from ctsim.benchmarks.studies.methods.tables import Numbers, numbers
 
 PROTOCOL = "tissue"
-SHOWN = ((PROTOCOL, "psnr3d", 5), (PROTOCOL, "ssim3d", 5), ("cost", "wall", 6))
-"""Protocol, metric and width of the numbers of a scene."""
-HEAD = "  ".join(f"{title:>{width}}" for title, (_, _, width) in zip(("PSNR", "SSIM", "s"), SHOWN, strict=True))
+SHOWN = (
+    ("PSNR", PROTOCOL, "psnr3d", 5),
+    ("lost", "metal_cost", "own_db", 5),
+    ("bone", "structure", "false_bone", 5),
+    ("s", "cost", "wall", 5),
+)
+"""Title, protocol, metric and width of the numbers of a scene."""
+RANKED = range(3)
+"""Those of them whose best is bold."""
+HEAD = "  ".join(f"{title:>{width}}" for title, _, _, width in SHOWN)
 Row = tuple[str, str]
 """Inputs and method."""
 Values = dict[tuple[str, Row], list[float | None]]
 """Numbers by scene and row, as in `SHOWN`."""
-MOST_TABLES = 2
+MOST_TABLES = 3
 """At most this many tables below each other; scenes that do not fit are averaged."""
 MOST_FAILURES = 10
 """At most this many failed or skipped runs are named."""
@@ -35,7 +42,8 @@ def text(records: Sequence[RunRecord], results: Path, data: Path) -> str:
     """Return the table, what its numbers are, where the rest is, and what to try next."""
     shown = latest(records)
     lines = [
-        f"PSNR3D in dB and SSIM3D of the body outside metal (protocol {PROTOCOL}); seconds of a run.",
+        f"PSNR: PSNR3D in dB of the body outside metal (protocol {PROTOCOL}). Lost: dB against the same method on the",
+        "metal-free twin. Bone: % of soft tissue near metal that reads as bone. s: seconds of a run.",
         *_failures(shown),
         f"All protocols: {results}/table.md, .csv, .tex; records: {results}/records.jsonl",
     ]
@@ -57,13 +65,13 @@ def _failures(shown: Sequence[RunRecord]) -> list[str]:
 
 
 def overview(shown: Sequence[RunRecord]) -> str:
-    """Return PSNR3D, SSIM3D and seconds of every method on every scene, as text that fits the terminal.
+    """Return PSNR3D, cost of metal, false bone and seconds of every method on every scene, fitting the terminal.
 
     Scenes are columns, in two tables where one is too narrow; if two are, the mean over all scenes is shown.
     Numbers are means over noise seeds.
     """
     own = [record for record in shown if record.run.variant == METAL]
-    found, scenes = numbers(own), list(dict.fromkeys(record.run.scene for record in own))
+    found, scenes = numbers(shown), list(dict.fromkeys(record.run.scene for record in own))
     rows = sorted(dict.fromkeys((record.inputs, record.label) for record in own), key=lambda row: row[0])
     failed = {(r.run.scene, r.label): r.status for r in own if r.status != OK}
     values = {(scene, row): _values(found, scene, row) for scene in scenes for row in rows}
@@ -84,11 +92,11 @@ def _table(rows: Sequence[Row], columns: Sequence[str], values: Values, failed: 
     table.add_column("\nmethod", overflow="fold")
     for column in columns:
         table.add_column(f"{one_line(column)}\n{HEAD}", no_wrap=True)
-    best = {(column, k): _best(rows, column, k, values) for column in columns for k in range(len(SHOWN))}
+    best = {(column, k): _best(rows, column, k, values) for column in columns for k in RANKED}
     for number, row in enumerate(rows):
         first = not number or rows[number - 1][0] != row[0]
         cells = [
-            _cell(values[column, row], failed.get((column, row[1]), ""), [row in best[column, k] for k in (0, 1)])
+            _cell(values[column, row], failed.get((column, row[1]), ""), [row in best[column, k] for k in RANKED])
             for column in columns
         ]
         table.add_row(row[0] if first else "", Text(one_line(row[1])), *cells)
@@ -97,7 +105,7 @@ def _table(rows: Sequence[Row], columns: Sequence[str], values: Values, failed: 
 
 def _values(found: Numbers, scene: str, row: Row) -> list[float | None]:
     inputs, label = row
-    numbers = (found.get((scene, METAL, label, inputs, protocol, metric)) for protocol, metric, _ in SHOWN)
+    numbers = (found.get((scene, METAL, label, inputs, protocol, metric)) for _, protocol, metric, _ in SHOWN)
     return [None if number is None else number[0] for number in numbers]
 
 
@@ -113,10 +121,10 @@ def _mean(scenes: Sequence[list[float | None]]) -> list[float | None]:
 def _best(rows: Sequence[Row], column: str, k: int, values: Values) -> set[Row]:
     """Return the rows that are best of their inputs in a number."""
     found: set[Row] = set()
-    protocol, metric, _ = SHOWN[k]
+    _, protocol, metric, _ = SHOWN[k]
     for inputs in dict.fromkeys(row[0] for row in rows if row[0] not in CONTROLS):
         group = [row for row in rows if row[0] == inputs]
-        places = ranked([values[column, row][k] for row in group], COLUMNS[protocol][metric].better)
+        places = ranked([values[column, row][k] for row in group], MAIN[protocol, metric].better)
         found |= {group[n] for n, place in places.items() if place == "best"}
     return found
 
@@ -126,11 +134,17 @@ def _cell(values: Sequence[float | None], failed: str, best: Sequence[bool]) -> 
     if failed and values[0] is None:
         return Text(failed.rjust(len(HEAD)), "red")
     out = Text()
-    for k, (value, (protocol, metric, size)) in enumerate(zip(values, SHOWN, strict=True)):
-        form = f".{COLUMNS[protocol][metric].digits}f" if metric != "wall" else ".2g" if (value or 0) < 10 else ".0f"
-        text = "–" if value is None else f"{value:{form}}"
+    for k, (value, (_, protocol, metric, size)) in enumerate(zip(values, SHOWN, strict=True)):
+        column = MAIN[protocol, metric]
+        text = ("–" if _unicode() else "-") if value is None else _text(value * column.scale, metric, column.digits)
         out.append("  " if k else "").append(text.rjust(size), "bold" if k < len(best) and best[k] else "")
     return out
+
+
+def _text(value: float, metric: str, digits: int) -> str:
+    if metric == "wall":
+        return f"{value:.2g}" if value < 10 else f"{value:.0f}"
+    return f"{value:.{digits}f}"
 
 
 def _unicode() -> bool:

@@ -9,9 +9,8 @@ import csv
 import functools
 import io
 import math
-import re
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -19,17 +18,16 @@ from ctsim.benchmarks.engine.record import OK, uncollected
 from ctsim.benchmarks.engine.table import Cell, Column, Table, escape, harmless, tex_comment
 from ctsim.benchmarks.methods import CONTROLS
 from ctsim.benchmarks.scores.score import (
-    AS_RETURNED,
     COLUMNS,
     COMPARED,
     KERMA,
-    NMAR,
+    MAIN,
     Metric,
     SeedValue,
     derived,
     harm,
-    row_of,
 )
+from ctsim.benchmarks.studies.methods.captions import caption, declared, main_caption
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest, outdated, remarks
 from ctsim.dataset.durable import write_synced
 from ctsim.errors import InputError
@@ -40,6 +38,9 @@ if TYPE_CHECKING:
 Format = Literal["md", "tex"]
 
 STUBS = (Column("inputs"), Column("method"))
+MAIN_TABLE = "main"
+ALL = (MAIN_TABLE, *COLUMNS)
+"""What a page of results shows: the main table, then one for each protocol."""
 
 Key = tuple[str, str, str, str, str, str]
 """Scene, variant, method, inputs, protocol and metric; a run without any number has protocol and metric ""."""
@@ -143,7 +144,7 @@ def _cell(number: Number | None, metric: str, column: Metric) -> Cell:
         return Cell("–")
     mean, std, _, _, _, identical = number
     if mean is None:
-        same = identical and metric.startswith("psnr3d")
+        same = identical and metric.rpartition("/")[2].startswith("psnr3d")
         return Cell("identical", float("inf")) if same else Cell("–")
     mean *= column.scale
     text = f"{mean:.{column.digits}f}"
@@ -152,23 +153,23 @@ def _cell(number: Number | None, metric: str, column: Metric) -> Cell:
     return Cell(text, mean)
 
 
-def tables(records: Sequence[RunRecord], protocols: Iterable[str] = tuple(COLUMNS)) -> list[Table]:
+def tables(records: Sequence[RunRecord], protocols: Collection[str] = ALL) -> list[Table]:
     """Return the protocols' tables of the records that count; a protocol without any number has none."""
     shown = latest(records)
     return _tables(shown, numbers(shown), protocols)
 
 
-def _tables(shown: Sequence[RunRecord], found: Numbers, protocols: Iterable[str] = tuple(COLUMNS)) -> list[Table]:
+def _tables(shown: Sequence[RunRecord], found: Numbers, protocols: Collection[str] = ALL) -> list[Table]:
     own = [r for r in shown if r.run.variant == METAL]
     chosen: dict[str, dict[tuple[str, str, str], Number]] = {}
     for (scene, variant, method, _, protocol, metric), number in found.items():
         if variant == METAL:
             chosen.setdefault(protocol, {})[scene, method, metric] = number
-    made = []
+    made = _main(shown, chosen, own) if MAIN_TABLE in protocols else []
     for protocol in (p for p in protocols if p in chosen):
         columns, rows = _grid(chosen[protocol], protocol, own)
         if len(columns) > len(STUBS):
-            text, notes = caption(shown, protocol), _notes(shown, protocol)
+            text, notes = caption(shown, protocol), declared(shown, protocol)
             made.append(
                 Table(
                     title=protocol,
@@ -183,12 +184,54 @@ def _tables(shown: Sequence[RunRecord], found: Numbers, protocols: Iterable[str]
     return made
 
 
+def _main(
+    shown: Sequence[RunRecord], chosen: dict[str, dict[tuple[str, str, str], Number]], own: Sequence[RunRecord]
+) -> list[Table]:
+    """Return the main tables: one for each scene, and their mean, of what matters most from several protocols."""
+    there = {(protocol, metric) for protocol, group in chosen.items() for _, _, metric in group}
+    metrics = {f"{p}/{m}": how for (p, m), how in MAIN.items() if (p, m) in there}
+    picked = {
+        (scene, method, f"{protocol}/{metric}"): number
+        for protocol, group in chosen.items()
+        for (scene, method, metric), number in group.items()
+        if f"{protocol}/{metric}" in metrics
+    }
+    if not metrics:
+        return []
+    columns, rows = _grid_of(picked, metrics, own)
+    heads = [column._replace(group="") for column in columns]
+    titles = list(dict.fromkeys(column.group for column in columns[len(STUBS) :]))
+    made = []
+    for k, title in enumerate(titles):
+        here = slice(len(STUBS) + k * len(metrics), len(STUBS) + (k + 1) * len(metrics))
+        made.append(
+            Table(
+                title=f"{MAIN_TABLE}: {title}",
+                columns=[*STUBS, *heads[here]],
+                rows=[[*row[: len(STUBS)], *row[here]] for row in rows],
+                caption=main_caption(shown) if k == 0 else "",
+                rank_within=0,
+                unranked=CONTROLS,
+            )
+        )
+    return made
+
+
 def _grid(
     chosen: dict[tuple[str, str, str], Number], protocol: str, own: Sequence[RunRecord]
 ) -> tuple[list[Column], list[list[Cell]]]:
     """Return the columns and rows of a protocol's table; `chosen` are its numbers by scene, method and metric."""
     there = {metric for _, _, metric in chosen}
-    metrics = {m: how for m, how in COLUMNS[protocol].items() if m in there}
+    return _grid_of(chosen, {m: how for m, how in COLUMNS[protocol].items() if m in there}, own, protocol)
+
+
+def _grid_of(
+    chosen: dict[tuple[str, str, str], Number],
+    metrics: dict[str, Metric],
+    own: Sequence[RunRecord],
+    protocol: str = MAIN_TABLE,
+) -> tuple[list[Column], list[list[Cell]]]:
+    """Return columns and rows of a table with all scenes side by side, then their mean."""
     scenes = list(dict.fromkeys(r.run.scene for r in own))
     groups = [*scenes, *["mean"] * (len(scenes) > 1), *["harm rate"] * (protocol == "anchored")]
     failed = {(r.run.scene, r.label): r.status for r in own if r.status != OK}
@@ -223,81 +266,7 @@ def _over_scenes(cells: list[Cell], k: int, step: int, column: Metric) -> Cell:
     return Cell(f"{mean:.{column.digits}f}", mean)
 
 
-def merged(texts: Iterable[str]) -> str:
-    """Join texts that differ in numbers only into one with their ranges, others with " / "."""
-    kinds: dict[tuple[str, ...], list[list[str]]] = {}
-    for text in texts:
-        kinds.setdefault(tuple(_NUMBER.split(text)), []).append(_NUMBER.findall(text))
-    out = []
-    for pieces, found in kinds.items():
-        ranges = [sorted(set(column), key=float) for column in zip(*found, strict=True)]
-        shown = [r[0] if len(r) == 1 else f"{r[0]} to {r[-1]}" for r in ranges]
-        out.append("".join(a + b for a, b in zip(pieces, [*shown, ""], strict=True)))
-    return " / ".join(out)
-
-
-_NUMBER = re.compile(r"\d+\.\d+")
-
-
-def caption(records: Sequence[RunRecord], protocol: str) -> str:
-    """State protocol, region, reference, alignment and data range of a table."""
-    if protocol == "cost":
-        return (
-            "Protocol cost: seconds and peak resident memory of a run; compilation and first call are not included. "
-            "Air kerma is that of the whole scan at the isocentre without the object, the same for every method."
-        )
-    if protocol == "against":
-        nmar = row_of(NMAR, (r.label for r in records if r.status == OK and r.run.variant == METAL))
-        return (
-            "Protocol tissue, compared: gain in PSNR3D (dB) over no correction (FDK) and over NMAR"
-            f"{'' if nmar is None else f' (the row {nmar})'}, scene by scene and seed by seed."
-        )
-    if protocol == "anchored":
-        return (
-            "Anchored scores s = (e − e_ref)/(e_FDK − e_ref), e_ref from the metal-free scan reconstructed by FDK: "
-            "0 as if the metal had never been there, 1 uncorrected. Harm rate: share of scenes with s > 1, "
-            "and how many of how many scenes that have a score."
-        )
-    found = [(r, r.scores[protocol]) for r in records if protocol in r.scores and r.run.variant == METAL]
-    if not found:
-        return f"Protocol {protocol}."
-    score = found[0][1]
-    references = merged(dict.fromkeys(s.reference for _, s in found))
-    alignment = "one least-squares gain on the body" if protocol.startswith("aligned") else score.alignment
-    text = f"Protocol {protocol}: region {score.region}; reference {references}; alignment {alignment}"
-    ranges: dict[str, list[float]] = {}
-    others: dict[str, list[str]] = {}
-    for r, s in found:
-        if s.data_range is not None:
-            ranges.setdefault(r.run.scene, []).append(s.data_range)
-        if s.volume != AS_RETURNED:
-            others.setdefault(s.volume, []).append(r.label)
-    if ranges:
-        text += "; data range " + ", ".join(f"{_span(v)} ({s})" for s, v in ranges.items()) + " 1/mm"
-    return text + "".join(f"; {', '.join(dict.fromkeys(who))} {how}" for how, who in others.items()) + "."
-
-
-def _span(numbers: list[float]) -> str:
-    """Write numbers as one, or as the least and the greatest where seeds differ."""
-    low, high = f"{min(numbers):.4g}", f"{max(numbers):.4g}"
-    return low if low == high else f"{low} to {high}"
-
-
-def _notes(records: Sequence[RunRecord], protocol: str) -> list[str]:
-    """Return what the scores of a protocol declare: once for a scene and seed where its methods agree."""
-    labels: dict[tuple[str, int, str], list[str]] = {}
-    for record in records:
-        if record.run.variant == METAL and protocol in record.scores and record.scores[protocol].note:
-            key = (record.run.scene, record.run.seed, record.scores[protocol].note)
-            labels.setdefault(key, []).append(record.label)
-    said = Counter((scene, seed) for scene, seed, _ in labels)
-    return [
-        f"{scene} (seed {seed}{'' if said[scene, seed] == 1 else ', ' + ', '.join(methods)}): {note}"
-        for (scene, seed, note), methods in labels.items()
-    ]
-
-
-def render(records: Sequence[RunRecord], form: Format, protocols: Iterable[str] = tuple(COLUMNS)) -> str:
+def render(records: Sequence[RunRecord], form: Format, protocols: Collection[str] = ALL) -> str:
     """Render the protocols' tables as Markdown or LaTeX (booktabs); failures and skips follow with their reasons."""
     return _page(tables(records, protocols), form, _failures(latest(records)), remarks(records))
 

@@ -21,7 +21,7 @@ from ctsim.benchmarks.engine.record import OK, merged
 from ctsim.benchmarks.engine.table import Cell, Column, Table, ranked
 from ctsim.benchmarks.methods import TABLE
 from ctsim.benchmarks.scores.score import VERSION
-from ctsim.benchmarks.studies.methods import records, tables
+from ctsim.benchmarks.studies.methods import captions, records, tables
 from ctsim.benchmarks.studies.methods.records import METAL, Run, RunRecord, case_of
 from ctsim.benchmarks.studies.paper.layout import NONE, PaperTable, Planned, duration, load, printed
 from ctsim.errors import InputError
@@ -252,7 +252,7 @@ def caption(layout: PaperTable, used: list[RunRecord], protocol: str) -> str:
     parts = [f"The paper's Table {layout.number} and what was measured here."]
     if not timed:
         parts.append("The paper states neither the region, nor the energy of the reference, nor the peak of PSNR3D.")
-    parts.append(f"Here: {tables.caption(used, 'cost' if timed else protocol)}")
+    parts.append(f"Here: {captions.caption(used, 'cost' if timed else protocol)}")
     steps = sorted({p.params["steps"] for row in layout.plan() for p in row if "steps" in p.params})
     if steps:
         parts.append(f"A run has {' or '.join(map(str, steps))} steps here, a tenth of the published.")
