@@ -186,7 +186,8 @@ def materials(setup: Bench) -> Iterator[Pair]:
     """Yield a phantom whose table names metals that it does not hold, traced without them and with them."""
     body = build(setup.scene())
     scan = setup.planned(phantom=replace(body, materials=body.materials + ABSENT))
-    every = replace(scan, plan=replace(scan.plan, materials=scan.phantom.materials))
+    names = scan.phantom.materials
+    every = replace(scan, plan=replace(scan.plan, materials=names, tissues=names))
     what = f"materials that do not occur: {', '.join(ABSENT)}"
     yield setup.pair(what, scan, every, limit=rounding(every), stated="rounding")
 
@@ -330,7 +331,8 @@ def twin(setup: Bench) -> Iterator[Pair]:
         both = (scan.phantom, scan.phantom.without_metal())
         alone, bare = (setup.planned(scan.scene, single, phantom=phantom) for phantom in both)
         # the twin's energies and materials
-        bare = replace(bare, plan=replace(bare.plan, rule=scan.plan.rule, materials=scan.plan.materials))
+        known = scan.plan
+        bare = replace(bare, plan=replace(bare.plan, rule=known.rule, materials=known.materials, tissues=known.tissues))
         yield Pair(
             scene=scan.scene.name,
             what="rays and draws of the metal-free twin out of the metal's shadow",
