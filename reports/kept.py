@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.benchmarks.scores.artefact import water_attenuation
+from ctsim.benchmarks.scores.artefact import effective_attenuation
 from ctsim.benchmarks.scores.protocol import Stored, Truth, truth_of
 from ctsim.benchmarks.studies.methods.panels import Look, cut, look_of
 from ctsim.benchmarks.studies.methods.plan import repetition
@@ -69,7 +69,7 @@ def case_of(stored: Stored, records: Sequence[RunRecord], results: Path) -> Case
             kept.append(Kept(record=record, values=map_volume(path), at_50kev=at_50kev))
     scene, seed = repetition(stored)
     truth = truth_of(stored)
-    look = look_of(truth, None, np.zeros(0, np.bool_), water_attenuation(stored))
+    look = look_of(truth, None, np.zeros(0, np.bool_), effective_attenuation(stored))
     return Case(stored=stored, scene=scene, seed=seed, truth=truth, look=look, kept=tuple(kept))
 
 

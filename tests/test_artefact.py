@@ -283,7 +283,7 @@ def test_water_is_that_of_the_effective_reference(smallest):
     reference = stored.metal_free.reference("effective")
     # rods in water: without them the voxels inside the cylinder are all water. spectrum.csv keeps energies
     # to 5e-5 keV: μ ∝ E^-3 moves by 3·5e-5/10 at worst; float32 references round to 6e-8
-    assert artefact.water_attenuation(stored) == pytest.approx(float(reference.max()), rel=2e-5)
+    assert artefact.effective_attenuation(stored) == pytest.approx(float(reference.max()), rel=2e-5)
 
 
 def test_a_layout_of_stored_files_declares_itself(smallest):
@@ -298,8 +298,8 @@ def test_a_layout_of_stored_files_declares_itself(smallest):
 
 def test_a_damaged_spectrum_is_named(smallest, tmp_path):
     stored = dataclasses.replace(open_scan(list_scans(smallest)[0]), folder=tmp_path)
-    assert artefact.water_attenuation(stored) is None
+    assert artefact.effective_attenuation(stored) is None
     for text in ("energy_kev,signal_fraction\n", "a,b\n1,2\n", "energy_kev,signal_fraction\n1,x\n"):
         (tmp_path / "spectrum.csv").write_text(text)
         with pytest.raises(InputError, match=r"spectrum\.csv"):
-            artefact.water_attenuation(stored)
+            artefact.effective_attenuation(stored)

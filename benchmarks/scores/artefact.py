@@ -67,8 +67,8 @@ class Layout:
     note: str
 
 
-def water_attenuation(stored: StoredScan) -> float | None:
-    """Return μ of water in 1/mm under the scan's effective spectrum; None where its spectrum is not stored.
+def effective_attenuation(stored: StoredScan, material: str = "water") -> float | None:
+    """Return μ of a material in 1/mm under the scan's effective spectrum; None where its spectrum is not stored.
 
     ω(E) ∝ signal(E)·exp(−μ_water(E)·L0), the weights of the effective-spectrum reference. Raises
     InputError where spectrum.csv is damaged.
@@ -86,7 +86,7 @@ def water_attenuation(stored: StoredScan) -> float | None:
     energies, signal = np.array(table).T
     mu = attenuation("water", energies)
     weights = signal * np.exp((mu.min() - mu) * stored.l0)
-    return float(np.average(mu, weights=weights))
+    return float(np.average(attenuation(material, energies), weights=weights))
 
 
 def layout_of(stored: StoredScan, truth: Truth) -> Layout:
@@ -94,7 +94,7 @@ def layout_of(stored: StoredScan, truth: Truth) -> Layout:
     rois, small = homogeneous(np.asarray(stored.labels), truth, stored.info.materials)
     lines, n_pairs, cut = metal_lines(truth)
     near = near_metal(truth)
-    water = water_attenuation(stored)
+    water = effective_attenuation(stored)
     parts = [_roi_text(roi) for roi in rois]
     parts += [f"no ROI in {', '.join(small)}: fewer than {MIN_VOXELS} voxels"] if small else []
     parts += [f"lines for {len(lines)} of {n_pairs} pairs of metal pieces{cut}"]
@@ -168,10 +168,8 @@ def metal_lines(truth: Truth) -> tuple[tuple[NDArray[np.float64], ...], int, str
 
     Points have a spacing of half the smallest voxel. A point whose nearest voxel is not judged tissue is left out.
     """
-    pieces = _pieces(truth.metal)
-    sizes = np.bincount(pieces.ravel())[1:]
-    n = sizes.size
-    kept = 1 + np.sort(np.argsort(-sizes, kind="stable")[:MAX_PIECES])
+    pieces, n = pieces_of(truth.metal, MAX_PIECES)
+    kept = np.unique(pieces[pieces > 0])
     centroids = np.array(ndimage.center_of_mass(truth.metal, pieces, kept)).reshape(-1, 3)
     lines = []
     for a, b in itertools.combinations(centroids, 2):
@@ -183,6 +181,22 @@ def metal_lines(truth: Truth) -> tuple[tuple[NDArray[np.float64], ...], int, str
             lines.append(points[inside])
     cut = f", the {MAX_PIECES} largest of {n}" if n > MAX_PIECES else ""
     return tuple(lines), len(centroids) * (len(centroids) - 1) // 2, cut
+
+
+def pieces_of(metal: Mask, most: int) -> tuple[NDArray[np.int32], int]:
+    """Return numbers of the pieces of metal, from 1 on and 0 for all but the `most` largest; and how many there are."""
+    pieces = _pieces(metal)
+    sizes = np.bincount(pieces.ravel())[1:]
+    kept = np.zeros(sizes.size + 1, np.bool_)
+    kept[1 + np.argsort(-sizes, kind="stable")[:most]] = True
+    return np.where(kept[pieces], pieces, np.int32(0)), sizes.size
+
+
+def distance_to_metal(truth: Truth) -> NDArray[np.float64]:
+    """Return the distance (mm) from each voxel's centre to that of the next metal voxel; infinity without metal."""
+    if not truth.metal.any():
+        return np.full(truth.metal.shape, np.inf)
+    return np.asarray(ndimage.distance_transform_edt(~truth.metal, sampling=truth.d_voxel))
 
 
 def near_metal(truth: Truth) -> Mask:

@@ -6,11 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.benchmarks.scores.artefact import Layout, artefact_score, layout_of
+from ctsim.benchmarks.scores.artefact import Layout, artefact_score, effective_attenuation, layout_of
 from ctsim.benchmarks.scores.metrics import METAL
 from ctsim.benchmarks.scores.projection import HeldOut, held_out, projection_score, with_floor
 from ctsim.benchmarks.scores.protocol import Truth, evaluate, truth_of
 from ctsim.benchmarks.scores.score import NO_TWIN, Score
+from ctsim.benchmarks.scores.soft import SoftLayout, soft_layout, soft_score
+from ctsim.benchmarks.scores.structure import StructureLayout, structure_layout, structure_score
 from ctsim.dataset.store import StoredScan
 from ctsim.notes import NOT_ON_GRID
 
@@ -32,6 +34,8 @@ class Judge:
 
     truth: Truth
     layout: Layout
+    soft: SoftLayout | str
+    structure: StructureLayout | str
     views: HeldOut | str
     absent: str = ""
 
@@ -40,7 +44,16 @@ class Judge:
         """Load a scan's references and choose where its artefacts are measured."""
         truth = truth_of(stored)
         views = with_floor(held_out(stored), truth)
-        return cls(truth=truth, layout=layout_of(stored, truth), views=views, absent=_absent(stored, truth))
+        water, bone = (effective_attenuation(stored, name) for name in ("water", "cortical_bone"))
+        soft = soft_layout(np.asarray(stored.labels), truth, stored.info.materials, water)
+        return cls(
+            truth=truth,
+            layout=layout_of(stored, truth),
+            soft=soft,
+            structure=structure_layout(soft, truth, bone / water if bone and water else None),
+            views=views,
+            absent=_absent(stored, truth),
+        )
 
     def scores(
         self, values: NDArray[Any], variant: str, twin: Twin, at_50kev: NDArray[Any] | None = None
@@ -50,6 +63,9 @@ class Judge:
         `at_50kev` is the volume at 50 keV of a method that knows energies.
         """
         scores = evaluate(values, self.truth, at_50kev=at_50kev, anchor=variant != "metal")
+        scores["soft"] = soft_score(values, self.soft)
+        if self.truth.metal.any():
+            scores["structure"] = structure_score(values, self.structure)
         if variant == "metal":
             scores["projection"] = projection_score(values, self.views, at_50kev)
         if variant == "metal" and self.absent:

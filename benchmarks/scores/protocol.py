@@ -16,19 +16,22 @@ from ctsim.benchmarks.scores.metrics import Mask
 from ctsim.benchmarks.scores.score import AS_RETURNED, AT_50KEV, Score
 from ctsim.dataset.store import StoredScan as Stored
 from ctsim.errors import InputError
+from ctsim.geometry import Geometry
 
 METAL_MARGIN = 2
 BODY_MARGIN = 4
 RANGE_PERCENTILE = 99.9
 ReferenceKind = Literal["effective", "50kev"]
 TISSUE = "inside the body dilated by 4 voxels, outside the metal dilated by 2"
+CUT = ", inside the field of view of all views"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Truth:
     """The truth that a volume is compared with: two references and the regions, all [z, y, x].
 
-    `tissue` is the judged region of the protocols `tissue` and `aligned`; `judged` is the dilated body.
+    `tissue` is the judged region of the protocols `tissue` and `aligned`; `judged` is the dilated body. `cut` says that
+    both end at the field of view, because the body does not.
     """
 
     references: dict[str, NDArray[np.float32]]
@@ -39,6 +42,7 @@ class Truth:
     near_metal: Mask
     d_voxel: tuple[float, float, float]
     l0: float
+    cut: bool = False
 
 
 def truth_of(stored: Stored) -> Truth:
@@ -46,6 +50,9 @@ def truth_of(stored: Stored) -> Truth:
     metal, body = np.asarray(stored.metal) > 0, np.asarray(stored.labels) > 0
     near_metal = metrics.dilate(metal, METAL_MARGIN) if metal.any() else metal
     judged = metrics.dilate(body | metal, BODY_MARGIN)
+    field = field_of_view(stored.geometry)
+    cut = bool((body | metal)[~field].any())
+    judged = judged & field if cut else judged
     tissue = judged & ~near_metal
     if not tissue.any():
         raise InputError(f"scan {stored.name!r}: nothing is left to judge outside the dilated metal")
@@ -62,7 +69,22 @@ def truth_of(stored: Stored) -> Truth:
         near_metal=near_metal,
         d_voxel=stored.geometry.d_voxel,
         l0=float(stored.l0),
+        cut=cut,
     )
+
+
+def field_of_view(geometry: Geometry) -> Mask:
+    """Return the voxels [z, y, x] whose centres every view of an orbit sees; all of them for views with poses.
+
+    A voxel is seen if it is within the cylinder of the fans, and within the cone where it comes nearest to the source.
+    """
+    if geometry.poses is not None:
+        return np.ones(geometry.n_voxel, np.bool_)
+    z, y, x = geometry.voxel_centres()
+    radius = np.hypot(y[:, None], x)
+    half, off = geometry.s_detector[0] / 2, geometry.off_detector[0]
+    magnified = geometry.dsd / np.maximum(geometry.dso - radius, 1e-9) * z[:, None, None]
+    return (radius <= geometry.fov_radius) & (magnified <= half + off) & (magnified >= off - half)
 
 
 def tissue_range(truth: Truth, kind: ReferenceKind) -> float:
@@ -123,7 +145,7 @@ def _region_score(
     mse = metrics.mse3d(values, reference, truth.tissue)
     ssim = metrics.ssim3d(values, reference, data_range=data_range, region=truth.tissue)
     return Score(
-        region=TISSUE,
+        region=TISSUE + CUT * truth.cut,
         reference=_reference_text(truth, kind),
         alignment=alignment,
         data_range=data_range,

@@ -11,12 +11,12 @@ import msgspec
 
 from ctsim.benchmarks.engine.record import OK
 
-VERSION = 3
+VERSION = 4
 """Part of every run's identity; raised when a protocol changes its meaning.
 
 1: tissue, aligned, paper, metal, cost. 2: every method runs on the metal-free twin too, for `artefact`.
 3: `projection`, and `rmse` of `artefact`. The version was not raised for `at_energy`: only new code has it, and code is
-part of the identity.
+part of the identity. 4: `soft` and `structure`, of the twin too; `tissue` stays inside the field of view.
 """
 
 AS_RETURNED, AT_50KEV = "as returned", "read at 50 keV"
@@ -85,6 +85,26 @@ COLUMNS: dict[str, dict[str, Metric]] = {
         "ssim3d_r2": Metric("ssim3d_r2", 3, "max"),
         "ssim3d_naf": Metric("ssim3d_naf", 3, "max"),
     },
+    "soft": {
+        **_IMAGE,
+        "rmse": Metric("RMSE (HU)", 1, "min"),
+        "contrast": Metric("contrast left", 3, "one"),
+        "cnr": Metric("CNR", 2, "max"),
+        "noise_near": Metric("noise ≤ 5 mm (HU)", 1),
+        "noise_far": Metric("noise > 5 mm (HU)", 1),
+        "grain_far": Metric("noise correlation", 2),
+        "mtf50_near": Metric("MTF50 ≤ 10 mm (1/mm)", 3, "max"),
+        "mtf50_far": Metric("MTF50 > 10 mm (1/mm)", 3, "max"),
+    },
+    "structure": {
+        "false_bone": Metric("false bone (%)", 2, "min", 100),
+        "false_air": Metric("false air (%)", 2, "min", 100),
+        "false_bone_near": Metric("false bone ≤ 5 mm (%)", 2, "min", 100),
+        "false_bone_between": Metric("false bone between (%)", 2, "min", 100),
+        "false_air_between": Metric("false air between (%)", 2, "min", 100),
+        "bias_between": Metric("bias between (HU)", 0),
+        "rmse_between": Metric("RMSE between (HU)", 0, "min"),
+    },
     "metal": {
         "core_ratio": Metric("core ratio", 3, "one"),
         "dice": Metric("Dice", 3, "max"),
@@ -112,6 +132,7 @@ COLUMNS: dict[str, dict[str, Metric]] = {
         "fdk_db": Metric("against FDK without metal (dB)", 2, "min"),
         "own_hu": Metric("against its own twin (HU)", 1, "min"),
         "fdk_hu": Metric("against FDK without metal (HU)", 1, "min"),
+        "own_bone": Metric("false bone against its own twin (points)", 2, "min", 100),
     },
     "against": {
         "over_fdk": Metric("over FDK (dB)", 2, "max"),
@@ -156,11 +177,11 @@ ANCHORED = {
     "artefact": ("roi_std", "cupping", "streak", "rmse", "rmse_near", "rmse_far"),
 }
 """The metrics that have an anchored score. FDK's `artefact` error without the metal is 0 by definition."""
-LOST = {("tissue", "psnr3d"): ("db", -1.0), ("soft", "rmse"): ("hu", 1.0)}
+LOST = {("tissue", "psnr3d"): ("db", -1.0), ("soft", "rmse"): ("hu", 1.0), ("structure", "false_bone"): ("bone", 1.0)}
 """What the cost of metal is taken of: (protocol, metric) -> its name's end, and the sign of what is worse."""
 LEAST_LOSS = 0.1
 """An anchored score exists where the metal raises FDK's error by at least this share of its error without."""
-COMPARED = {**ANCHORED, "tissue": ("psnr3d", *ANCHORED["tissue"]), "soft": ("rmse",)}
+COMPARED = {**ANCHORED, "tissue": ("psnr3d", *ANCHORED["tissue"]), "soft": ("rmse",), "structure": ("false_bone",)}
 """The metrics that costs, gains or anchored scores are derived from."""
 
 Place = tuple[str, int, str, str, str, str]

@@ -24,7 +24,7 @@ from ctsim.baselines.limar import interpolated
 from ctsim.baselines.metal import Metal, Trace, find_metal
 from ctsim.baselines.prior import Choice, better, choose_prior
 from ctsim.benchmarks.cli import guarded
-from ctsim.benchmarks.scores.artefact import water_attenuation
+from ctsim.benchmarks.scores.artefact import effective_attenuation
 from ctsim.benchmarks.scores.protocol import truth_of
 from ctsim.dataset.store import StoredScan, list_scans, open_scan
 from ctsim.errors import InputError
@@ -64,7 +64,7 @@ def _chosen(folders: Iterable[Path], names: list[str]) -> list[Path]:
 
 def rows(stored: StoredScan) -> list[dict[str, object]]:
     """Measure a scene with every dilation."""
-    water, free = water_attenuation(stored), stored.metal_free
+    water, free = effective_attenuation(stored), stored.metal_free
     if free is None or water is None:
         raise InputError(f"{stored.name}: expected a scene with its spectrum and its metal-free twin")
     mask, bare = np.asarray(stored.metal) > 0, free.scan

@@ -23,7 +23,7 @@ from PIL import Image
 
 from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.table import pictured
-from ctsim.benchmarks.scores.artefact import water_attenuation
+from ctsim.benchmarks.scores.artefact import effective_attenuation
 from ctsim.benchmarks.scores.protocol import Truth, truth_of
 from ctsim.benchmarks.studies.methods.records import RunRecord, latest
 from ctsim.benchmarks.studies.methods.volumes import (
@@ -157,7 +157,7 @@ def draw(stored: StoredScan, truth: Truth, rows: list[PanelRow]) -> Figure:
     worked = any(r.shown for r in rows)
     view = next((int(r.shown["view"]) for r in rows if "view" in r.shown), None)
     measured, shadow = (None, np.zeros(0, bool)) if view is None else _measured(stored, view)
-    look = look_of(truth, measured, shadow, water_attenuation(stored))
+    look = look_of(truth, measured, shadow, effective_attenuation(stored))
     at = cut(truth.metal, truth.body)
     n_columns, n_rows = 2 * len(PLANES) + 2 * worked, 1 + len(rows)
     size = (CELL * n_columns + LABEL, CELL * n_rows + 1.1)

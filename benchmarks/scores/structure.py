@@ -1,0 +1,96 @@
+"""The protocol `structure`: soft tissue between and around metal that reads as bone or as air.
+
+Streaks between pieces of metal look like structure: PSNR over the whole body hardly counts a bar of false bone, a
+reader of the image sees nothing else. Volumes are [z, y, x] in 1/mm.
+"""
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from skimage.morphology import convex_hull_image
+
+from ctsim.benchmarks.scores.artefact import MAX_PIECES, pieces_of
+from ctsim.benchmarks.scores.metrics import Mask, erode
+from ctsim.benchmarks.scores.protocol import Truth
+from ctsim.benchmarks.scores.score import COLUMNS, Score
+from ctsim.benchmarks.scores.soft import SoftLayout
+
+REGION = (
+    "soft tissue without its outermost voxel, within 5 mm of the metal or between two pieces of it, outside the metal "
+    "dilated by 2 voxels"
+)
+NO_METAL = "the scan holds no metal"
+NONE_LEFT = "no soft tissue lies near the metal or between its pieces"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StructureLayout:
+    """Where false structure is looked for: masks [z, y, x], and per voxel the HU from which it reads as bone or air."""
+
+    near: Mask
+    between: Mask
+    soft: SoftLayout
+    bone: float
+    air: float = -1000.0
+
+
+def structure_layout(soft: SoftLayout | str, truth: Truth, bone: float | None) -> StructureLayout | str:
+    """Choose the region; a sentence where there is none. `bone` is μ of cortical bone over that of water."""
+    if isinstance(soft, str):
+        return soft
+    if not truth.metal.any() or bone is None:
+        return NO_METAL
+    inside = erode(soft.region) & soft.region
+    found = StructureLayout(
+        near=inside & soft.near, between=inside & between_metal(truth), soft=soft, bone=(bone - 1) * 1000
+    )
+    return found if (found.near | found.between).any() else NONE_LEFT
+
+
+def between_metal(truth: Truth) -> Mask:
+    """Return the voxels between two pieces of metal: in each slice, the convex hulls of all pairs of pieces."""
+    pieces, _ = pieces_of(truth.metal, MAX_PIECES)
+    found = np.zeros_like(truth.metal)
+    for z in np.flatnonzero(pieces.any((1, 2))):
+        here = pieces[z]
+        for a, b in itertools.combinations([k for k in np.unique(here) if k], 2):
+            pair = (here == a) | (here == b)
+            box = ndimage.find_objects(pair.astype(np.uint8))[0]
+            found[z][box] |= convex_hull_image(pair[box])
+    return found & truth.tissue
+
+
+def structure_score(values: NDArray[Any], layout: StructureLayout | str) -> Score:
+    """Score false bone and false air; all None with the reason where the layout is a sentence.
+
+    A voxel reads as bone where it is nearer to cortical bone than to its own reference, as air where nearer to air.
+    """
+    if isinstance(layout, str):
+        return Score.none(REGION, COLUMNS["structure"], layout)
+    region = layout.near | layout.between
+    reference = layout.soft.reference[region]
+    hu = (values[region].astype(np.float64) / layout.soft.water - 1) * 1000
+    bone, air = hu > (reference + layout.bone) / 2, hu < (reference + layout.air) / 2
+    parts = {"": np.ones_like(bone), "_near": layout.near[region], "_between": layout.between[region]}
+    found: dict[str, float | None] = {}
+    for end, part in parts.items():
+        found[f"false_bone{end}"] = float(bone[part].mean()) if part.any() else None
+        found[f"false_air{end}"] = float(air[part].mean()) if part.any() else None
+    error = (hu - reference)[parts["_between"]]
+    found["bias_between"] = float(error.mean()) if error.size else None
+    found["rmse_between"] = math.sqrt(float(np.mean(error**2))) if error.size else None
+    return Score(
+        region=REGION,
+        reference="effective spectrum, in HU",
+        alignment="none",
+        data_range=None,
+        n_voxels=int(region.sum()),
+        values=found,
+        note=f"{int(layout.near.sum())} voxels near metal, {int(layout.between.sum())} between pieces; "
+        f"cortical bone {layout.bone:.0f} HU",
+    )
