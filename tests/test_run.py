@@ -85,6 +85,10 @@ def open_double(folder):
     return double(Path(folder))
 
 
+TWIN = {"tissue", "aligned", "aligned_50kev", "soft", "structure"}
+"""The protocols of a metal-free twin."""
+
+
 def double(folder, twin=True):
     return Double(folder=folder, name="box", metal_free=Double(folder=folder, name="box") if twin else None)
 
@@ -158,7 +162,7 @@ def test_a_run_is_scored_timed_kept_and_recorded(tmp_path):
     record = once("good", tmp_path)
     assert record.status == "ok" and record.run.seed == 3 and record.run.params == {"level": 0.018}
     assert record.data_code == "v1" and record.kerma == 1.25
-    assert set(record.scores) == {"tissue", "aligned", "aligned_50kev", "paper", "metal", "projection", "artefact"}
+    assert set(record.scores) == {*TWIN, "paper", "metal", "projection", "artefact"}
     assert "without scene.toml" in record.scores["projection"].note
     assert record.scores["artefact"].note == NOT_ASKED
     assert set(record.scores["artefact"].values.values()) == {None}
@@ -240,7 +244,7 @@ def test_the_anchor_is_judged_in_the_region_of_the_metal_scan(tmp_path, monkeypa
     without, with_metal = run_methods([double(tmp_path)], [methods.find("fdk")], tmp_path)
     assert without.run.variant == "metal_free" and without.identity != with_metal.identity
     assert without.scores["tissue"] == with_metal.scores["tissue"]
-    assert set(without.scores) == {"tissue", "aligned", "aligned_50kev"}
+    assert set(without.scores) == TWIN
     assert len(plan.jobs([double(tmp_path, twin=False)], [methods.find("fdk")], anchor=True)) == 1
 
 
