@@ -25,14 +25,41 @@ LEAST_CONTRAST = 50.0
 NEAR_EDGE = 10.0
 """A cube whose centre is at most this far from metal (mm) is near it."""
 CUBE, STRIDE = 12, 6
-MOST_CUBES = 2000
+MOST_CUBES = 400
 LEAST_CUBES = 8
+LEAST_LIKENESS = 0.05
+DENSEST = 2000.0
+SIGMAS = np.arange(0, 4.01, 0.25)
+"""Blurs that are tried (standard deviations of Gaussians in voxels); the best is found between them."""
 HIGH_PASS = 5
 """Noise is what is left of an error without its mean over a cube of this edge (voxels)."""
-LEAST_GAIN = 0.1
 REGION = "soft tissue inside the body, outside the metal dilated by 2 voxels"
 NO_HU = "no HU: the scan comes without spectrum.csv"
 NO_SOFT = f"no material of the labels is within {SOFT_HU:g} HU of water"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Edges:
+    """Cubes of a reference with an edge in them: their `corners` [n, 3], and what each is like `blurred` by a Gaussian.
+
+    `blurred` is [σ, n, voxel] in HU, without each cube's mean.
+    """
+
+    corners: NDArray[np.int64]
+    blurred: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, reference: NDArray[np.float64], corners: NDArray[np.int64]) -> "Edges":
+        """Blur a reference [z, y, x] in HU; what is denser than bone would outshine the tissue, so it is cut there."""
+        cut = np.clip(reference, -1000, DENSEST)
+        blurred = [_cubes_of(ndimage.gaussian_filter(cut, sigma), corners) for sigma in SIGMAS if len(corners)]
+        return cls(corners=corners, blurred=np.array(blurred, np.float32))
+
+
+def _cubes_of(volume: NDArray[np.float64], corners: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the cubes [n, voxel] of a volume at their corners, without their means."""
+    found = np.lib.stride_tricks.sliding_window_view(volume, (CUBE,) * 3)[tuple(corners.T)].reshape(len(corners), -1)
+    return found - found.mean(1, keepdims=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,8 +68,8 @@ class SoftLayout:
 
     `region` holds all voxels of soft classes, `classes` each class's own; `even` those whose 26 neighbours are of the
     same class, and `wide` those whose neighbours within 2 voxels are. `pair` names two classes to tell apart. The
-    `reference` is in HU. `near` is up to 5 mm from the metal. `cubes` are corners of cubes with structure, near metal
-    and far.
+    `reference` is in HU. `near` is up to 5 mm from the metal. `edges` are cubes with structure, "near" metal and
+    "far".
     """
 
     water: float
@@ -53,7 +80,7 @@ class SoftLayout:
     wide: Mask
     near: Mask
     pair: tuple[str, str] | None
-    cubes: dict[str, NDArray[np.int64]]
+    edges: dict[str, Edges]
     pitch: float
     note: str
 
@@ -89,7 +116,7 @@ def soft_layout(
         wide=wide,
         near=distance <= 5.0 * (1 + 1e-9),
         pair=pair,
-        cubes=_cubes(reference, truth, distance),
+        edges=_edges(reference, truth, distance),
         pitch=float(np.prod(truth.d_voxel) ** (1 / 3)),
         note=f"soft tissue: {', '.join(classes)}; {told}; water {water:.5g} 1/mm",
     )
@@ -113,23 +140,20 @@ def _pair(reference: NDArray[np.float64], even: dict[str, Mask]) -> tuple[str, s
     return max(found)[1] if found else None
 
 
-def _cubes(reference: NDArray[np.float64], truth: Truth, distance: NDArray[np.float64]) -> dict[str, NDArray[np.int64]]:
-    """Return corners [n, 3] of cubes within the judged tissue that hold an edge, near the metal and far from it."""
+def _edges(reference: NDArray[np.float64], truth: Truth, distance: NDArray[np.float64]) -> dict[str, Edges]:
+    """Return the cubes within the judged tissue that hold an edge, those near the metal and those far from it."""
     if min(truth.tissue.shape) < CUBE:
-        return {"near": np.zeros((0, 3), np.int64), "far": np.zeros((0, 3), np.int64)}
+        return {where: Edges.of(reference, np.zeros((0, 3), np.int64)) for where in ("near", "far")}
     starts = [np.arange(0, n - CUBE + 1, STRIDE) for n in truth.tissue.shape]
     corners = np.stack(np.meshgrid(*starts, indexing="ij"), -1).reshape(-1, 3)
-    kept = [c for c in corners if truth.tissue[_box(c)].all() and np.ptp(reference[_box(c)]) >= LEAST_CONTRAST]
-    found = np.array(kept, np.int64).reshape(-1, 3)
-    middle = distance[tuple((found + CUBE // 2).T)] if len(found) else np.zeros(0)
-    near = middle <= NEAR_EDGE
+    boxes = (tuple(slice(int(c), int(c) + CUBE) for c in corner) for corner in corners)
+    kept = [truth.tissue[box].all() and np.ptp(reference[box]) >= LEAST_CONTRAST for box in boxes]
+    found = corners[np.array(kept, np.bool_)]
+    near = distance[tuple((found + CUBE // 2).T)] <= NEAR_EDGE
     return {
-        name: part[:: max(1, len(part) // MOST_CUBES)] for name, part in (("near", found[near]), ("far", found[~near]))
+        where: Edges.of(reference, part[:: max(1, -(-len(part) // MOST_CUBES))])
+        for where, part in (("near", found[near]), ("far", found[~near]))
     }
-
-
-def _box(corner: NDArray[np.int64]) -> tuple[slice, ...]:
-    return tuple(slice(int(c), int(c) + CUBE) for c in corner)
 
 
 def soft_score(values: NDArray[Any], layout: SoftLayout | str) -> Score:
@@ -145,7 +169,7 @@ def soft_score(values: NDArray[Any], layout: SoftLayout | str) -> Score:
         "rmse": math.sqrt(mse),
         **_told_apart(hu, error, layout),
         **_noise(error, layout),
-        **{f"mtf50_{where}": mtf50(hu, layout.reference, c, layout.pitch) for where, c in layout.cubes.items()},
+        **{f"mtf50_{where}": mtf50(hu, edges, layout.pitch) for where, edges in layout.edges.items()},
     }
     for name, mask in layout.classes.items():
         even = layout.even[name]
@@ -206,41 +230,41 @@ def _correlation(local: NDArray[np.float64], mask: Mask) -> float | None:
     return (product / square - white) / (1 - white) if square else None
 
 
-def mtf50(
-    hu: NDArray[np.float64], reference: NDArray[np.float64], corners: NDArray[np.int64], pitch: float
-) -> float | None:
-    """Return the frequency (1/mm) at which half of the reference's modulation is left, over cubes with structure.
+def mtf50(hu: NDArray[np.float64], edges: Edges, pitch: float) -> float | None:
+    """Return the frequency (1/mm) at which half of the modulation is left, by the blur that explains the cubes best.
 
-    The transfer is the cross spectrum of volume and reference over the reference's power (Hann windows, means removed,
-    bins of radial frequency as wide as a cube's), so noise and the reference's own voxels do not count. It is compared
-    with its lowest bin; None where there are too few cubes or too little of the structure is left, the highest full
-    frequency of the grid where more than half is left everywhere.
+    It is that of the Gaussian whose blur of the reference is most like the volume over all cubes: neither noise, nor an
+    offset of a cube, nor lost contrast changes it. At most the highest frequency of the grid, 1/(2·pitch); None
+    where there are too few cubes, or where the volume holds next to nothing of the reference.
     """
-    if len(corners) < LEAST_CUBES:
+    if len(edges.corners) < LEAST_CUBES:
         return None
-    taper = np.hanning(CUBE + 2)[1:-1]
-    window = taper[:, None, None] * taper[:, None] * taper
-    cross, power = np.zeros((CUBE,) * 3), np.zeros((CUBE,) * 3)
-    for corner in corners:
-        box = _box(corner)
-        v, r = (np.fft.fftn((image[box] - _mean(image[box], window)) * window) for image in (hu, reference))
-        cross += (v * r.conj()).real
-        power += np.abs(r) ** 2
-    f = np.fft.fftfreq(CUBE)
-    radius = np.sqrt(f[:, None, None] ** 2 + f[:, None] ** 2 + f**2) * CUBE
-    rings = [(radius >= k - 0.5) & (radius < k + 0.5) for k in range(1, CUBE // 2 + 1)]
-    where = np.array([float(np.average(radius[ring], weights=power[ring])) for ring in rings]) / (CUBE * pitch)
-    gain = np.array([cross[ring].sum() / power[ring].sum() for ring in rings])
-    if gain[0] < LEAST_GAIN:
+    found = _cubes_of(hu, edges.corners).ravel()
+    blurred = edges.blurred.reshape(len(SIGMAS), -1).astype(np.float64)
+    along, power = blurred @ found, np.sum(blurred**2, 1)
+    likeness = along / np.sqrt(power)
+    least = LEAST_LIKENESS * math.sqrt(float(found @ found))
+    k = int(likeness.argmax())
+    if not likeness[k] > least:
         return None
-    gain = gain / gain[0]
-    below = np.flatnonzero(gain < 0.5)
-    if not below.size:
-        return float(where[-1])
-    k = int(below[0])
-    share = (gain[k - 1] - 0.5) / (gain[k - 1] - gain[k])
-    return float(where[k - 1] + share * (where[k] - where[k - 1]))
+    best, square = float(likeness[k]), float(SIGMAS[k] ** 2)
+    for j in (k - 1, k):
+        if 0 <= j < len(SIGMAS) - 1:
+            shared = float(blurred[j] @ blurred[j + 1])
+            share = _share(along[j], along[j + 1], power[j], power[j + 1], shared)
+            mixed = (1 - share) * along[j] + share * along[j + 1]
+            norm = (1 - share) ** 2 * power[j] + share**2 * power[j + 1] + 2 * share * (1 - share) * shared
+            if mixed / math.sqrt(norm) > best:
+                best = mixed / math.sqrt(norm)
+                square = float((1 - share) * SIGMAS[j] ** 2 + share * SIGMAS[j + 1] ** 2)
+    finest = math.sqrt(math.log(2) / 2) / math.pi  # of a Gaussian, times its σ
+    return min(finest / math.sqrt(max(square, 1e-9)), 0.5) / pitch
 
 
-def _mean(part: NDArray[np.float64], window: NDArray[np.float64]) -> float:
-    return float(np.vdot(part, window) / window.sum())
+def _share(a: float, b: float, aa: float, bb: float, ab: float) -> float:
+    """Return the second share, 0 to 1, of the mixture of two vectors that is most like a third, by their products.
+
+    A blur changes nearly linearly with σ², so the mixture of two neighbours stands for those between them.
+    """
+    first, second = a * bb - b * ab, b * aa - a * ab
+    return float(np.clip(second / (first + second), 0, 1)) if first + second > 0 else 0.0

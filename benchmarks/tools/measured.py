@@ -61,6 +61,11 @@ PAGES: dict[str, Page] = {
         command="run-benchmark report quick --markdown docs/measured/results.md --also core-scatter",
         sources=(*METHODS, "benchmarks/scores/", f"{SUITES}quick.toml", f"{SUITES}core-scatter.toml"),
     ),
+    "sensitivity": Page(
+        title="Which score sees which fault",
+        command="python -m ctsim.benchmarks.tools.sensitivity data/thorax-Fe-s1 docs/measured",
+        sources=("benchmarks/scores/", "benchmarks/tools/sensitivity.py"),
+    ),
     "methods": Page(
         title="Methods: settings and experiments",
         command="run-benchmark pareto results/ --suite benchmarks/suites/tune-settings.toml --part methods",

@@ -1,0 +1,34 @@
+import pytest
+from run_records import append, make_record
+
+from ctsim.benchmarks.scores.score import Score
+from ctsim.benchmarks.tools import assumptions
+from ctsim.errors import InputError
+
+
+def record(scene, method, psnr):
+    score = Score(region="r", reference="e", alignment="none", data_range=0.03, n_voxels=9, values={"psnr3d": psnr})
+    return make_record(
+        method, scene=scene, scene_id=scene, scan=f"{scene}{method}", status="ok", scores={"tissue": score}
+    )
+
+
+def test_a_favour_is_a_difference_from_the_strict_scene(tmp_path, capsys):
+    append(
+        tmp_path,
+        record("box-strict", "fdk", 20.0),
+        record("box-filter", "fdk", 20.25),
+        record("box-strict", "splat", 30.0),
+    )
+    assert assumptions.main([str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    assert "| strict | 20.00 | 30.00 |" in text and "| filter | +0.25 | – |" in text
+    (tmp_path / "docs").mkdir()
+    assert assumptions.main([str(tmp_path), str(tmp_path / "docs")]) == 0
+    assert (tmp_path / "docs" / "assumptions.md").read_text(encoding="utf-8") == text
+
+
+def test_other_results_are_refused(tmp_path):
+    append(tmp_path, record("box", "fdk", 20.0))
+    with pytest.raises(InputError, match="run the suite assumptions first"):
+        assumptions.main([str(tmp_path)])
