@@ -149,10 +149,9 @@ SHOWN: tuple[Place, ...] = (
 )  # fmt: skip
 
 CAPTION = (
-    "Each row is a score, each column a fault that was painted on the truth. ✓: the score sees the fault, for it is "
-    f"worse than without by more than {SEEN:g} standard deviations over {DRAWS} draws of the noise. ▲: it exists to see "
-    "this fault. The artefact is measured against the volume without fault. Blur lessens no "
-    "noise, which is added after it."
+    "Each row is a score, each column a fault that was painted on the truth. ✓: the score sees the fault, for it is worse "
+    f"by more than {SEEN:g} standard deviations over {DRAWS} draws of the noise. ▲: it exists to see this fault. The "
+    "artefact is measured against the volume without fault. Blur lessens no noise, which is added after it."
 )
 
 
