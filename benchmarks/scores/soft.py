@@ -29,7 +29,7 @@ MOST_CUBES = 400
 LEAST_CUBES = 8
 LEAST_LIKENESS = 0.05
 DENSEST = 2000.0
-SIGMAS = np.array([0.375, 0.45, 0.525, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.3, 1.5, 1.75, 2.0, 2.4, 2.8, 3.3, 4.0])
+SIGMAS = np.array([0.37, 0.45, 0.525, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.3, 1.5, 1.75, 2.0, 2.4, 2.8, 3.3, 4.0])
 """Blurs that are tried (σ in voxels); half of the modulation is left by the first at the grid's highest frequency."""
 HIGH_PASS = 5
 """Noise is what is left of an error without its mean over a cube of this edge (voxels)."""

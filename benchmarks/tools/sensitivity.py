@@ -149,8 +149,8 @@ SHOWN: tuple[Place, ...] = (
 )  # fmt: skip
 
 CAPTION = (
-    "Each row is a score, each column a fault that was painted on the truth. ✓: the score sees the fault, for it is worse "
-    f"by more than {SEEN:g} standard deviations over {DRAWS} draws of the noise. ▲: it exists to see this fault. The "
+    "Each row is a score, each column a fault that was painted on the truth. ✓: the score sees the fault, for it is "
+    f"worse by more than {SEEN:g} standard deviations over {DRAWS} draws of the noise. ▲: it exists to see this fault. The "
     "artefact is measured against the volume without fault. Blur lessens no noise, which is added after it."
 )
 
@@ -173,7 +173,9 @@ def main(arguments: list[str]) -> int:
 def page(name: str, judge: Judge) -> str:
     """Return the page on one scan: how it was made, and the table."""
     commands = "; ".join(f"`{line.strip()}`" for line in (__doc__ or "").splitlines() if line.startswith("    "))
-    made = f"# {TITLE}\n\nMade by {commands}. Do not edit. Scan {name}, {commit()}, {machine()}.\n\n{CAPTION}\n\n"
+    made = (
+        f"# {TITLE}\n\nMade by {commands}. Do not edit. Scan {name}, commit {commit()}, {machine()}.\n\n{CAPTION}\n\n"
+    )
     return made + table(*measure(judge)).markdown()
 
 
