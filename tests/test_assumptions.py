@@ -8,7 +8,12 @@ from ctsim.errors import InputError
 
 def record(scene, method, psnr):
     score = Score(region="r", reference="e", alignment="none", data_range=0.03, n_voxels=9, values={"psnr3d": psnr})
-    more = {"scene": scene, "scene_id": scene, "scan": scene, "place": (scene != "box-strict", method != "fdk")}
+    more = {
+        "scene": scene,
+        "scene_id": scene,
+        "scan": scene,
+        "place": (int(scene != "box-strict"), int(method != "fdk")),
+    }
     return make_record(method, scores={"tissue": score}, **more)
 
 

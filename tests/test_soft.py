@@ -120,8 +120,8 @@ def test_the_sharpness_of_a_blur_is_its_closed_form(sigma):
     edges = Edges.of(blocks, corners)
     blurred = ndimage.gaussian_filter(blocks, sigma)
     expected = math.sqrt(math.log(2) / 2) / (math.pi * sigma) / pitch  # exp(−2π²σ²f²) = 1/2
-    # a gain exp(−cσ²) is taken as linear between neighbouring σ², which are at most 0.36 σ² apart: off by cσ²·0.36²/8 of
-    # σ², half of that of σ, with cσ² of 2 or less where the modulation is: 1.6 %
+    # a gain exp(−cσ²) is taken as linear between neighbouring σ², which are at most 0.36 σ² apart: off by cσ²·0.36²/8
+    # of σ², half of that of σ, with cσ² of 2 or less where the modulation is: 1.6 %
     assert mtf50(blurred, edges, pitch) == pytest.approx(expected, rel=0.016)
     # neither gain nor offset counts; noise averages out over 64 cubes of 12³ voxels
     noisy = 0.5 * blurred + 300 + 20 * rng.standard_normal(blocks.shape)

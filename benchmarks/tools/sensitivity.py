@@ -150,8 +150,8 @@ SHOWN: tuple[Place, ...] = (
 
 CAPTION = (
     "Each row is a score, each column a fault that was painted on the truth. ✓: the score sees the fault, for it is "
-    f"worse by more than {SEEN:g} standard deviations over {DRAWS} draws of the noise. ▲: it exists to see this fault. The "
-    "artefact is measured against the volume without fault. Blur lessens no noise, which is added after it."
+    f"worse by more than {SEEN:g} standard deviations over {DRAWS} draws of the noise. ▲: it exists to see this fault. "
+    "The artefact is measured against the volume without fault. Blur lessens no noise, which is added after it."
 )
 
 
