@@ -11,6 +11,14 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 
 
+class LabelGrid(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The grid that a phantom's body was drawn on: voxels (z, y, x), their size and the middle of the grid in mm."""
+
+    n_voxel: tuple[int, int, int]
+    d_voxel: tuple[float, float, float]
+    off_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
 class ScanInfo(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What scan.json holds; lengths mm, energies keV.
 
@@ -18,7 +26,8 @@ class ScanInfo(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     `l0` the median water-equivalent path. `view_kerma` and `scan_kerma` are the air kerma (mGy) at the isocentre,
     without the object, of a view and of the scan (None: an older scan). `materials` name the labels, `metal` those of
     them that are inserts. `notes` say what a user of the scan should know, such as that no view shows the metal. `seed`
-    is that of a scan without scene.toml.
+    is that of a scan without scene.toml. `label_grid` is where the phantom's voxels lie (None: a phantom of
+    exact solids, or an older scan).
     """
 
     geometry: Geometry
@@ -35,6 +44,7 @@ class ScanInfo(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     metal: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0
+    label_grid: LabelGrid | None = None
 
     def __post_init__(self) -> None:
         check_readings(self.dark, self.i0, self.e_max)

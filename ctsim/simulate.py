@@ -7,6 +7,7 @@ before it, which are made again where a run that was interrupted goes on. It giv
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -368,6 +369,11 @@ def scan_info(plan: Plan, phantom: Phantom, scanner: Scanner) -> dict:
     """Return what a reader needs to use the counts; lengths mm, energies keV; "flat" is the open-field image."""
     noise = scanner.noise
     a1, _ = response(scanner.detector, plan.spectrum.energies)
+    optional: dict[str, Any] = {"notes": list(plan.notes)} if plan.notes else {}
+    if phantom.labels.any():  # solids alone are on no grid
+        sizes = {"d_voxel": phantom.d_voxel, "off_origin": phantom.off_origin}
+        grid = {"n_voxel": list(phantom.labels.shape), **{key: list(map(float, size)) for key, size in sizes.items()}}
+        optional["label_grid"] = grid
     return {
         "geometry": msgspec.to_builtins(scanner.geometry),
         "flat": flat_image(plan, scanner),
@@ -382,4 +388,5 @@ def scan_info(plan: Plan, phantom: Phantom, scanner: Scanner) -> dict:
         "scatter_fraction": plan.scatter_fraction,
         "materials": list(plan.told),
         "metal": sorted({s.material for s in phantom.solids if s.metal}),
-    } | ({"notes": list(plan.notes)} if plan.notes else {})
+        **optional,
+    }

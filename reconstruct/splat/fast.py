@@ -85,13 +85,14 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
 def reconstruct(scan: Scan, settings: Settings) -> Volume:
     """Reconstruct `scan`, attenuation in 1/mm; keywords are those of `Settings`.
 
-    Details hold the volumes "rho_a" and "rho_b" under "densities".
+    Details hold the volumes "rho_a" and "rho_b" under "densities", and under "grid" the voxels of the finest lattice.
     """
     stopwatch = Stopwatch(limit=settings.seconds)
     p, clamped = line_integrals(scan, slice(None))
     valid = ~clamped.numpy()
     scatter = open_excess(p.numpy(), valid) if settings.scatter is None else settings.scatter
-    data = weighted(finer(scan.geometry, settings.fineness), p.numpy(), valid, scatter)
+    finest = finer(scan.geometry, settings.fineness)
+    data = weighted(finest, p.numpy(), valid, scatter)
     response = settings.make_response(scan.e_max)
 
     fit = None if clamped.all() else _fitted(_course(data, response, settings), scan, settings, stopwatch)
@@ -99,6 +100,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         "response": response.described(),
         "scatter": scatter,
         "clamped_pixels": int(clamped.sum()),
+        "grid": list(finest.n_voxel),
         "splats": 0 if fit is None else len(fit.lattice),
     }
     if fit is None:

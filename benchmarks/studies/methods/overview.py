@@ -14,7 +14,7 @@ from ctsim.benchmarks.engine.table import one_line, ranked
 from ctsim.benchmarks.engine.terminal import rendered, width
 from ctsim.benchmarks.methods import CONTROLS
 from ctsim.benchmarks.scores.score import MAIN
-from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest
+from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest, remarks
 from ctsim.benchmarks.studies.methods.tables import Numbers, numbers
 
 PROTOCOL = "tissue"
@@ -45,6 +45,7 @@ def text(records: Sequence[RunRecord], results: Path, data: Path) -> str:
         f"PSNR: PSNR3D in dB of the body outside metal (protocol {PROTOCOL}). Lost: dB against the same method on the",
         "metal-free twin. Bone: % of soft tissue near metal that reads as bone. s: seconds of a run.",
         *_failures(shown),
+        *remarks(records),
         f"All protocols: {results}/table.md, .csv, .tex; records: {results}/records.jsonl",
     ]
     if any(record.volume for record in shown):

@@ -14,6 +14,7 @@ from ctsim.benchmarks.engine.record import Found, Record, Store, Task
 from ctsim.benchmarks.engine.record import latest as latest_rows
 from ctsim.benchmarks.methods import TABLE
 from ctsim.benchmarks.scores.score import VERSION, Score
+from ctsim.benchmarks.studies.methods.grids import shared_text
 from ctsim.dataset.folder import mixture
 
 STUDY, FILE, WHAT = "methods", "records", "a record of run-benchmark"
@@ -203,4 +204,5 @@ def remarks(records: Sequence[RunRecord]) -> list[str]:
     shown = latest(records)
     known = {r.task.data: r.data_code for r in shown if r.data_code}
     made = {f"{r.run.scene} (seed {r.run.seed})": known.get(r.task.data, "") for r in shown}
-    return [text for text in (outdated(records), mixture(made.items())) if text]
+    grids = {f"{r.label} on {r.run.scene}": r.details for r in shown}
+    return [text for text in (outdated(records), mixture(made.items()), shared_text(grids)) if text]

@@ -20,6 +20,7 @@ from ctsim.benchmarks.methods import Method
 from ctsim.benchmarks.scores.judge import Judge, Twin
 from ctsim.benchmarks.scores.score import NO_TWIN, NOT_ASKED, TWIN_ENDED
 from ctsim.benchmarks.studies.methods.attempt import SCORED, Outcome, describe, run_here, scan_for, skip, warm_up
+from ctsim.benchmarks.studies.methods.grids import with_grid
 from ctsim.benchmarks.studies.methods.plan import Job, job_of
 from ctsim.benchmarks.studies.methods.records import METAL, TWIN, Result, RunTask
 from ctsim.benchmarks.studies.methods.study import Flags
@@ -135,7 +136,7 @@ class Runner:
             inputs=job.method.inputs,
             scores=scores,
             cost=outcome.cost,
-            details=outcome.details,
+            details=with_grid(outcome.details, job.stored.geometry, job.stored.info.label_grid),
             data_code=job.stored.code,
             kerma=job.stored.kerma,
         )
