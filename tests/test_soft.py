@@ -100,6 +100,48 @@ def test_white_noise_has_its_deviation_and_no_grain(scan):
     assert values["cnr"] == pytest.approx(160 / sigma, rel=5 / math.sqrt(even))
 
 
+VESSEL = (slice(18, 34), slice(30, 33), slice(24, 26))
+
+
+@pytest.fixture(scope="module")
+def vessel():
+    """A box of muscle with a block of fat, in it a vessel 3 by 2 voxels thick that ends next to a piece of bone."""
+    labels = np.zeros(SHAPE, np.uint8)
+    labels[4:-4, 4:-4, 4:-4] = 1
+    labels[12:36, 20:44, 14:40] = 2
+    labels[35:41, 28:35, 22:28] = 3
+    labels[VESSEL] = 1
+    return labels, None, soft_layout(labels, truth_of(labels), NAMES, WATER), None
+
+
+def test_fine_structures_are_vessels_away_from_bone(vessel):
+    fine = vessel[2].fine
+    expected = np.zeros(SHAPE, bool)
+    expected[16:33, 28:35, 22:28] = True  # the vessel and 2 voxels around it, as far as 2 voxels from the bone
+    assert np.array_equal(fine, expected)
+
+
+@pytest.mark.parametrize("left", [0.0, 0.5, 1.0])
+def test_the_contrast_of_a_vessel_is_the_share_that_is_left(vessel, left):
+    sigma = 20.0
+    painted = sigma * np.random.default_rng(4).standard_normal(SHAPE)
+    painted[VESSEL] -= 160 * (1 - left)
+    values = scored(vessel, painted)
+    places = np.argwhere(vessel[2].fine)
+    reference = vessel[2].reference
+    # the deviation from the mean of what is fine within 4 voxels, place by place
+    deviation = [
+        reference[tuple(p)] - reference[tuple((places[np.abs(places - p).max(1) <= 4]).T)].mean() for p in places
+    ]
+    power = float(np.sum(np.square(deviation)))
+    # white noise without its local mean has at most its own variance, so the share is off by σ/√power at most
+    assert values["fine_contrast"] == pytest.approx(left, abs=4 * sigma / math.sqrt(power))
+    # the residual is that noise: of about 150 voxels in a mean, so 1 % less than σ; its RMS is known to 1/√(2n)
+    n = len(places)
+    expected = values["fine_contrast"] * math.sqrt(power / n) / sigma
+    assert values["fine_cnr"] == pytest.approx(abs(expected), rel=0.02 + 4 / math.sqrt(2 * n))
+
+
 def test_smooth_noise_has_grain(scan):
     noise = ndimage.gaussian_filter(np.random.default_rng(2).standard_normal(SHAPE), 0.8)
     # neighbours of white noise behind a Gaussian of σ correlate by exp(−1/(4σ²)) = 0.68; without the local mean, less

@@ -11,12 +11,13 @@ import msgspec
 
 from ctsim.benchmarks.engine.record import OK
 
-VERSION = 4
+VERSION = 5
 """Part of every run's identity; raised when a protocol changes its meaning.
 
 1: tissue, aligned, paper, metal, cost. 2: every method runs on the metal-free twin too, for `artefact`.
 3: `projection`, and `rmse` of `artefact`. The version was not raised for `at_energy`: only new code has it, and code is
 part of the identity. 4: `soft` and `structure`, of the twin too; `tissue` stays inside the field of view.
+5: fine structures in `soft`.
 """
 
 AS_RETURNED, AT_50KEV = "as returned", "read at 50 keV"
@@ -90,6 +91,8 @@ COLUMNS: dict[str, dict[str, Metric]] = {
         "rmse": Metric("RMSE (HU)", 1, "min"),
         "contrast": Metric("contrast left", 3, "one"),
         "cnr": Metric("CNR", 2, "max"),
+        "fine_contrast": Metric("fine structures: contrast left", 3, "one"),
+        "fine_cnr": Metric("fine structures: CNR", 2, "max"),
         "noise_near": Metric("noise ≤ 5 mm (HU)", 1),
         "noise_far": Metric("noise > 5 mm (HU)", 1),
         "grain_far": Metric("noise correlation", 2),

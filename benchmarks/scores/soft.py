@@ -13,12 +13,13 @@ from scipy import ndimage
 
 from ctsim.benchmarks.scores import metrics
 from ctsim.benchmarks.scores.artefact import MIN_VOXELS, distance_to_metal
-from ctsim.benchmarks.scores.metrics import Mask
+from ctsim.benchmarks.scores.metrics import Mask, dilate
 from ctsim.benchmarks.scores.protocol import Truth
 from ctsim.benchmarks.scores.score import COLUMNS, Score
 
 SOFT_HU = 300.0
 """A material is soft tissue if the median of its reference is within this of water."""
+AIR_HU = -900.0
 RANGE_HU = 1000.0
 """Data range: from −500 to 500 HU."""
 LEAST_CONTRAST = 50.0
@@ -31,6 +32,10 @@ LEAST_LIKENESS = 0.05
 DENSEST = 2000.0
 SIGMAS = np.array([0.37, 0.45, 0.525, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.3, 1.5, 1.75, 2.0, 2.4, 2.8, 3.3, 4.0])
 """Blurs that are tried (σ in voxels); half of the modulation is left by the first at the grid's highest frequency."""
+FINE = 5
+"""What a cube of this edge (voxels) does not fit into is a fine structure, such as a vessel."""
+AROUND = 9
+"""The contrast of a fine structure is against the mean over a cube of this edge."""
 HIGH_PASS = 5
 """Noise is what is left of an error without its mean over a cube of this edge (voxels)."""
 REGION = "soft tissue inside the body, outside the metal dilated by 2 voxels"
@@ -67,9 +72,9 @@ class SoftLayout:
     """Where soft tissue is judged in a scan. Masks are [z, y, x].
 
     `region` holds all voxels of soft classes, `classes` each class's own; `even` those whose 26 neighbours are of the
-    same class, and `wide` those whose neighbours within 2 voxels are. `pair` names two classes to tell apart. The
-    `reference` is in HU. `near` is up to 5 mm from the metal. `edges` are cubes with structure, "near" metal and
-    "far".
+    same class, and `wide` those whose neighbours within 2 voxels are. `pair` names two classes to tell apart. `fine`
+    holds fine structures and what is up to 2 voxels from them, away from bone and air. The `reference` is in HU.
+    `near` is up to 5 mm from the metal. `edges` are cubes with structure, "near" metal and "far".
     """
 
     water: float
@@ -80,6 +85,7 @@ class SoftLayout:
     wide: Mask
     near: Mask
     pair: tuple[str, str] | None
+    fine: Mask
     edges: dict[str, Edges]
     pitch: float
     note: str
@@ -116,6 +122,7 @@ def soft_layout(
         wide=wide,
         near=distance <= 5.0 * (1 + 1e-9),
         pair=pair,
+        fine=_fine(reference, truth, classes),
         edges=_edges(reference, truth, distance),
         pitch=float(np.prod(truth.d_voxel) ** (1 / 3)),
         note=f"soft tissue: {', '.join(classes)}; {told}; water {water:.5g} 1/mm",
@@ -138,6 +145,19 @@ def _pair(reference: NDArray[np.float64], even: dict[str, Mask]) -> tuple[str, s
         if means[a] - means[b] >= LEAST_CONTRAST
     ]
     return max(found)[1] if found else None
+
+
+def _fine(reference: NDArray[np.float64], truth: Truth, classes: dict[str, Mask]) -> Mask:
+    """Return the fine structures of the classes and their surroundings, without what touches bone, metal or air.
+
+    Partial volumes with bone or air have far more contrast than a vessel; they would decide the score.
+    """
+    found = np.zeros_like(truth.tissue)
+    for mask in classes.values():
+        found |= mask & ~ndimage.binary_opening(mask, np.ones((FINE,) * 3, np.bool_))
+    strong = (reference > SOFT_HU) | (reference < AIR_HU) | ~truth.body
+    away = truth.tissue & ~dilate(strong, 2)
+    return dilate(found & away, 2) & away
 
 
 def _edges(reference: NDArray[np.float64], truth: Truth, distance: NDArray[np.float64]) -> dict[str, Edges]:
@@ -168,6 +188,7 @@ def soft_score(values: NDArray[Any], layout: SoftLayout | str) -> Score:
         "ssim3d": metrics.ssim3d(hu, layout.reference, data_range=RANGE_HU, region=layout.region),
         "rmse": math.sqrt(mse),
         **_told_apart(hu, error, layout),
+        **_fine_structures(hu, layout),
         **_noise(error, layout),
         **{f"mtf50_{where}": mtf50(hu, edges, layout.pitch) for where, edges in layout.edges.items()},
     }
@@ -195,6 +216,28 @@ def _told_apart(hu: NDArray[np.float64], error: NDArray[np.float64], layout: Sof
     found, true = (float(image[a].mean() - image[b].mean()) for image in (hu, layout.reference))
     deviation = math.sqrt((float(error[a].var()) + float(error[b].var())) / 2)
     return {"contrast": found / true, "cnr": abs(found) / deviation if deviation else None}
+
+
+def _fine_structures(hu: NDArray[np.float64], layout: SoftLayout) -> dict[str, float | None]:
+    """Return how much of the contrast of fine structures is left, and that contrast over what does not belong to it.
+
+    Contrast is the deviation from the mean over 9³ voxels, of those in `layout.fine`. The share left is its regression
+    on the reference's; 0 is nothing, 1 is all. The RMS of the contrast left over that of the residual is the CNR.
+    """
+    none = {"fine_contrast": None, "fine_cnr": None}
+    if int(layout.fine.sum()) < MIN_VOXELS:
+        return {**none}
+    weight = ndimage.uniform_filter(layout.fine.astype(np.float64), AROUND)[layout.fine]
+    found, true = (
+        image[layout.fine] - ndimage.uniform_filter(np.where(layout.fine, image, 0), AROUND)[layout.fine] / weight
+        for image in (hu, layout.reference)
+    )
+    power = float(true @ true)
+    if not power:
+        return {**none}
+    left = float(found @ true) / power
+    residual = float(np.sum((found - left * true) ** 2))
+    return {"fine_contrast": left, "fine_cnr": abs(left) * math.sqrt(power / residual) if residual else None}
 
 
 def _noise(error: NDArray[np.float64], layout: SoftLayout) -> dict[str, float | None]:

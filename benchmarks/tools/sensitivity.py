@@ -24,7 +24,7 @@ from ctsim.benchmarks.engine.table import Table, simple
 from ctsim.benchmarks.scores.judge import Judge, Twin
 from ctsim.benchmarks.scores.metrics import Mask, dilate
 from ctsim.benchmarks.scores.score import COLUMNS, Metric
-from ctsim.benchmarks.scores.soft import SoftLayout
+from ctsim.benchmarks.scores.soft import AROUND, SoftLayout
 from ctsim.benchmarks.scores.structure import StructureLayout
 from ctsim.dataset.store import open_scan
 from ctsim.errors import InputError
@@ -86,6 +86,14 @@ def _alike(scene: Scene) -> Volume:
     return np.where(lower, scene.hu[upper].mean(), scene.hu)
 
 
+def _faded(scene: Scene) -> Volume:
+    """Halve what fine structures differ by from the mean around them."""
+    fine = scene.soft.fine
+    mean = ndimage.uniform_filter(np.where(fine, scene.hu, 0), AROUND)
+    share = np.maximum(ndimage.uniform_filter(fine.astype(np.float64), AROUND), 1 / AROUND**3)
+    return np.where(fine, (scene.hu + mean / share) / 2, scene.hu)
+
+
 def _shading(scene: Scene) -> Volume:
     """Darken the body towards its axis, as beam hardening does: by 100 HU in the middle, 0 at the edge."""
     y, x = (np.linspace(-1, 1, n) for n in scene.hu.shape[1:])
@@ -110,6 +118,7 @@ def _noise(scene: Scene, sigma: float, smooth: float) -> Volume:
 FAULTS: dict[str, Callable[[Scene], Volume]] = {
     NONE: lambda s: s.hu,
     "fat as muscle": _alike,
+    "vessels faded": _faded,
     "bar of bone": lambda s: np.where(s.bar, s.bone, s.hu),
     "dark band": lambda s: np.where(s.bar, -800.0, s.hu),
     "shading": _shading,
@@ -125,6 +134,7 @@ FAULTS: dict[str, Callable[[Scene], Volume]] = {
 
 FOR: dict[str, tuple[Place, ...]] = {
     "fat as muscle": (("soft", "contrast"), ("soft", "cnr"), ("soft", "rmse"), ("soft", "psnr3d")),
+    "vessels faded": (("soft", "fine_contrast"), ("soft", "fine_cnr")),
     "bar of bone": (("structure", "false_bone"), ("structure", "rmse_between"), ("artefact", "streak")),
     "dark band": (("structure", "false_air"), ("structure", "rmse_between"), ("artefact", "streak")),
     "shading": (("soft", "rmse"), ("artefact", "rmse")),
@@ -141,6 +151,7 @@ FOR: dict[str, tuple[Place, ...]] = {
 SHOWN: tuple[Place, ...] = (
     ("tissue", "psnr3d"), ("tissue", "ssim3d"), ("aligned", "psnr3d"), ("aligned", "gain"), ("paper", "psnr3d"),
     ("soft", "psnr3d"), ("soft", "ssim3d"), ("soft", "rmse"), ("soft", "contrast"), ("soft", "cnr"),
+    ("soft", "fine_contrast"), ("soft", "fine_cnr"),
     ("soft", "noise_far"), ("soft", "grain_far"), ("soft", "mtf50_far"),
     ("structure", "false_bone"), ("structure", "false_air"), ("structure", "rmse_between"),
     ("artefact", "streak"), ("artefact", "rmse"), ("artefact", "cupping"),
