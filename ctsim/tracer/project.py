@@ -18,8 +18,9 @@ from ctsim.materials import attenuation
 from ctsim.solids import pack
 from ctsim.tracer import shadow
 from ctsim.tracer.bricks import Bricks, make_bricks
-from ctsim.tracer.columns import Columns, make_columns
-from ctsim.tracer.kernels import bricks_cpu, columns_cpu, raytrace_cpu
+from ctsim.tracer.columns import Columns, DensityColumns, make_columns, make_density_columns
+from ctsim.tracer.kernels import bricks_cpu, columns_cpu, density_cpu, raytrace_cpu
+from ctsim.tracer.kernels.footprint_cpu import LANES
 from ctsim.types import Phantom
 
 # Over a pixel in which the thickness changes linearly by R the intensity mean differs from the central
@@ -33,7 +34,7 @@ class Tracer:
     """A phantom ready to be traced. `materials[0]` is air and has no length."""
 
     bricks: Bricks
-    columns: Columns | None
+    columns: Columns | DensityColumns | None
     prims: NDArray[np.float64]
     materials: tuple[str, ...]
     metal: NDArray[np.bool_]
@@ -44,7 +45,7 @@ class Tracer:
         """Prepare a phantom; with `extra`, that material is appended for a layer that every ray crosses."""
         return Tracer(
             bricks=make_bricks(phantom),
-            columns=make_columns(phantom),
+            columns=make_columns(phantom) or make_density_columns(phantom),
             prims=pack(phantom.solids, phantom.materials),
             materials=phantom.materials + ((extra,) if extra else ()),
             metal=np.concatenate(
@@ -66,8 +67,9 @@ class Tracer:
         if out is None:
             out = np.zeros((len(self.materials), *shape), np.float32)
         if self.columns is not None and _upright(pose):
-            order = work_order(-(-shape[1] // columns_cpu.LANES))
-            columns_cpu.fill_view(tuple(self.columns), self.bricks.grid, pose, order, out)
+            order = work_order(-(-shape[1] // LANES))
+            fill = columns_cpu.fill_view if isinstance(self.columns, Columns) else density_cpu.fill_view
+            fill(tuple(self.columns), self.bricks.grid, pose, order, out)
         else:
             low, high = self.bricks.box[:3], self.bricks.box[3:]
             seen = shadow.cast(pose, shape, shadow.box_corners(low, high)[: int(low[0] <= high[0])])

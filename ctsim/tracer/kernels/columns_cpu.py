@@ -1,10 +1,10 @@
 """Path lengths of all central rays of a detector column at once, from the volume's label boundaries.
 
-The rays of column u cross the voxel column (y, x) between the same ray parameters λ0 and λ1 (0 at the source,
-1 at the pixel). A boundary at height z is met by the ray of row v(λ) = B + A·(z − source z)/λ, so rows above
-both v(λ0) and v(λ1) gain λ1 − λ0 of the label above, the rare rows between them a part. Gains are entered as
-differences along v and summed once. λ is an integer in 2⁻⁵⁰, so that sums are exact and what a ray does not
-meet is exactly 0; the result does not depend on the order or the number of threads.
+The rays of column u cross the voxel column (y, x) between the same ray parameters λ0 and λ1 (see `footprint_cpu`).
+A boundary at height z is met by the ray of row v(λ) = B + A·(z − source z)/λ, so rows above both v(λ0) and v(λ1) gain
+λ1 − λ0 of the label above, the rare rows between them a part. Gains are entered as differences along v and summed
+once. λ is an integer in 2⁻⁵⁰, so that sums are exact and what a ray does not meet is exactly 0; the result does not
+depend on the order or the number of threads.
 """
 
 import math
@@ -13,10 +13,9 @@ import numpy as np
 from numba import njit, prange
 
 from ctsim.kernels.once import compiled_once
+from ctsim.tracer.kernels.footprint_cpu import LANES, footprint
 
-LANES = 16  # detector columns done together: their sums fill vector registers, their results cache lines
 FIXED = 2.0**50
-TINY = 1e-12  # a horizontal direction (voxels) below this counts as parallel to the axis
 
 
 @njit(cache=True)
@@ -43,15 +42,6 @@ def list_boundaries(labels, at, change):
                 if below != above:
                     change[at[y, x]] = np.uint32(z) | below << np.uint32(16) | above << np.uint32(24)
                     at[y, x] += 1
-
-
-@njit(inline="always", error_model="numpy")
-def _clip(o, d, n, t0, t1):
-    """Cut [t0, t1] to where 0 ≤ o + d·t ≤ n; also 1/d."""
-    d = (TINY if d >= 0 else -TINY) if abs(d) < TINY else d
-    inverse = 1.0 / d
-    a, b = -o * inverse, (n - o) * inverse
-    return max(t0, min(a, b)), min(t1, max(a, b)), inverse
 
 
 @njit(inline="always", error_model="numpy")
@@ -86,42 +76,6 @@ def _split(change, low, high, rays, near, far, sums, lane):
 
 
 @njit(cache=True, error_model="numpy")
-def _cross(columns, grid, pose, u, sums, lane):
-    """Walk the footprint of detector column u (from the detector's centre) through the xy plane."""
-    first, change = columns
-    n_y, n_x = first.shape[0], first.shape[1] - 1
-    hx, hy = pose[3] + u * pose[6] - pose[0], pose[4] + u * pose[7] - pose[1]
-    ox, oy = (pose[0] - grid[6]) * grid[3], (pose[1] - grid[7]) * grid[4]
-    dx, dy = hx * grid[3], hy * grid[4]
-    near, end, ix = _clip(ox, dx, float(n_x), 1e-9, 1.0)
-    near, end, iy = _clip(oy, dy, float(n_y), near, end)
-    if not near < end:
-        return
-    per_row, level = 1.0 / pose[11], pose[5] - pose[2]
-    middle = (sums.shape[1] - 3) / 2
-    rays = (grid[8] - pose[2], 1.0 / grid[5], middle - level * per_row, per_row, level, middle)
-    ux, uy = int(ix > 0), int(iy > 0)
-    sx, sy = 2 * ux - 1, 2 * uy - 1
-    x = min(max(int(ox + dx * near), 0), n_x - 1)
-    y = min(max(int(oy + dy * near), 0), n_y - 1)
-    tx, ty = (x + ux - ox) * ix, (y + uy - oy) * iy
-    while True:
-        far = min(max(min(tx, ty), near), end)
-        low, high = first[y, x], first[y, x + 1]
-        if low < high:
-            _split(change, low, high, rays, near, far, sums, lane)
-        near = far
-        if tx <= ty:
-            x += sx
-            tx = (x + ux - ox) * ix
-        else:
-            y += sy
-            ty = (y + uy - oy) * iy
-        if x < 0 or y < 0 or x >= n_x or y >= n_y or near >= end:
-            return
-
-
-@njit(cache=True, error_model="numpy")
 def _lengths(sums, pose, u_0, lengths):
     """Sum the differences along v and turn λ into mm: `lengths` [material, v, u] from column u_0 on."""
     n_m, n_v, n_u = lengths.shape
@@ -144,10 +98,18 @@ def _lengths(sums, pose, u_0, lengths):
 
 @compiled_once("Tuple((int32[:,::1], uint32[::1]))", "float64[::1]", "float64[::1]", "int64", "float32[:,:,::1]")
 def _block(columns, grid, pose, u_0, lengths):
+    first, change = columns
+    starts, steps = first.ravel(), int(grid[0] + grid[1])
+    cells, ends = np.empty(steps, np.int64), np.empty(steps + 1)
     n_m, n_v, n_u = lengths.shape
     sums = np.zeros((n_m, n_v + 2, LANES), np.int64)
+    per_row, level, middle = 1.0 / pose[11], pose[5] - pose[2], (n_v - 1) / 2
+    rays = (grid[8] - pose[2], 1.0 / grid[5], middle - level * per_row, per_row, level, middle)
     for u in range(u_0, min(u_0 + LANES, n_u)):
-        _cross(columns, grid, pose, u - (n_u - 1) / 2, sums, u - u_0)
+        for k in range(footprint(grid, pose, u - (n_u - 1) / 2, cells, ends)):
+            low, high = starts[cells[k]], starts[cells[k] + 1]
+            if low < high:
+                _split(change, low, high, rays, ends[k], ends[k + 1], sums, u - u_0)
     _lengths(sums, pose, u_0, lengths)
 
 

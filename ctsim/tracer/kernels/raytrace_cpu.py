@@ -1,6 +1,6 @@
 """Solids and energies on top of the label volume's path lengths, fused per detector row.
 
-What a pixel's central ray crosses in the label volume is given (`columns_cpu`, `bricks_cpu`). Solids are
+What a pixel's central ray crosses in the label volume is given (`columns_cpu`, `density_cpu`, `bricks_cpu`). Solids are
 intersected exactly and replace the volume along their intervals. Pixels that the edge of a solid crosses are
 measured by several rays and averaged in *intensity*, as a detector does, and by more where these disagree; what
 differs between those rays is the solids, while the volume is always that of the central ray. Rows are done in strips,

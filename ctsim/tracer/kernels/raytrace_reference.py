@@ -1,8 +1,8 @@
 """The ray tracer in float64 for reading: every plane crossing is listed, sorted and looked up.
 
 `transmit_view` takes what `raytrace_cpu.transmit_view` does, `trace_view` is the twin of `bricks_cpu`,
-`columns_cpu` and `raytrace_cpu.replace_view` together. Nothing is skipped, and the position of every piece of
-a ray is found from its midpoint.
+`columns_cpu`, `density_cpu` and `raytrace_cpu.replace_view` together. Nothing is skipped, and the position of every
+piece of a ray is found from its midpoint.
 """
 
 import itertools
