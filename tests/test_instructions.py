@@ -56,6 +56,11 @@ def measure() -> dict[str, np.ndarray]:
     labels = r.integers(0, 3, (12, 13, 14)).astype(np.uint8)
     tracer = Tracer.of(Phantom(labels=labels, materials=("air", "water", "Fe"), d_voxel=(1.0, 1.1, 1.2)))
     found["paths"] = np.stack([path_lengths(tracer, geometry, k) for k in range(7)])
+    density = r.uniform(0.5, 1.5, labels.shape).astype(np.float32)
+    tracer = Tracer.of(
+        Phantom(labels=labels, materials=("air", "water", "Fe"), d_voxel=(1.0, 1.1, 1.2), density=density)
+    )
+    found["paths, density"] = np.stack([path_lengths(tracer, geometry, k) for k in range(7)])
     noise = Noise()
     pattern = pixel_pattern((60, 70), noise=noise, scene_id="a")
     m1 = (r.random((60, 70)) ** 8).astype(np.float32)  # from no photon on

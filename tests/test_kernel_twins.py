@@ -1,5 +1,7 @@
 """Fast kernels against their float64 references, on unequal axis lengths."""
 
+import itertools
+
 import numba
 import numpy as np
 import pytest
@@ -19,14 +21,18 @@ from ctsim.benchmarks.scores.metrics import border, window
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.kernels import log_cpu, log_reference, tv_cpu, tv_reference
 from ctsim.reconstruct.splat.kernels import adam_cpu, adam_reference, carve_cpu, carve_reference
+from ctsim.tracer.columns import make_density_columns
 from ctsim.tracer.kernels import (
     bricks_cpu,
     bricks_reference,
     columns_cpu,
     columns_reference,
+    density_cpu,
     shadow_cpu,
     shadow_reference,
 )
+from ctsim.tracer.kernels.gather_cpu import PAD
+from ctsim.types import Phantom
 
 SHAPE = (5, 7, 11)
 U = 2.0**-24  # of float32
@@ -74,6 +80,32 @@ def test_boundaries_are_the_changes_of_label_along_z():
     assert np.array_equal(at, ends)
     flat = [boundary for row in expected for column in row for boundary in column]
     assert [(c & 0xFFFF, c >> 16 & 0xFF, c >> 24) for c in change.tolist()] == flat
+
+
+def test_runs_hold_the_density_of_one_material_each_and_zeros_around(threads):
+    r = np.random.default_rng(1)
+    labels = r.integers(0, 3, (67, 7, 11)).astype(np.uint8)
+    labels[r.random(labels.shape) < 0.9] = 0  # gaps of all lengths
+    density = r.uniform(0.5, 1.5, labels.shape).astype(np.float32)
+    phantom = Phantom(labels=labels, materials=("air", "water", "Fe"), d_voxel=(1.0,) * 3, density=density)
+    columns = make_density_columns(phantom)
+    assert columns is not None
+    first, run, values = columns
+    told, used = np.zeros((2, *labels.shape), np.float32), np.zeros(values.size, bool)
+    for y, x in np.ndindex(labels.shape[1:]):
+        within = run[first[y, x] : first[y, x + 1]]
+        for bottom, after, label, place in within:
+            assert not told[label - 1, bottom:after, y, x].any()
+            told[label - 1, bottom:after, y, x] = values[place : place + after - bottom]
+            used[place : place + after - bottom] = True
+            for edge in (place, place + after - bottom):  # PAD zeros beyond, the ends themselves are none
+                assert not values[edge - PAD : edge].any() or edge > place
+                assert not values[edge : edge + PAD].any() or edge == place
+            assert values[place] > 0 and values[place + after - bottom - 1] > 0
+        for a, b in itertools.pairwise(within):
+            assert a[2] < b[2] or b[0] - a[1] >= density_cpu.MERGED
+    assert np.array_equal(told, np.stack([np.where(labels == m, density, 0) for m in (1, 2)]))
+    assert not values[~used].any() and len(run) > labels[0].size
 
 
 def test_a_shadow_is_what_its_hull_reaches_in_a_row():

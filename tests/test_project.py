@@ -15,6 +15,7 @@ from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.solids import BOX, CAPSULE, ELLIPSOID, FRUSTUM, TORUS, Primitive, Solid
 from ctsim.tracer import project
+from ctsim.tracer.columns import Columns, DensityColumns
 from ctsim.tracer.kernels import raytrace_cpu, raytrace_reference
 from ctsim.tracer.kernels.exp_cpu import exp_minus
 from ctsim.tracer.project import Response, Tracer, path_lengths, transmit, work_order
@@ -72,6 +73,81 @@ def test_path_lengths_equal_the_reference(solids, dense):
         assert want[1].max() > 1
 
 
+def heights(g, *z):
+    """Return the geometry with source and detector of view k lifted by z[k], as on a helix."""
+    poses = g.pose_array()
+    poses[:, [2, 5]] += np.array(z)[:, None]
+    return msgspec.structs.replace(g, poses=tuple(tuple(map(float, row)) for row in poses))
+
+
+def with_density(labels, d_voxel, **kw):
+    """A phantom of the labels in which every voxel, of air too, has a density of its own."""
+    density = np.random.default_rng(8).uniform(0.2, 1.8, labels.shape).astype(np.float32)
+    return Phantom(labels=labels, materials=MATERIALS, d_voxel=d_voxel, density=density, **kw)
+
+
+NEAR = geometry(n_detector=(10, 6), n_views=2, pixel=6.0, start_deg=20.0)
+DENSE = {
+    "helix": (heights(geometry(n_views=3, start_deg=5.0), -31.0, 2.2, 40.0), (3.1, 2.3, 1.7), (0.4, -1.1, 0.7)),
+    "along z-faces": (geometry(n_detector=(7, 3), n_views=2, pixel=4.0), (2.0, 3.0, 4.0), (-5.0, 0.0, 0.0)),
+    "thin slices": (geometry(n_detector=(12, 3), n_views=2, pixel=2.0), (0.02, 9.0, 8.0), (0.5, 0.0, 0.0)),
+    "source near": (msgspec.structs.replace(NEAR, dso=14.0, dsd=30.0), (3.1, 2.3, 1.7), (0.4, -1.1, 0.7)),
+    "source inside": (msgspec.structs.replace(NEAR, dso=5.0, dsd=12.0), (3.1, 2.3, 1.7), (0.4, -1.1, 0.7)),
+    "detector inside": (msgspec.structs.replace(NEAR, dsd=203.0, d_detector=(2.0, 2.0)), (3.1, 2.3, 1.7), (0.0,) * 3),
+    "one row": (geometry(n_detector=(1, 9), n_views=3, start_deg=1.0), (3.1, 2.3, 1.7), (0.4, -1.1, 0.7)),
+    "missed": (geometry(n_views=2, off_detector=(4000.0, 900.0)), (3.1, 2.3, 1.7), (0.0,) * 3),
+    "far off": (geometry(n_views=1, off_detector=(4.0, -7.0)), (3.1, 2.3, 1.7), (0.0, 3.0, -9000.0)),
+    "turned away": (geometry(n_views=1, off_detector=(-170.0, 0.0)), (3.1, 2.3, 1.7), (-90.0, 0.0, 0.0)),
+}
+
+
+@pytest.mark.parametrize("case", DENSE)
+def test_a_density_map_is_crossed_as_in_the_reference(case):
+    g, d_voxel, off_origin = DENSE[case]
+    labels = np.random.default_rng(4).integers(0, 4, (5, 7, 11)).astype(np.uint8)
+    tracer = Tracer.of(with_density(labels, d_voxel, off_origin=off_origin))
+    assert isinstance(tracer.columns, DensityColumns)
+    met = 0.0
+    for view in range(g.n_views):
+        got, want = path_lengths(tracer, g, view), reference_lengths(tracer, g, view)
+        # float32 output of lengths up to 60 mm times a density of float32
+        np.testing.assert_allclose(got, want, atol=4e-6)
+        assert got.min() == 0
+        met = max(met, want.max())
+    assert (met > 1) == (case not in ("missed", "far off"))
+
+
+def test_rays_in_the_faces_of_voxels_meet_the_density_on_both_sides():
+    labels = np.random.default_rng(4).integers(0, 4, (3, 4, 6)).astype(np.uint8)
+    density = np.random.default_rng(8).uniform(0.2, 1.8, labels.shape).astype(np.float32)
+    pairs = [a.repeat(2, 0).repeat(2, 1).repeat(2, 2) for a in (labels, density)]  # equal on both sides of the faces
+    tracer = Tracer.of(
+        Phantom(labels=pairs[0], materials=MATERIALS, d_voxel=(2.0,) * 3, off_origin=(0.0, 2.0, 2.0), density=pairs[1])
+    )
+    g = geometry(n_detector=(5, 5), n_views=4)
+    for view in range(4):  # the middle row and column run in faces
+        got, want = path_lengths(tracer, g, view), reference_lengths(tracer, g, view)
+        np.testing.assert_allclose(got, want, atol=4e-6)
+        assert want[1:, 2, 2].sum() > 1
+
+
+def test_runs_that_lie_apart_and_solids_on_them_are_crossed_as_in_the_reference():
+    labels = np.zeros((61, 5, 7), np.uint8)
+    labels[2:9], labels[26:30], labels[33:], labels[40:55:2, 1:4] = 1, 1, 2, 1  # gaps above and below MERGED
+    labels[-1], labels[0, 2, 3] = 3, 2
+    tracer = Tracer.of(with_density(labels, (0.5, 3.0, 2.0), solids=INSERTS))
+    g = geometry(n_detector=(17, 7), n_views=2, pixel=4.0, start_deg=31.0)
+    for view in range(g.n_views):
+        got, want = path_lengths(tracer, g, view), reference_lengths(tracer, g, view)
+        np.testing.assert_allclose(got, want, atol=4e-6)
+        assert want[1].max() > 1 and want[3].max() > 1
+
+
+def test_a_density_map_without_material_has_no_length():
+    labels = np.zeros((5, 7, 11), np.uint8)
+    assert not path_lengths(Tracer.of(with_density(labels, (1.0, 1.0, 1.0))), geometry(), 1).any()
+
+
 def tilted(g, degrees):
     """Return the geometry with every detector turned in its plane, which no longer stands upright."""
     cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
@@ -82,21 +158,25 @@ def tilted(g, degrees):
     return msgspec.structs.replace(g, poses=rows)
 
 
-def test_a_tilted_detector_is_traced_through_bricks_to_the_same_accuracy():
-    tracer, g = Tracer.of(blobs(solids=INSERTS)), tilted(geometry(off_detector=(1.3, -2.0), start_deg=11.0), 7.0)
+@pytest.mark.parametrize("dense", [False, True])
+def test_a_tilted_detector_is_traced_through_bricks_to_the_same_accuracy(dense):
+    body = blobs(solids=INSERTS)
+    tracer = Tracer.of(with_density(body.labels, body.d_voxel, solids=INSERTS) if dense else body)
+    g = tilted(geometry(off_detector=(1.3, -2.0), start_deg=11.0), 7.0)
     for view in range(g.n_views):
         got, want = path_lengths(tracer, g, view), reference_lengths(tracer, g, view)
         np.testing.assert_allclose(got, want, atol=4e-6)
 
 
+@pytest.mark.parametrize("dense", [False, True])
 @pytest.mark.parametrize("inside", [False, True])
-def test_columns_and_bricks_cross_the_same_lengths(inside):
+def test_columns_and_bricks_cross_the_same_lengths(inside, dense):
     rng = np.random.default_rng(5)
     labels = rng.integers(0, 3, (37, 29, 33)).astype(np.uint8)
-    tracer = Tracer.of(
-        Phantom(labels=labels, materials=MATERIALS, d_voxel=(1.1, 0.9, 1.3), off_origin=(3.0, 0.0, -1.0))
-    )
-    assert tracer.columns is not None
+    where = {"d_voxel": (1.1, 0.9, 1.3), "off_origin": (3.0, 0.0, -1.0)}
+    plain = Phantom(labels=labels, materials=MATERIALS, **where)
+    tracer = Tracer.of(with_density(labels, **where) if dense else plain)
+    assert isinstance(tracer.columns, DensityColumns if dense else Columns)
     g = geometry(n_detector=(45, 51), pixel=2.1, start_deg=1.0, off_detector=(7.0, 3.0))
     if inside:  # a source in the volume, a detector that cuts it, the steepest cone
         g = msgspec.structs.replace(g, dso=9.0, dsd=21.0)
@@ -224,8 +304,11 @@ def test_skipping_changes_nothing_that_matters_on_oblong_pixels(pixel):
         np.testing.assert_allclose(fast[0], slow[0], rtol=4e-6)
 
 
-def test_results_do_not_depend_on_the_number_of_threads():
-    tracer, g, r = Tracer.of(blobs(solids=INSERTS)), geometry(n_detector=(31, 40), pixel=1.5), response()
+@pytest.mark.parametrize("dense", [False, True])
+def test_results_do_not_depend_on_the_number_of_threads(dense):
+    body = blobs(solids=INSERTS)
+    tracer = Tracer.of(with_density(body.labels, body.d_voxel, solids=INSERTS) if dense else body)
+    g, r = geometry(n_detector=(31, 40), pixel=1.5), response()
     several = transmit(tracer, g, 1, r)
     before = numba.get_num_threads()
     numba.set_num_threads(1)
