@@ -8,6 +8,7 @@ volumes) is prepared before the clock starts.
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -47,6 +48,13 @@ def _thorax(n: int, *, metal: bool) -> Phantom:
     return compact(phantom, present_materials(phantom))
 
 
+def _mapped(n: int) -> Phantom:
+    """Return the thorax with a density of its own in every voxel, 5 % around nominal, as a CT volume has."""
+    phantom = _thorax(n, metal=False)
+    density = 1 + 0.05 * np.random.default_rng(1).standard_normal(phantom.labels.shape, np.float32)
+    return replace(phantom, density=np.maximum(density, np.float32(0)))
+
+
 def _cylinder(n: int) -> Phantom:
     z = (np.arange(n) + 0.5 - n / 2) * SIZE / n
     y, x = z[:, None], z[None, :]
@@ -62,6 +70,7 @@ PATH_SCENES: dict[str, Callable[[int], Phantom]] = {
     "lung": partial(_thorax, metal=False),
     "lung + Fe": partial(_thorax, metal=True),
     "cylinder": _cylinder,
+    "lung, density map": _mapped,
 }
 
 
@@ -78,7 +87,9 @@ def paths(setup: Setup, scene: str) -> list[Measurement]:
     if setup.measures(RTK):
         rtk = Rtk(geometry, setup.threads)
         commonest = 1 + int(np.argmax(np.bincount(phantom.labels.ravel())[1:]))
-        contenders[RTK] = partial(rtk.project, rtk.volume((phantom.labels == commonest).astype(np.float32)))
+        one = (phantom.labels == commonest).astype(np.float32)
+        one = one if phantom.density is None else one * phantom.density
+        contenders[RTK] = partial(rtk.project, rtk.volume(one))
     notes = {OURS: f"all of {', '.join(phantom.materials[1:])}", RTK: "Joseph, one material"}
     timed = setup.timed(contenders)
     return [msgspec.structs.replace(m, note=notes[name]) for name, (_, m) in timed.items()]
