@@ -120,7 +120,7 @@ class Plan:
             "quadrature_error": float(self.error),
             "edge_error": self.edge_error,
             "l0_mm": self.l0,
-            "scatter_fraction": self.scatter_fraction,
+            **({"scatter_fraction": self.scatter_fraction} if self.scatter_error is None else {}),
             "rays": self.n_rays,
             "disk_bytes": self.disk_bytes,
             "flops": self.flops,

@@ -23,11 +23,12 @@ class ScanInfo(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """What scan.json holds; lengths mm, energies keV.
 
     `dark` is the pedestal and `gain` the open signal above it, in counts; `i0` the photons per open pixel and view;
-    `l0` the median water-equivalent path. `view_kerma` and `scan_kerma` are the air kerma (mGy) at the isocentre,
-    without the object, of a view and of the scan (None: an older scan). `materials` name the labels, `metal` those of
-    them that are inserts. `notes` say what a user of the scan should know, such as that no view shows the metal. `seed`
-    is that of a scan without scene.toml. `label_grid` is where the phantom's voxels lie (None: a phantom of
-    exact solids, or an older scan).
+    `l0` the median water-equivalent path. `scatter_fraction` is the scattered signal over that of the open field,
+    averaged over all pixels and views; older scans with scatter by Monte Carlo say 0. `view_kerma` and `scan_kerma`
+    are the air kerma (mGy) at the isocentre, without the object, of a view and of the scan (None: an older scan).
+    `materials` name the labels, `metal` those of them that are inserts. `notes` say what a user of the scan should
+    know, such as that no view shows the metal. `seed` is that of a scan without scene.toml. `label_grid` is where the
+    phantom's voxels lie (None: a phantom of exact solids, or an older scan).
     """
 
     geometry: Geometry

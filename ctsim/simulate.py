@@ -5,7 +5,7 @@ before it, which are made again where a run that was interrupted goes on. It giv
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -31,6 +31,7 @@ from ctsim.types import Phantom, Scanner
 
 Image = NDArray[np.float32]
 Moments = tuple[Image, Image]
+Scattered = Sequence[ScatterSeries | None]
 TWIN = "metal_free/"
 REFERENCE_KEV = 50.0  # centre of 10–90 keV
 
@@ -112,10 +113,30 @@ def _fold(plan: Plan, phantom: Phantom) -> NDArray[np.float32] | None:
     return fold
 
 
+def scatter_of(plan: Plan, phantom: Phantom, scanner: Scanner) -> Scattered:
+    """Follow photons through the phantom and, where there is a twin, without its metal; None at levels other than 3."""
+    body = compact(phantom, plan.materials)
+    bodies = [body, body.without_metal()] if any(o.name == f"{TWIN}counts" for o in plan.outputs) else [body]
+    if scanner.scatter.level != 3:
+        return [None] * len(bodies)
+    beam = _beam(plan, scanner)
+    source = Source(
+        spectrum=plan.spectrum,
+        detector=scanner.detector,
+        n_detector=scanner.geometry.n_detector,
+        gain=beam.gain,
+        layer=beam.layer,
+        layer_material=beam.layer_material,
+        grid_ratio=scanner.scatter.grid_ratio or 0.0,
+    )
+    tolerance, stream = plan.settings.scatter_error, plan.stream_id
+    return [scatter_series(each, source, scanner.geometry, tolerance=tolerance, stream=stream) for each in bodies]
+
+
 class _Simulator:
     """One scan being simulated; holds what the views share."""
 
-    def __init__(self, plan: Plan, phantom: Phantom, scanner: Scanner) -> None:
+    def __init__(self, plan: Plan, phantom: Phantom, scanner: Scanner, scatter: Scattered | None = None) -> None:
         self.plan, self.scanner, self.geometry = plan, scanner, scanner.geometry
         self.beam = _beam(plan, scanner)
         self.fold = _fold(plan, phantom)
@@ -132,9 +153,7 @@ class _Simulator:
         self.opened, self.lit_open = opened if self.panel is None else map(self.panel.spread, opened)
         self.lengths = np.zeros((len(self.tracer.materials), *self.geometry.n_detector), np.float32)
 
-        self.scatter = [self._scatter(body)]
-        if "metal_free/counts" in self.names:
-            self.scatter.append(self._scatter(body.without_metal()))
+        self.scatter = scatter_of(plan, phantom, scanner) if scatter is None else scatter
         self.largest = self._largest_p() if scanner.noise.model == "tigre" else [math.nan] * 2
 
     @property
@@ -212,23 +231,6 @@ class _Simulator:
             edge_tolerance=self.plan.settings.edge_tolerance,
             background=self.lengths,
             out=out,
-        )
-
-    def _scatter(self, body: Phantom) -> ScatterSeries | None:
-        """Follow photons through a body, where the plan wants that."""
-        if self.scanner.scatter.level != 3:
-            return None
-        source = Source(
-            spectrum=self.plan.spectrum,
-            detector=self.scanner.detector,
-            n_detector=self.geometry.n_detector,
-            gain=self.beam.gain,
-            layer=self.beam.layer,
-            layer_material=self.beam.layer_material,
-            grid_ratio=self.scanner.scatter.grid_ratio or 0.0,
-        )
-        return scatter_series(
-            body, source, self.geometry, tolerance=self.plan.settings.scatter_error, stream=self.plan.stream_id
         )
 
     def _lit(self, moments: Moments, k: int, which: int) -> Moments:
@@ -310,16 +312,16 @@ class _Simulator:
 
 
 def simulate_views(
-    plan: Plan, phantom: Phantom, scanner: Scanner, first_view: int = 0
+    plan: Plan, phantom: Phantom, scanner: Scanner, first_view: int = 0, scatter: Scattered | None = None
 ) -> Iterator[tuple[int, dict[str, NDArray]]]:
-    """Yield (view, images by output name) from `first_view` on.
+    """Yield (view, images by output name) from `first_view` on; `scatter` is that of `scatter_of`, where it is known.
 
     Line-integral images (noise_free, scatter_free, mono_…) are P = −ln(signal/open), float32 [v, u];
     metal_path and paths are mm; trace is 1 where the central ray meets metal.
     """
     if first_view == scanner.geometry.n_views:
         return  # a pass over all views, as TIGRE's noise takes, would be for nothing
-    simulator = _Simulator(plan, phantom, scanner)
+    simulator = _Simulator(plan, phantom, scanner, scatter)
     for k in range(max(0, first_view - simulator.frames), first_view):
         simulator.view(k)  # light of earlier views comes in later ones
     for k in range(first_view, scanner.geometry.n_views):
@@ -365,9 +367,9 @@ def _reference_mu(materials: tuple[str, ...], energies: NDArray, omega: NDArray)
     return {m: 0.0 if m == "air" else float(attenuation(m, energies) @ omega) for m in materials}
 
 
-def scan_info(plan: Plan, phantom: Phantom, scanner: Scanner) -> dict:
+def scan_info(plan: Plan, phantom: Phantom, scanner: Scanner, scatter: Scattered = ()) -> dict:
     """Return what a reader needs to use the counts; lengths mm, energies keV; "flat" is the open-field image."""
-    noise = scanner.noise
+    noise, series = scanner.noise, next(iter(scatter), None)
     a1, _ = response(scanner.detector, plan.spectrum.energies)
     optional: dict[str, Any] = {"notes": list(plan.notes)} if plan.notes else {}
     if phantom.labels.any():  # solids alone are on no grid
@@ -385,7 +387,7 @@ def scan_info(plan: Plan, phantom: Phantom, scanner: Scanner) -> dict:
         "e_max": float(plan.spectrum.e_max),
         "l0": plan.l0,
         "mean_detected_kev": float(np.average(plan.spectrum.energies, weights=plan.spectrum.weights * a1)),
-        "scatter_fraction": plan.scatter_fraction,
+        "scatter_fraction": plan.scatter_fraction if series is None else series.mean,
         "materials": list(plan.told),
         "metal": sorted({s.material for s in phantom.solids if s.metal}),
         **optional,

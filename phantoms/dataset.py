@@ -15,7 +15,7 @@ from ctsim.detector.response import response
 from ctsim.errors import InputError
 from ctsim.phantoms.scene import Scene, build, scene_id, scene_to_toml, stream_id
 from ctsim.plan import Plan, make_plan
-from ctsim.simulate import scan_info, simulate_views, truth_volumes
+from ctsim.simulate import Scattered, scan_info, scatter_of, simulate_views, truth_volumes
 from ctsim.types import Phantom, Scanner
 
 Watch = Callable[[Iterable[Any], int, int], Iterable[Any]]
@@ -65,17 +65,18 @@ def make_scene(
         with SceneWriter(
             out, scene.name, scene_id=scene_id(scene), plan_hash=plan_hash(plan), stacks=stacks, force=force
         ) as writer:
-            views = simulate_views(plan, phantom, scanner, first_view=writer.first_view)
+            scatter = scatter_of(plan, phantom, scanner)
+            views = simulate_views(plan, phantom, scanner, first_view=writer.first_view, scatter=scatter)
             for view, arrays in watch(views, writer.first_view, scanner.geometry.n_views):
                 writer.put(view, arrays)
-            _write_truth(writer, plan, phantom, scanner)
+            _write_truth(writer, plan, phantom, scanner, scatter)
             writer.write_text("scene.toml", scene_to_toml(scene))
             return writer.finish()
 
 
-def _write_truth(writer: SceneWriter, plan: Plan, phantom: Phantom, scanner: Scanner) -> None:
+def _write_truth(writer: SceneWriter, plan: Plan, phantom: Phantom, scanner: Scanner, scatter: Scattered) -> None:
     """Write what a scan has once: the flat, the true volumes, and how both were made."""
-    info = dict(scan_info(plan, phantom, scanner))
+    info = dict(scan_info(plan, phantom, scanner, scatter))
     writer.write_image("flat", info.pop("flat"), scanner.geometry.d_detector)
     for name, volume in truth_volumes(plan, phantom, scanner):
         writer.write_image(name, volume, scanner.geometry.d_voxel)

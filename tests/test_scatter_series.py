@@ -19,8 +19,12 @@ from ctsim.montecarlo.kernels.transport_cpu import CHUNKS
 from ctsim.montecarlo.series import scatter_series
 from ctsim.montecarlo.transport import PLANES, Source, scatter_image
 from ctsim.montecarlo.world import World
-from ctsim.scatter import Scatter
+from ctsim.phantoms.dataset import make_scene, plan_scene
+from ctsim.phantoms.scene import Scene, build
+from ctsim.scaninfo import read_info
+from ctsim.scatter import Scatter, constant_fraction
 from ctsim.settings import Simulation, Truth
+from ctsim.simulate import scan_info, scatter_of
 
 SIGMAS = 4.0
 MONO = Spectrum(energies=np.array([60.0]), weights=np.array([1.0]))
@@ -141,9 +145,29 @@ def test_the_simulator_adds_it_to_scan_and_twin_each_their_own(tube):
         added[which] = np.exp(-p) - np.exp(-bare)
         assert (added[which] > 0).all()
     assert abs(added[""] / added["metal_free/"] - 1).max() > 0.02  # metal takes scatter away, and makes some
+    stated = scan_info(plan, phantom(), machine, scatter_of(plan, phantom(), machine))["scatter_fraction"]
+    if not tube.heel:  # the images are relative to the open field, which a heel makes another in each pixel
+        # P of about 1 in float32 is off by 1e-7, and so are intensities; scatter is 0.004 of the open field
+        assert stated == pytest.approx(added[""].mean(), rel=1e-4)
+        assert stated != pytest.approx(added["metal_free/"].mean(), rel=1e-4)
     _, other = run(phantom(), machine, settings, truth, first_view=2)
     np.testing.assert_array_equal(other["counts"], out["counts"][2:])
     np.testing.assert_array_equal(other["metal_free/counts"], out["metal_free/counts"][2:])
+
+
+@pytest.mark.slow
+def test_scan_json_says_how_much_scatter_there_is(tmp_path):
+    scanner = {"preset": "ideal", "n_voxel": (8, 8, 8), "n_detector": (12, 12), "n_views": 4}
+    scene = {"name": "one", "phantom": {"recipe": "validation", "n_voxel": (16, 16, 16), "size": 60.0, "metal": "Fe"}}
+    for level, simulation in ((0, {}), (1, {}), (3, {"scatter_error": 0.3})):
+        given = scene | {"scanner": scanner | {"scatter": {"level": level}}, "simulation": simulation}
+        one = msgspec.convert(given, Scene)
+        folder = make_scene(one, tmp_path / str(level))
+        share = read_info(folder / "scan.json").scatter_fraction
+        (series, *_) = scatter_of(plan_scene(one), build(one), one.resolve())
+        expected = {0: 0.0, 1: constant_fraction(one.resolve().geometry)}
+        assert share == (series.mean if series else expected[level])
+        assert (share > 0) == (level > 0)
 
 
 def test_another_error_keeps_the_noise():

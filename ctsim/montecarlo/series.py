@@ -47,6 +47,11 @@ class ScatterSeries:
     error: float
     histories: int
 
+    @property
+    def mean(self) -> float:
+        """Return the scatter averaged over all pixels and views, which is the wave that is constant."""
+        return float(self.coefficients[0, 0, 0, 0])
+
     def view(self, k: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the mean and the mean squared signal of view k, float32 [v, u]."""
         _, n_t, n_v, n_u = self.coefficients.shape
