@@ -27,44 +27,45 @@ SHARES_END = 300.0
 """Highest energy (keV) at which xraylib tabulates the shares of the shells in photoelectric absorption."""
 _SHARES_END_LIGHT, _LAST_LIGHT = 100.0, 8  # the same up to oxygen
 
-# Compositions in percent by weight, densities in g/cm3. Tissues: ICRU Report 44 (1989), lung inflated.
-# Compounds and elements: NIST, physics.nist.gov/PhysRefData/XrayMassCoef. Enamel and dentin: 95 and 70 %
-# hydroxyapatite, 4 and 10 % water, the rest collagen. Alloys: nominal ASTM F75, AISI 316L and 6061. Spongiosa, kidney
-# and urine: ICRU Report 46 (1992). Amalgam: equal weights of mercury and an admixed high-copper powder (Anusavice,
-# Phillips' Science of Dental Materials, 12th ed., ch. 15).
-_TABLE: dict[str, tuple[str, float]] = {
-    "air": ("C 0.0124 N 75.5268 O 23.1781 Ar 1.2827", 1.20479e-3),
-    "water": ("H2O", 1.0),
-    "soft_tissue": ("H 10.2 C 14.3 N 3.4 O 70.8 Na 0.2 P 0.3 S 0.3 Cl 0.2 K 0.3", 1.06),
-    "lung": ("H 10.3 C 10.5 N 3.1 O 74.9 Na 0.2 P 0.2 S 0.3 Cl 0.3 K 0.2", 0.26),
-    "adipose": ("H 11.4 C 59.8 N 0.7 O 27.8 Na 0.1 S 0.1 Cl 0.1", 0.95),
-    "muscle": ("H 10.2 C 14.3 N 3.4 O 71.0 Na 0.1 P 0.2 S 0.3 Cl 0.1 K 0.4", 1.05),
-    "brain": ("H 10.7 C 14.5 N 2.2 O 71.2 Na 0.2 P 0.4 S 0.2 Cl 0.3 K 0.3", 1.04),
-    "blood": ("H 10.2 C 11.0 N 3.3 O 74.5 Na 0.1 P 0.1 S 0.2 Cl 0.3 K 0.2 Fe 0.1", 1.06),
-    "cortical_bone": ("H 3.4 C 15.5 N 4.2 O 43.5 Na 0.1 Mg 0.2 P 10.3 S 0.3 Ca 22.5", 1.92),
-    "spongiosa": ("H 8.5 C 40.4 N 2.8 O 36.7 Na 0.1 Mg 0.1 P 3.4 S 0.2 Cl 0.2 K 0.1 Ca 7.4 Fe 0.1", 1.18),
-    "kidney": ("H 10.3 C 13.2 N 3.0 O 72.4 Na 0.2 P 0.2 S 0.2 Cl 0.2 K 0.2 Ca 0.1", 1.05),
-    "urine": ("H 11.0 C 0.5 N 1.0 O 86.2 Na 0.4 P 0.1 Cl 0.6 K 0.2", 1.02),
-    "enamel": ("H 0.7 C 0.5 N 0.2 O 43.1 P 17.6 Ca 37.9", 2.96),
-    "dentin": ("H 2.7 C 10.2 N 3.4 O 42.9 P 12.9 Ca 27.9", 2.14),
-    "PLA": ("C3H4O2", 1.24),
-    "PMMA": ("C5H8O2", 1.18),
-    "PE": ("CH2", 0.93),
-    "cellulose": ("C6H10O5", 1.5),
-    "glass": ("O 45.98 Na 9.64 Si 33.66 Ca 10.72", 2.40),
-    "Al": ("Al", 2.699),
-    "Al6061": ("Al 97.9 Mg 1.0 Si 0.6 Cu 0.3 Cr 0.2", 2.70),
-    "Ti": ("Ti", 4.506),
-    "Fe": ("Fe", 7.874),
-    "Cu": ("Cu", 8.96),
-    "Sn": ("Sn", 7.31),
-    "W": ("W", 19.3),
-    "Au": ("Au", 19.32),
-    "CoCr": ("Co 64.0 Cr 28.5 Mo 6.0 Si 0.7 Mn 0.5 Fe 0.3", 8.30),
-    "steel": ("Fe 65.5 Cr 17.0 Ni 12.0 Mo 2.5 Mn 2.0 Si 1.0", 7.99),
-    "amalgam": ("Hg 50.0 Ag 34.5 Sn 9.0 Cu 6.0 Zn 0.5", 11.6),
-    "GOS": ("Gd2O2S", 7.34),
-    "CsI": ("CsI", 4.51),
+# Compositions in percent by weight, densities in g/cm3, and where both are from. ICRU 44: Tissue Substitutes in
+# Radiation Dosimetry, 1989. ICRU 46: Photon, Electron, Proton and Neutron Interaction Data for Body Tissues, 1992.
+# NIST: tables 1 and 2 of physics.nist.gov/PhysRefData/XrayMassCoef. CRC: Handbook of Chemistry and Physics, at 20 °C
+# (NIST has 4.54). CoCr: within the ranges of F75, Cr and Mo in the middle. Steel: Mn and Si at the limits of 316L.
+# Amalgam: equal weights of mercury and an admixed high-copper powder (Anusavice, Phillips' Science of Dental
+# Materials, 12th ed., ch. 15).
+_TABLE: dict[str, tuple[str, float, str]] = {
+    "air": ("C 0.0124 N 75.5268 O 23.1781 Ar 1.2827", 1.20479e-3, "NIST"),
+    "water": ("H2O", 1.0, "NIST"),
+    "soft_tissue": ("H 10.2 C 14.3 N 3.4 O 70.8 Na 0.2 P 0.3 S 0.3 Cl 0.2 K 0.3", 1.06, "ICRU 44"),
+    "lung": ("H 10.3 C 10.5 N 3.1 O 74.9 Na 0.2 P 0.2 S 0.3 Cl 0.3 K 0.2", 0.26, "ICRU 44, inflated"),
+    "adipose": ("H 11.4 C 59.8 N 0.7 O 27.8 Na 0.1 S 0.1 Cl 0.1", 0.95, "ICRU 44"),
+    "muscle": ("H 10.2 C 14.3 N 3.4 O 71.0 Na 0.1 P 0.2 S 0.3 Cl 0.1 K 0.4", 1.05, "ICRU 44"),
+    "brain": ("H 10.7 C 14.5 N 2.2 O 71.2 Na 0.2 P 0.4 S 0.2 Cl 0.3 K 0.3", 1.04, "ICRU 44"),
+    "blood": ("H 10.2 C 11.0 N 3.3 O 74.5 Na 0.1 P 0.1 S 0.2 Cl 0.3 K 0.2 Fe 0.1", 1.06, "ICRU 44"),
+    "cortical_bone": ("H 3.4 C 15.5 N 4.2 O 43.5 Na 0.1 Mg 0.2 P 10.3 S 0.3 Ca 22.5", 1.92, "ICRU 44"),
+    "spongiosa": ("H 8.5 C 40.4 N 2.8 O 36.7 Na 0.1 Mg 0.1 P 3.4 S 0.2 Cl 0.2 K 0.1 Ca 7.4 Fe 0.1", 1.18, "ICRU 46"),
+    "kidney": ("H 10.3 C 13.2 N 3.0 O 72.4 Na 0.2 P 0.2 S 0.2 Cl 0.2 K 0.2 Ca 0.1", 1.05, "ICRU 46"),
+    "urine": ("H 11.0 C 0.5 N 1.0 O 86.2 Na 0.4 P 0.1 Cl 0.6 K 0.2", 1.02, "ICRU 46"),
+    "enamel": ("H 0.7 C 0.5 N 0.2 O 43.1 P 17.6 Ca 37.9", 2.96, "95 % hydroxyapatite, 4 % water, 1 % collagen"),
+    "dentin": ("H 2.7 C 10.2 N 3.4 O 42.9 P 12.9 Ca 27.9", 2.14, "70 % hydroxyapatite, 10 % water, 20 % collagen"),
+    "PLA": ("C3H4O2", 1.24, "repeat unit; density of printed filament"),
+    "PMMA": ("C5H8O2", 1.18, "NIST; density of extruded sheet"),
+    "PE": ("CH2", 0.93, "NIST"),
+    "cellulose": ("C6H10O5", 1.5, "repeat unit; density of cell walls"),
+    "glass": ("O 45.98 Na 9.64 Si 33.66 Ca 10.72", 2.40, "NIST"),
+    "Al": ("Al", 2.699, "NIST"),
+    "Al6061": ("Al 97.9 Mg 1.0 Si 0.6 Cu 0.3 Cr 0.2", 2.70, "nominal 6061"),
+    "Ti": ("Ti", 4.506, "CRC"),
+    "Fe": ("Fe", 7.874, "NIST"),
+    "Cu": ("Cu", 8.96, "NIST"),
+    "Sn": ("Sn", 7.31, "NIST"),
+    "W": ("W", 19.3, "NIST"),
+    "Au": ("Au", 19.32, "NIST"),
+    "CoCr": ("Co 64.0 Cr 28.5 Mo 6.0 Si 0.7 Mn 0.5 Fe 0.3", 8.30, "nominal ASTM F75"),
+    "steel": ("Fe 65.5 Cr 17.0 Ni 12.0 Mo 2.5 Mn 2.0 Si 1.0", 7.99, "limits of AISI 316L"),
+    "amalgam": ("Hg 50.0 Ag 34.5 Sn 9.0 Cu 6.0 Zn 0.5", 11.6, "Anusavice"),
+    "GOS": ("Gd2O2S", 7.34, "NIST; density of the crystal"),
+    "CsI": ("CsI", 4.51, "NIST"),
 }
 _BY_WEIGHT = re.compile(r"[A-Z][a-z]?\s+[0-9.]+(\s+[A-Z][a-z]?\s+[0-9.]+)*")
 
@@ -131,7 +132,7 @@ def material(name: str) -> Material:
     Raises InputError naming near matches where the name is unknown.
     """
     if name in _TABLE:
-        formula, density = _TABLE[name]
+        formula, density, _ = _TABLE[name]
         return Material(name=name, formula=formula, density=density)
     formula, at, density_text = name.partition("@")
     if at:

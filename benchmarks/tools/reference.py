@@ -233,12 +233,14 @@ def _filters(tube: Any, between: str) -> str:
 
 def _materials() -> str:
     """Return the table of named materials."""
-    rows = [(f"`{name}`", composition, f"{density:g}") for name, (composition, density) in MATERIALS.items()]
+    rows = [
+        (f"`{name}`", composition, f"{density:g}", source) for name, (composition, density, source) in MATERIALS.items()
+    ]
     said = (
         "Any element by its symbol and any formula with a density, such as `NaI@3.67`, is a material too. "
         "Compositions are formulas or percent by weight."
     )
-    return f"## Materials\n\n{said}\n\n{table(('name', 'composition', 'density (g/cm3)'), rows)}"
+    return f"## Materials\n\n{said}\n\n{table(('name', 'composition', 'density (g/cm3)', 'source'), rows)}"
 
 
 def suite(name: str) -> str:
