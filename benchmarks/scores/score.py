@@ -170,6 +170,18 @@ MAIN: dict[tuple[str, str], Metric] = {
 }
 """Protocol and metric of the main table's columns: one or two of the protocols that matter most."""
 
+MAIN_ACROSS: dict[tuple[str, str], Metric] = {
+    ("soft", "rmse"): MAIN["soft", "rmse"],
+    ("artefact", "rmse"): Metric("artefact RMSE (HU)", 1, "min"),
+    ("metal_cost", "own_hu"): Metric("cost of metal (HU)", 1, "min"),
+    ("metal_cost", "fdk_hu"): Metric("short of FDK without metal (HU)", 1, "min"),
+    ("structure", "false_bone"): MAIN["structure", "false_bone"],
+    ("tissue", "psnr3d"): _IMAGE["psnr3d"],
+    ("tissue", "ssim3d"): _IMAGE["ssim3d"],
+    ("cost", "wall"): MAIN["cost", "wall"],
+}
+"""The same where scanners are compared: HU first, since the range that dB are taken of moves with the spectrum."""
+
 FDK, NMAR = "fdk", "nmar"
 FDK_ROWS = (FDK, "fdk-ramp")
 """The rows without correction of any kind, with any filter: the best of them on the twin is what metal could leave."""

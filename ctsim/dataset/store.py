@@ -5,6 +5,7 @@ A scene's folder holds counts.tif [view, v, u], flat.tif, the references, labels
 `metal_free/`, the twin without metal. Row 0 of an image is the bottom of the detector.
 """
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -81,6 +82,14 @@ class StoredScan:
     def kerma(self) -> float | None:
         """Return the scan's air kerma (mGy) at the isocentre; None where scan.json of an older scan lacks it."""
         return self.info.scan_kerma
+
+    @property
+    def phantom(self) -> str:
+        """Return a hash of what lies where on the reconstruction grid; "" where the scan has no labels."""
+        entry = self.files.get("labels.tif")
+        return (
+            "" if entry is None else hashlib.sha256(f"{entry.sha256} {self.info.materials}".encode()).hexdigest()[:12]
+        )
 
     @property
     def labels(self) -> NDArray[np.uint8]:

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 
 from ctsim.benchmarks.engine.record import OK
-from ctsim.benchmarks.scores.score import AS_RETURNED, NMAR, row_of
+from ctsim.benchmarks.scores.score import AS_RETURNED, MAIN, MAIN_ACROSS, NMAR, Metric, row_of
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord
 
 RANGES_DIFFER = 1.05
@@ -14,21 +14,56 @@ RANGES_DIFFER = 1.05
 
 def main_caption(shown: Sequence[RunRecord]) -> str:
     """Say what the columns of the main tables are, and where scenes do not compare by dB."""
-    text = (
-        "PSNR3D and SSIM3D of all tissue outside the metal (protocol tissue). Cost of metal: what PSNR3D loses against "
-        "the same method on the metal-free twin. Short of FDK without metal: what it lacks of the best FDK of that "
-        "twin, so that erasing detail with and without metal alike is no gain. False bone: share of soft tissue near "
-        "and between metal that reads as bone (protocol structure). Soft tissue RMSE: protocol soft. Controls have no "
-        "rank."
+    image = "PSNR3D and SSIM3D of all tissue outside the metal (protocol tissue)."
+    bone = "False bone: share of soft tissue near and between metal that reads as bone (protocol structure)."
+    clean = (
+        "Short of FDK without metal: what it lacks of the best FDK of that twin, so that erasing detail with and "
+        "without metal alike is no gain."
     )
-    ranges = [r.scores["tissue"].data_range for r in shown if r.run.variant == METAL and "tissue" in r.scores]
-    known = [x for x in ranges if x]
-    if known and max(known) > RANGES_DIFFER * min(known):
+    ranges = [found for group in _ranges(shown).values() for found in group.values()]
+    span = f"{min(ranges):.4g} to {max(ranges):.4g} 1/mm" if ranges else ""
+    if across_scanners(shown):
+        return (
+            "These scenes show the same object to different scanners, so HU come first. The range that PSNR3D is taken "
+            f"of moves with the spectrum ({span}): an image with half the error in HU may have the lower PSNR3D. Soft "
+            "tissue RMSE: protocol soft. Artefact RMSE: what the metal changes, against the same method on the "
+            "metal-free twin (protocol artefact). Cost of metal: what soft tissue RMSE loses against that twin. "
+            f"{clean} {bone} {image} Controls have no rank."
+        )
+    text = (
+        f"{image} Cost of metal: what PSNR3D loses against the same method on the metal-free twin. {clean} {bone} "
+        "Soft tissue RMSE: protocol soft. Controls have no rank."
+    )
+    if ranges and max(ranges) > RANGES_DIFFER * min(ranges):
         text += (
-            f" The range that PSNR3D is taken of differs between scenes ({min(known):.4g} to {max(known):.4g} 1/mm): "
+            f" The range that PSNR3D is taken of differs between scenes ({span}): "
             "compare scenes by HU, and methods within a scene by either."
         )
     return text
+
+
+def main_columns(shown: Sequence[RunRecord]) -> dict[tuple[str, str], Metric]:
+    """Return the columns of the main table of these records."""
+    return MAIN_ACROSS if across_scanners(shown) else MAIN
+
+
+def across_scanners(shown: Sequence[RunRecord]) -> bool:
+    """Whether the scenes differ by scanner: every object is in several of them, and the range of its PSNR3D moves.
+
+    The range is a percentile of the true volume, so for one object it moves with the spectrum only.
+    """
+    ranges = _ranges(shown)
+    shared = "" not in ranges and all(len(group) > 1 for group in ranges.values())
+    return shared and any(max(g.values()) > RANGES_DIFFER * min(g.values()) for g in ranges.values())
+
+
+def _ranges(shown: Sequence[RunRecord]) -> dict[str, dict[str, float]]:
+    """Return the data range of `tissue` by object and scene; the object "" is unknown."""
+    found: dict[str, dict[str, float]] = {}
+    for r in shown:
+        if r.run.variant == METAL and "tissue" in r.scores and (size := r.scores["tissue"].data_range):
+            found.setdefault(r.phantom, {})[r.run.scene] = size
+    return found
 
 
 def merged(texts: Iterable[str]) -> str:

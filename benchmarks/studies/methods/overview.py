@@ -2,8 +2,10 @@
 
 import shlex
 import sys
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from rich import box
 from rich.table import Table
@@ -11,27 +13,44 @@ from rich.text import Text
 
 from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.table import one_line, ranked
-from ctsim.benchmarks.engine.terminal import rendered, width
+from ctsim.benchmarks.engine.terminal import WIDEST, rendered, width
 from ctsim.benchmarks.methods import CONTROLS
-from ctsim.benchmarks.scores.score import MAIN
+from ctsim.benchmarks.scores.score import MAIN, MAIN_ACROSS, Metric
+from ctsim.benchmarks.studies.methods.captions import across_scanners
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest, remarks
 from ctsim.benchmarks.studies.methods.tables import Numbers, numbers
 
-PROTOCOL = "tissue"
+
+class Number(NamedTuple):
+    """One number of a method on a scene: its title, where it is from, the width of its column, and what it is."""
+
+    title: str
+    protocol: str
+    metric: str
+    width: int
+    about: str
+
+
+_BONE = Number("bone", "structure", "false_bone", 5, "% of soft tissue near metal that reads as bone")
+_SECONDS = Number("s", "cost", "wall", 5, "seconds of a run")
 SHOWN = (
-    ("PSNR", PROTOCOL, "psnr3d", 5),
-    ("lost", "metal_cost", "own_db", 5),
-    ("bone", "structure", "false_bone", 5),
-    ("s", "cost", "wall", 5),
+    Number("PSNR", "tissue", "psnr3d", 5, "PSNR3D in dB of the body outside metal (protocol tissue)"),
+    Number("lost", "metal_cost", "own_db", 5, "dB against the same method on the metal-free twin"),
+    _BONE,
+    _SECONDS,
 )
-"""Title, protocol, metric and width of the numbers of a scene."""
-RANKED = range(3)
-"""Those of them whose best is bold."""
-HEAD = "  ".join(f"{title:>{width}}" for title, _, _, width in SHOWN)
+ACROSS = (
+    Number("HU", "soft", "rmse", 6, "RMSE of soft tissue in HU (protocol soft)"),
+    Number("metal", "artefact", "rmse", 6, "RMSE in HU against the same method on the metal-free twin"),
+    Number("lost", "metal_cost", "own_hu", 6, "HU of soft tissue RMSE against that twin"),
+    SHOWN[0],
+    _SECONDS,
+)
+"""The numbers where scanners are compared, whose dB do not compare."""
 Row = tuple[str, str]
 """Inputs and method."""
 Values = dict[tuple[str, Row], list[float | None]]
-"""Numbers by scene and row, as in `SHOWN`."""
+"""Numbers by scene and row, as in `SHOWN` or `ACROSS`."""
 MOST_TABLES = 3
 """At most this many tables below each other; scenes that do not fit are averaged."""
 MOST_FAILURES = 10
@@ -42,8 +61,7 @@ def text(records: Sequence[RunRecord], results: Path, data: Path) -> str:
     """Return the table, what its numbers are, where the rest is, and what to try next."""
     shown = latest(records)
     lines = [
-        f"PSNR: PSNR3D in dB of the body outside metal (protocol {PROTOCOL}). Lost: dB against the same method on the",
-        "metal-free twin. Bone: % of soft tissue near metal that reads as bone. s: seconds of a run.",
+        *textwrap.wrap(". ".join(f"{number.title}: {number.about}" for number in _numbers(shown)) + ".", WIDEST),
         *_failures(shown),
         *remarks(records),
         f"All protocols: {results}/table.md, .csv, .tex; records: {results}/records.jsonl",
@@ -66,47 +84,62 @@ def _failures(shown: Sequence[RunRecord]) -> list[str]:
 
 
 def overview(shown: Sequence[RunRecord]) -> str:
-    """Return PSNR3D, cost of metal, false bone and seconds of every method on every scene, fitting the terminal.
+    """Return `SHOWN` or `ACROSS` of every method on every scene, fitting the terminal.
 
     Scenes are columns, in two tables where one is too narrow; if two are, the mean over all scenes is shown.
     Numbers are means over noise seeds.
     """
     own = [record for record in shown if record.run.variant == METAL]
-    found, scenes = numbers(shown), list(dict.fromkeys(record.run.scene for record in own))
+    what, found, scenes = _numbers(shown), numbers(shown), list(dict.fromkeys(record.run.scene for record in own))
     rows = sorted(dict.fromkeys((record.inputs, record.label) for record in own), key=lambda row: row[0])
     failed = {(r.run.scene, r.label): r.status for r in own if r.status != OK}
-    values = {(scene, row): _values(found, scene, row) for scene in scenes for row in rows}
+    values = {(scene, row): _values(found, scene, row, what) for scene in scenes for row in rows}
     stubs = sum(max(map(len, column)) + 2 for column in zip(("inputs", "method"), *rows, strict=True))
-    wide = max([len(HEAD), *map(len, scenes)]) + 2
+    wide = max([len(_head(what)), *map(len, scenes)]) + 2
     fit = max((width() - stubs) // wide, 1)
     if len(scenes) > fit * MOST_TABLES:
         title = f"mean of {len(scenes)} scenes"
         values |= {(title, row): _mean([values[scene, row] for scene in scenes]) for row in rows}
         scenes = [title]
-    return "\n".join(_table(rows, scenes[n : n + fit], values, failed) for n in range(0, len(scenes), fit))
+    return "\n".join(_table(what, rows, scenes[n : n + fit], values, failed) for n in range(0, len(scenes), fit))
 
 
-def _table(rows: Sequence[Row], columns: Sequence[str], values: Values, failed: dict[tuple[str, str], str]) -> str:
+def _numbers(shown: Sequence[RunRecord]) -> tuple[Number, ...]:
+    return ACROSS if across_scanners(shown) else SHOWN
+
+
+def _head(what: Sequence[Number]) -> str:
+    return "  ".join(f"{number.title:>{number.width}}" for number in what)
+
+
+def _table(
+    what: Sequence[Number],
+    rows: Sequence[Row],
+    columns: Sequence[str],
+    values: Values,
+    failed: dict[tuple[str, str], str],
+) -> str:
     """Return a table with a column for each scene; `failed` says how a run of a scene and method ended."""
     table = Table(box=box.SIMPLE_HEAD if _unicode() else box.ASCII2, pad_edge=False, show_edge=False)
     table.add_column("\ninputs", no_wrap=True)
     table.add_column("\nmethod", overflow="fold")
     for column in columns:
-        table.add_column(f"{one_line(column)}\n{HEAD}", no_wrap=True)
-    best = {(column, k): _best(rows, column, k, values) for column in columns for k in RANKED}
+        table.add_column(f"{one_line(column)}\n{_head(what)}", no_wrap=True)
+    ranked = range(len(what) - 1)  # all but the seconds
+    best = {(column, k): _best(rows, column, k, values, what[k]) for column in columns for k in ranked}
     for number, row in enumerate(rows):
         first = not number or rows[number - 1][0] != row[0]
         cells = [
-            _cell(values[column, row], failed.get((column, row[1]), ""), [row in best[column, k] for k in RANKED])
+            _cell(what, values[column, row], failed.get((column, row[1]), ""), [row in best[column, k] for k in ranked])
             for column in columns
         ]
         table.add_row(row[0] if first else "", Text(one_line(row[1])), *cells)
     return rendered(table)
 
 
-def _values(found: Numbers, scene: str, row: Row) -> list[float | None]:
+def _values(found: Numbers, scene: str, row: Row, what: Sequence[Number]) -> list[float | None]:
     inputs, label = row
-    numbers = (found.get((scene, METAL, label, inputs, protocol, metric)) for _, protocol, metric, _ in SHOWN)
+    numbers = (found.get((scene, METAL, label, inputs, each.protocol, each.metric)) for each in what)
     return [None if number is None else number[0] for number in numbers]
 
 
@@ -119,33 +152,36 @@ def _mean(scenes: Sequence[list[float | None]]) -> list[float | None]:
     return out
 
 
-def _best(rows: Sequence[Row], column: str, k: int, values: Values) -> set[Row]:
+def _best(rows: Sequence[Row], column: str, k: int, values: Values, number: Number) -> set[Row]:
     """Return the rows that are best of their inputs in a number."""
     found: set[Row] = set()
-    _, protocol, metric, _ = SHOWN[k]
     for inputs in dict.fromkeys(row[0] for row in rows if row[0] not in CONTROLS):
         group = [row for row in rows if row[0] == inputs]
-        places = ranked([values[column, row][k] for row in group], MAIN[protocol, metric].better)
+        places = ranked([values[column, row][k] for row in group], _column(number).better)
         found |= {group[n] for n, place in places.items() if place == "best"}
     return found
 
 
-def _cell(values: Sequence[float | None], failed: str, best: Sequence[bool]) -> Text:
+def _column(number: Number) -> Metric:
+    return (MAIN | MAIN_ACROSS)[number.protocol, number.metric]
+
+
+def _cell(what: Sequence[Number], values: Sequence[float | None], failed: str, best: Sequence[bool]) -> Text:
     """Return the numbers of a method on a scene; how a run ended that has none."""
     if failed and values[0] is None:
-        return Text(failed.rjust(len(HEAD)), "red")
+        return Text(failed.rjust(len(_head(what))), "red")
     out = Text()
-    for k, (value, (_, protocol, metric, size)) in enumerate(zip(values, SHOWN, strict=True)):
-        column = MAIN[protocol, metric]
-        text = ("–" if _unicode() else "-") if value is None else _text(value * column.scale, metric, column.digits)
-        out.append("  " if k else "").append(text.rjust(size), "bold" if k < len(best) and best[k] else "")
+    for k, (value, number) in enumerate(zip(values, what, strict=True)):
+        text = ("–" if _unicode() else "-") if value is None else _text(value, number)
+        out.append("  " if k else "").append(text.rjust(number.width), "bold" if k < len(best) and best[k] else "")
     return out
 
 
-def _text(value: float, metric: str, digits: int) -> str:
-    if metric == "wall":
+def _text(value: float, number: Number) -> str:
+    if number.metric == "wall":
         return f"{value:.2g}" if value < 10 else f"{value:.0f}"
-    return f"{value:.{digits}f}"
+    column = _column(number)
+    return f"{value * column.scale:.{column.digits}f}"
 
 
 def _unicode() -> bool:

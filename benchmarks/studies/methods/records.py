@@ -64,7 +64,8 @@ class Result(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     `inputs` is what the method needs in addition to the counts; `files["volume"]` its kept volume; `data_code` hashes
     the code of the simulator that made the scan (empty: unknown). `kerma` is the scan's air kerma (mGy) at the
-    isocentre (None: the scan or the record is older).
+    isocentre (None: the scan or the record is older); `phantom` hashes the labels of the scan (empty: it has none, or
+    the record is older).
     """
 
     inputs: str = ""
@@ -73,6 +74,7 @@ class Result(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
     details: dict[str, Any] = msgspec.field(default_factory=dict)
     data_code: str = ""
     kerma: float | None = None
+    phantom: str = ""
 
 
 class RunRecord(Record[Result], frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -134,6 +136,11 @@ class RunRecord(Record[Result], frozen=True, kw_only=True, forbid_unknown_fields
     def kerma(self) -> float | None:
         """The scan's air kerma (mGy) at the isocentre; None where it is unknown."""
         return self.found[0].kerma
+
+    @property
+    def phantom(self) -> str:
+        """The hash of the labels of the scan; empty where it is unknown."""
+        return self.found[0].phantom
 
 
 def case_of(run: Run) -> str:

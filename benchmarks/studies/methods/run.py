@@ -139,6 +139,7 @@ class Runner:
             details=with_grid(outcome.details, job.stored.geometry, job.stored.info.label_grid),
             data_code=job.stored.code,
             kerma=job.stored.kerma,
+            phantom=job.stored.phantom,
         )
 
 

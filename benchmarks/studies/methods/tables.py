@@ -21,13 +21,12 @@ from ctsim.benchmarks.scores.score import (
     COLUMNS,
     COMPARED,
     KERMA,
-    MAIN,
     Metric,
     SeedValue,
     derived,
     harm,
 )
-from ctsim.benchmarks.studies.methods.captions import caption, declared, main_caption
+from ctsim.benchmarks.studies.methods.captions import caption, declared, main_caption, main_columns
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest, outdated, remarks
 from ctsim.dataset.durable import write_synced
 from ctsim.errors import InputError
@@ -189,7 +188,7 @@ def _main(
 ) -> list[Table]:
     """Return the main tables: one for each scene, and their mean, of what matters most from several protocols."""
     there = {(protocol, metric) for protocol, group in chosen.items() for _, _, metric in group}
-    metrics = {f"{p}/{m}": how for (p, m), how in MAIN.items() if (p, m) in there}
+    metrics = {f"{p}/{m}": how for (p, m), how in main_columns(shown).items() if (p, m) in there}
     picked = {
         (scene, method, f"{protocol}/{metric}"): number
         for protocol, group in chosen.items()
