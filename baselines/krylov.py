@@ -12,7 +12,7 @@ from ctsim.types import Scan, Volume
 class Cgls(Iterations, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As `Iterations`."""
 
-    iterations: Count = 15
+    iterations: Count = 9
 
 
 @keywords(Cgls)

@@ -35,6 +35,7 @@ CACHE_BYTES = 1 << 30  # voxel sums of the subsets are kept up to this size, els
 class Sart(Iterations, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """`iterations` are passes over all views."""
 
+    iterations: Count = 2
     relaxation: Relaxation = 0.5
     positivity: Positivity = True
 
@@ -42,6 +43,7 @@ class Sart(Iterations, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class OsSart(Sart, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As `Sart`, with the views in interleaved subsets."""
 
+    iterations: Count = 3
     relaxation: Relaxation = 1.0
     subsets: Annotated[int, about("subsets of the views, at most one per view", ge=1, le=100_000)] = 20
 
@@ -49,7 +51,7 @@ class OsSart(Sart, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Sirt(Sart, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As `Sart`."""
 
-    iterations: Count = 100
+    iterations: Count = 30
     relaxation: Relaxation = 1.9
 
 

@@ -12,8 +12,11 @@ import csv
 import itertools
 import statistics
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import TypeVar
+
+import torch
 
 from ctsim.benchmarks.cli import guarded
 from ctsim.benchmarks.methods import find
@@ -29,22 +32,15 @@ CUTOFFS = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5)
 FILTERS = tuple(itertools.product(WINDOWS, CUTOFFS))
 NAMES = ("scene", "method", "window", "cutoff", "psnr3d")
 Row = tuple[str, str, str, float, float]
+T = TypeVar("T", bound=tuple[object, ...])
 
 
 def main(arguments: list[str]) -> int:
     """Write the table, a scene at a time, and print the best filter of each method; return 0."""
     if len(arguments) < 3:
         raise InputError("expected DATA, OUT and the names of methods")
-    out, found = Path(arguments[1]), list[Row]()
-    out.mkdir(parents=True, exist_ok=True)
-    with (out / "filter.csv").open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(NAMES)
-        for folder in list_scans(Path(arguments[0])):
-            for row in rows(open_scan(folder), arguments[2:]):
-                found.append(row)
-                writer.writerow(row)
-                file.flush()
+    stored = (open_scan(folder) for folder in list_scans(Path(arguments[0])))
+    found = written(Path(arguments[1]) / "filter.csv", NAMES, (row for s in stored for row in rows(s, arguments[2:])))
     for group in [*([method] for method in arguments[2:]), arguments[2:]]:
         means = mean_scores(found, group)
         best = max(means, key=lambda filter: means[filter])
@@ -54,17 +50,40 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
+def written(path: Path, names: Sequence[str], rows: Iterable[T]) -> list[T]:
+    """Write a CSV file, each row as soon as it is there, and return the rows."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    found = list[T]()
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(names)
+        for row in rows:
+            found.append(row)
+            writer.writerow(row)
+            file.flush()
+    return found
+
+
 def rows(stored: StoredScan, methods: Sequence[str]) -> Iterator[Row]:
     """Yield the score of each method with each filter on a scene."""
-    truth = truth_of(stored)
-    largest = tissue_range(truth, "effective")
+    score = scoring(stored)
     for name, (window, cutoff) in itertools.product(methods, FILTERS):
         method = find(name, {"window": window, "cutoff": cutoff})
-        values = method.reconstruct(scan_for(method, stored, METAL)).values.numpy()
-        score = psnr3d(values, truth.references["effective"], data_range=largest, region=truth.tissue)
-        if score is None:
-            raise InputError(f"{stored.name}, {name}: the volume is the reference itself")
-        yield stored.name, name, window, cutoff, round(score, 3)
+        yield stored.name, name, window, cutoff, score(method.reconstruct(scan_for(method, stored, METAL)).values)
+
+
+def scoring(stored: StoredScan) -> Callable[[torch.Tensor], float]:
+    """Return the score of a volume of a scene: PSNR3D under protocol `tissue`, dB."""
+    truth = truth_of(stored)
+    largest = tissue_range(truth, "effective")
+
+    def score(volume: torch.Tensor) -> float:
+        found = psnr3d(volume.numpy(), truth.references["effective"], data_range=largest, region=truth.tissue)
+        if found is None:
+            raise InputError(f"{stored.name}: the volume is the reference itself")
+        return round(found, 3)
+
+    return score
 
 
 def mean_scores(found: Sequence[Row], methods: Sequence[str]) -> dict[tuple[str, float], float]:
