@@ -15,24 +15,20 @@ from numpy.typing import NDArray
 
 from ctsim.beam.quadrature import effective_weights
 from ctsim.beam.spectrum import bowtie_thickness, heel_factor
-from ctsim.detector.noise import detect, detect_tigre, flat_field, largest_p, photons, pixel_pattern, read_out
-from ctsim.detector.panel import Panel
+from ctsim.detector.noise import flat_field, largest_p, pixel_pattern
 from ctsim.detector.response import response
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.montecarlo.series import ScatterSeries, scatter_series
 from ctsim.montecarlo.transport import Source
 from ctsim.plan import Plan, density_levels
-from ctsim.rng import stream_key
+from ctsim.readout import TWIN, Image, Moments, Readout, panel_of
 from ctsim.tracer.project import Response, Tracer, path_lengths, transmit
 from ctsim.tracer.shadow import join, row_spans
 from ctsim.tracer.voxelise import attenuation_volume, label_volume, metal_mask
 from ctsim.types import Phantom, Scanner
 
-Image = NDArray[np.float32]
-Moments = tuple[Image, Image]
 Scattered = Sequence[ScatterSeries | None]
-TWIN = "metal_free/"
 REFERENCE_KEV = 50.0  # centre of 10–90 keV
 
 
@@ -95,14 +91,6 @@ def _beam(plan: Plan, scanner: Scanner) -> _Beam:
     return _Beam(gain=gain, layer=layer, layer_material=name, open1=open1, open2=open2)
 
 
-def _panel(scanner: Scanner) -> Panel | None:
-    """Return the panel where its light spreads or comes late."""
-    detector = scanner.detector
-    if detector.blur is None and not detector.lag:
-        return None
-    return Panel(detector.blur, detector.lag, scanner.geometry.d_detector)
-
-
 def _fold(plan: Plan, phantom: Phantom) -> NDArray[np.float32] | None:
     """Relative density [told, material] of each material in the one it is told as; None where all are themselves."""
     if plan.told == plan.materials:
@@ -133,8 +121,11 @@ def scatter_of(plan: Plan, phantom: Phantom, scanner: Scanner) -> Scattered:
     return [scatter_series(each, source, scanner.geometry, tolerance=tolerance, stream=stream) for each in bodies]
 
 
-class _Simulator:
-    """One scan being simulated; holds what the views share."""
+class Simulator:
+    """One scan being simulated; holds what the views share.
+
+    `scatter` is that of `scatter_of` where it is known already, as of a body that scatters alike.
+    """
 
     def __init__(self, plan: Plan, phantom: Phantom, scanner: Scanner, scatter: Scattered | None = None) -> None:
         self.plan, self.scanner, self.geometry = plan, scanner, scanner.geometry
@@ -144,10 +135,10 @@ class _Simulator:
         self.tracer = Tracer.of(body, skip=plan.settings.skip, extra=self.beam.layer_material)
         self.bare = self.tracer.without_metal()
         self.response = Response.of(plan.rule, self.tracer.materials)
-        self.pattern = pixel_pattern(self.geometry.n_detector, noise=scanner.noise, scene_id=plan.stream_id)
         self.metal = np.array([any(s.metal and s.material == m for s in body.solids) for m in self.tracer.materials])
         self.names = {o.name for o in plan.outputs}
-        self.panel = _panel(scanner)
+        self.readout = Readout(scanner, plan.stream_id)
+        self.panel = self.readout.panel
         beam = self.beam
         opened = beam.open1, beam.open1 if beam.gain is None else beam.open1 * beam.gain
         self.opened, self.lit_open = opened if self.panel is None else map(self.panel.spread, opened)
@@ -166,15 +157,20 @@ class _Simulator:
         scan, twin, spans = self._signals(k)
         lit = self._lit(scan, k, 0)
         out = self._images(scan, lit)
-        out["counts"], drawn = self._counts(lit, k, 0)
+        out["counts"], drawn = self.readout.counts(lit, k, largest=self.largest[0])
         if twin is not None:
             lit = self._lit(twin, k, 1)
             images = self._images(twin, lit, TWIN)
             # scatter of its own makes every pixel of the twin another
             known = None if spans is None or self.scatter[1] else (drawn.copy(), spans)
-            images["counts"], _ = self._counts(lit, k, 1, known)
+            images["counts"], _ = self.readout.counts(lit, k, TWIN, largest=self.largest[1], known=known)
             out |= {f"{TWIN}{name}": image for name, image in images.items()}
         return out | self._paths(k)
+
+    def expected(self, k: int) -> list[Moments]:
+        """Return the noise-free moments of what reaches the detector in view k of the scan, and of its twin if any."""
+        signals = [moments for moments in self._signals(k)[:2] if moments is not None]
+        return [self._lit(moments, k, which) for which, moments in enumerate(signals)]
 
     def _signals(self, k: int) -> tuple[Moments, Moments | None, NDArray[np.int64] | None]:
         """Noise-free moments of the scan and of its twin, and the columns of each row in which these can differ."""
@@ -268,25 +264,6 @@ class _Simulator:
         """Return what the panel makes of the next image of a stack."""
         return image if self.panel is None else self.panel.see(name, image)
 
-    def _counts(
-        self, moments: Moments, k: int, which: int, known: tuple[NDArray, NDArray[np.int64]] | None = None
-    ) -> tuple[NDArray, NDArray]:
-        """Draw the counts of the scan (0) or its twin (1); return them, and what was drawn before the panel acted.
-
-        `known` = (drawn, spans) are to be drawn again in those columns only.
-        """
-        m1, m2 = moments
-        key, noise, i0 = stream_key(self.plan.stream_id, "view", k), self.scanner.noise, self.scanner.i0
-        if noise.model == "tigre":
-            counts = detect_tigre(m1, top=self.largest[which], noise=noise, i0=i0, key=key)
-            return counts, counts
-        if self.panel is None:
-            counts = detect(m1, m2, noise=noise, i0=i0, key=key, pattern=self.pattern, known=known)
-            return counts, counts
-        drawn = photons(m1, m2, noise=noise, i0=i0, key=key, known=known)
-        seen = self.panel.see(f"{TWIN if which else ''}counts", drawn)
-        return read_out(seen, noise=noise, i0=i0, key=key, pattern=self.pattern), drawn
-
     def _paths(self, k: int) -> dict[str, NDArray]:
         """Images made from path lengths along the central rays."""
         wanted = {"trace", "metal_path", "paths"} & self.names
@@ -321,7 +298,7 @@ def simulate_views(
     """
     if first_view == scanner.geometry.n_views:
         return  # a pass over all views, as TIGRE's noise takes, would be for nothing
-    simulator = _Simulator(plan, phantom, scanner, scatter)
+    simulator = Simulator(plan, phantom, scanner, scatter)
     for k in range(max(0, first_view - simulator.frames), first_view):
         simulator.view(k)  # light of earlier views comes in later ones
     for k in range(first_view, scanner.geometry.n_views):
@@ -333,7 +310,7 @@ def flat_image(plan: Plan, scanner: Scanner) -> Image:
     beam = _beam(plan, scanner)
     gain = 1.0 if beam.gain is None else beam.gain
     pattern = pixel_pattern(scanner.geometry.n_detector, noise=scanner.noise, scene_id=plan.stream_id)
-    panel = _panel(scanner)
+    panel = panel_of(scanner)
     return flat_field(
         (beam.open1 * np.float32(gain), beam.open2 * np.float32(gain)),
         noise=scanner.noise,

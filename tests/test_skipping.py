@@ -21,7 +21,7 @@ from ctsim.detector.panel import Blur, Lag
 from ctsim.detector.response import Detector
 from ctsim.phantoms.scene import build
 from ctsim.scatter import Scatter, open_fraction
-from ctsim.simulate import _Simulator
+from ctsim.simulate import Simulator
 from ctsim.tracer.bricks import MIXED
 from ctsim.tracer.project import Tracer, transmit
 
@@ -243,12 +243,12 @@ def test_an_effect_that_is_off_runs_none_of_its_code(tmp_path, monkeypatch, name
         raise RuntimeError("this was to be left out")
 
     monkeypatch.setattr("ctsim.simulate.scatter_series", never)
-    monkeypatch.setattr("ctsim.simulate.Panel", never)
+    monkeypatch.setattr("ctsim.readout.Panel", never)
     monkeypatch.setattr("ctsim.beam.spot.SubSources.geometry", never)
     if name in ("focal spot", "off-focal", "detector blur", "lag", "scatter 3", "anti-scatter grid"):
         with pytest.raises(RuntimeError, match="left out"):
             next(given.views())
-    simulator = _Simulator(scan.plan, scan.phantom, scan.scanner)
+    simulator = Simulator(scan.plan, scan.phantom, scan.scanner)
     assert scan.plan.spot is None and scan.plan.scatter_fraction == 0
     assert simulator.beam.gain is None and simulator.frames == 0
     assert image_difference(before, [images for _, images in scan.views()]) == 0
