@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from ctsim.phantoms.scene import Scene
 
-STUDY_SUITES = ("pareto", "stress", "tune-settings")
+STUDY_SUITES = ("detect", "pareto", "stress", "tune-settings")
 """Suites of studies; make-dataset does not take them."""
 
 
