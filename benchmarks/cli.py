@@ -33,6 +33,7 @@ OTHERS = {
     "report": Command("ctsim.reports.report", "write results as one HTML page with the slices of every volume"),
     "inspect": Command("ctsim.benchmarks.studies.inspect.study", "score a volume by other conventions of PSNR, SSIM"),
     "pareto": Command("ctsim.benchmarks.studies.pareto.study", "error against run time, simulator and methods"),
+    "detect": Command("ctsim.benchmarks.studies.detect.study", "detection of lesions near metal by a model observer"),
     "skipping": Command("ctsim.benchmarks.studies.skipping.study", "what ctsim leaves out: time saved, error made"),
     "validate": Command(
         "ctsim.benchmarks.studies.validate.study", "the physics against tables, closed forms, Monte Carlo"

@@ -6,9 +6,11 @@ bit.
 
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from ctsim.detector.noise import Noise
 from ctsim.plan import Plan
 from ctsim.readout import Readout
 from ctsim.simulate import Scattered, Simulator, flat_image
@@ -37,6 +39,11 @@ class Expectation:
         readout, (m1, m2) = Readout(self.scanner, stream_id), self.moments[twin]
         views = range(self.scanner.geometry.n_views)
         return np.stack([readout.counts((m1[k], m2[k]), k, largest=self.largest[twin])[0] for k in views])
+
+    def noise_free(self) -> "Expectation":
+        """Return the same signal for a detector without noise, which writes it in float32 photons, no pedestal."""
+        scanner = msgspec.structs.replace(self.scanner, noise=Noise(model="none"))
+        return replace(self, scanner=scanner)
 
     def flat(self, stream_id: str) -> NDArray[np.float32]:
         """Draw the open-field image in counts, float32 [v, u], from the streams named `stream_id`."""

@@ -86,18 +86,18 @@ def varying_background(found: Responses, draws: int = DRAWS) -> Area:
 def difference(one: Area, other: Area) -> tuple[float, float, float]:
     """Return one AUC minus another with its 95 % interval, of areas on the same scans.
 
-    The interval combines those of the two, which need not be symmetric, by the correlation of the draws (Zou and Donner
-    2008, doi:10.1002/sim.3095).
+    It is the value ± 1.96 standard deviations of the paired draws. Where one AUC is the same in all draws, as at 1, the
+    two intervals are combined instead (Zou and Donner 2008, doi:10.1002/sim.3095), which need not be symmetric.
     """
-    spread = one.draws.std() * other.draws.std()
-    r = float(np.mean((one.draws - one.draws.mean()) * (other.draws - other.draws.mean())) / spread) if spread else 0.0
-
-    def reach(a: float, b: float) -> float:
-        return math.sqrt(max(a * a - 2 * r * a * b + b * b, 0.0))
-
     value = one.auc - other.auc
-    down = reach(one.auc - one.low, other.high - other.auc)
-    return value, value - down, value + reach(one.high - one.auc, other.auc - other.low)
+    if one is other or (one.draws.std() > 0 and other.draws.std() > 0):
+        half = Z95 * float((one.draws - other.draws).std())
+        return value, value - half, value + half
+    down, up = (
+        math.hypot(one.auc - one.low, other.high - other.auc),
+        math.hypot(one.high - one.auc, other.auc - other.low),
+    )
+    return value, value - down, value + up
 
 
 def normal_theory(present: Array, absent: Array) -> tuple[float, float, float]:

@@ -15,12 +15,12 @@ from ctsim.benchmarks.scores.channels import Channels, channels
 from ctsim.benchmarks.studies.detect import DEFAULT, Flags
 from ctsim.benchmarks.studies.detect.records import Pair, Rows, Seen, Site
 from ctsim.benchmarks.studies.detect.suite import DetectScene, load
-from ctsim.benchmarks.studies.methods.attempt import attempt, warm_up
+from ctsim.benchmarks.studies.methods.attempt import Outcome, attempt, warm_up
 from ctsim.materials import attenuation
 from ctsim.phantoms.scene import stream_id
 from ctsim.plan import make_plan
 from ctsim.realisations import Expectation, expected
-from ctsim.simulate import truth_volumes
+from ctsim.tracer.voxelise import attenuation_volume, metal_mask
 from ctsim.types import Phantom, Scan, Scanner
 
 DIGITS = 9  # of a response in a record: responses to float32 volumes have seven
@@ -45,15 +45,27 @@ class Setup:
     def scan(self, method: Method, pair: int, *, lesion: bool) -> Scan:
         """Draw one scan of a pair; its noise is independent of all others and the same for all methods."""
         signal, stream = self.present if lesion else self.absent, self.stream(pair, lesion=lesion)
-        scanner = signal.scanner
+        counts = signal.counts(stream, twin=method.told_twin)
+        return self._scan(method, counts, signal.flat(stream), self.metal)
+
+    def anatomy(self, method: Method) -> Scan:
+        """Return the scan without metal, lesions and noise."""
+        silent = self.absent.noise_free()
+        counts, flat = silent.counts(self.stream_id, twin=True), silent.flat(self.stream_id)
+        return self._scan(method, counts, flat, torch.zeros_like(self.metal), silent.scanner)
+
+    def _scan(
+        self, method: Method, counts: NDArray, flat: NDArray, metal: torch.Tensor, scanner: Scanner | None = None
+    ) -> Scan:
+        scanner = scanner or self.absent.scanner
         return Scan(
             geometry=scanner.geometry,
-            counts=torch.from_numpy(signal.counts(stream, twin=method.told_twin)),
-            flat=torch.from_numpy(signal.flat(stream)),
+            counts=torch.from_numpy(counts),
+            flat=torch.from_numpy(flat),
             dark=scanner.noise.dark,
             i0=scanner.i0,
-            e_max=float(signal.plan.spectrum.e_max),
-            metal=self.metal.clone() if method.mask == "oracle" else None,
+            e_max=float(self.absent.plan.spectrum.e_max),
+            metal=metal.clone() if method.mask == "oracle" else None,
         )
 
     def stream(self, pair: int, *, lesion: bool) -> str:
@@ -90,32 +102,37 @@ def prepared(scene: DetectScene) -> Setup:
     streams = stream_id(scene.scan)
     plan = make_plan(present, scanner, scene.simulation, scene.scan.truth, streams)
     without = expected(plan, absent, scanner)
-    images = [dict(truth_volumes(plan, body, scanner)) for body in (present, absent)]
-    lesion = images[0]["reference_effective"].astype(np.float64) - images[1]["reference_effective"]
     energies, omega = effective_weights(plan.spectrum, scanner.detector, plan.l0)
-    water = float(attenuation("water", energies) @ omega)
+    contrast = (scene.density - 1) * float(attenuation(scene.tissue, energies) @ omega)
+    only = dict.fromkeys(present.materials, 0.0) | {scene.material: contrast}
+    image = attenuation_volume(present, scanner.geometry, only).reshape(-1).astype(np.float64)
     places = [place.at for place in scene.locations]
     balls, slices = (
         tuple(channels(scanner.geometry, at, scene.diameter, dimensions=n) for at in places) for n in (3, 2)
     )
-    lesions = tuple(lesion.reshape(-1)[ball.index] for ball in balls)
+    hounsfield = 1000 * contrast / float(attenuation("water", energies) @ omega)
     return Setup(
         stream_id=streams,
         present=expected(plan, present, scanner, without.scatter),
         absent=without,
-        metal=torch.from_numpy(images[1]["metal"] != 0),
-        sites=_sites(scene, absent, scanner, [float(t[np.abs(t).argmax()]) / water for t in lesions]),
+        metal=torch.from_numpy(metal_mask(absent, scanner.geometry) != 0),
+        sites=_sites(scene, absent, scanner, hounsfield),
         balls=balls,
         slices=slices,
-        lesions=lesions,
+        lesions=tuple(image[ball.index] for ball in balls),
     )
 
 
-def _sites(scene: DetectScene, body: Phantom, scanner: Scanner, contrasts: list[float]) -> tuple[Site, ...]:
-    distances = scene.distances(body, scanner.geometry)
+def _sites(scene: DetectScene, body: Phantom, scanner: Scanner, contrast: float) -> tuple[Site, ...]:
+    distances, contrasts = scene.distances(body, scanner.geometry), {"none": 0.0}
     return tuple(
-        Site(at=place.at, group=place.group, distance_mm=round(float(d), 2), contrast_hu=round(1000 * c, 1))
-        for place, d, c in zip(scene.locations, distances, contrasts, strict=True)
+        Site(
+            at=place.at,
+            group=place.group,
+            distance_mm=round(float(distance), 2),
+            contrast_hu=round(contrasts.get(place.group, contrast), 2),
+        )
+        for place, distance in zip(scene.locations, distances, strict=True)
     )
 
 
@@ -125,20 +142,39 @@ def methods(given: Flags) -> dict[str, Method]:
     return {method.label: method for method in chosen(given.method or DEFAULT, given.set)}
 
 
-_warm: dict[str, float] = {}
+_anatomies: dict[tuple[Flags, str, str], Seen] = {}
+
+
+def _anatomy(given: Flags, scene: str, label: str) -> Seen | Outcome:
+    """Return what is seen without metal, or how the method failed; the first call in a process compiles the method."""
+    if (key := (given, scene, label)) in _anatomies:
+        return _anatomies[key]
+    found, method = setup(given.suite, scene), methods(given)[label]
+    warm_up(method, found.scan(method, 0, lesion=True))
+    seen, _ = _seen(found, method, found.anatomy(method))
+    if isinstance(seen, Seen):
+        _anatomies[key] = seen
+    return seen
+
+
+def _seen(found: Setup, method: Method, scan: Scan) -> tuple[Seen | Outcome, float]:
+    """Return what is seen in the volume of a scan, or how the method failed, and the seconds that it took."""
+    outcome = attempt(method, scan, 0.0)
+    seconds = outcome.cost.wall if outcome.cost else 0.0
+    return outcome if outcome.status != OK or outcome.values is None else found.seen(outcome.values), seconds
 
 
 def measure(task: Task, given: Flags) -> list[Pair]:
     """Reconstruct one pair of scans by one method; a failure is an outcome."""
     found, method = setup(given.suite, task.part), methods(given)[task.subject]
-    if task.subject not in _warm:
-        _warm[task.subject] = warm_up(method, found.scan(method, 0, lesion=True))
-    seen, seconds = {}, {}
-    for name, lesion in (("present", True), ("absent", False)):
-        outcome = attempt(method, found.scan(method, task.settings["pair"], lesion=lesion), _warm[task.subject])
-        if outcome.status != OK or outcome.values is None:
-            reason = f"{name}: {outcome.reason}"
-            return [Pair(ok=False, status=outcome.status, reason=reason, inputs=method.inputs, sites=found.sites)]
-        assert outcome.cost is not None
-        seen[name], seconds[name] = found.seen(outcome.values), (round(outcome.cost.wall, 4),)
-    return [Pair(seconds=seconds, inputs=method.inputs, sites=found.sites, **seen)]
+    seen: dict[str, Seen | Outcome] = {"anatomy": _anatomy(given, task.part, task.subject)}
+    seconds = {}
+    for name in ("present", "absent"):
+        scan = found.scan(method, task.settings["pair"], lesion=name == "present")
+        seen[name], taken = _seen(found, method, scan)
+        seconds[name] = (round(taken, 4),)
+    for name, one in seen.items():
+        if isinstance(one, Outcome):
+            reason = f"{name}: {one.reason}"
+            return [Pair(ok=False, status=one.status, reason=reason, inputs=method.inputs, sites=found.sites)]
+    return [Pair(seconds=seconds, inputs=method.inputs, sites=found.sites, **seen)]  # pyright: ignore[reportArgumentType]  failures have returned

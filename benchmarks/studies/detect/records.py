@@ -30,9 +30,13 @@ class Seen(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class Pair(Found, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One pair of scans by one method. `seconds` has the times of both reconstructions."""
+    """One pair of scans by one method. `seconds` has the times of both reconstructions.
+
+    `anatomy` is seen in the method's volume of the scan without metal, lesions and noise.
+    """
 
     inputs: str = ""
     sites: tuple[Site, ...] = ()
+    anatomy: Seen | None = None
     present: Seen | None = None
     absent: Seen | None = None

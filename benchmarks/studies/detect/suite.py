@@ -81,17 +81,21 @@ class DetectScene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         """A hash of all keys."""
         return hashlib.sha256(msgspec.json.encode(self)).hexdigest()[:16]
 
+    @property
+    def material(self) -> str:
+        """The material of the lesions."""
+        return at_density(self.tissue, self.density)
+
     def bodies(self) -> tuple[Phantom, Phantom]:
         """Return the body with and without lesions, of the same materials. Raises InputError as `check` does."""
         body = scenes.build(self.scan)
         self.check(body)
-        material = at_density(self.tissue, self.density)
         lesions = tuple(
-            Solid(name=f"lesion{k}", material=material, primitives=(ball(place.at, self.diameter),))
+            Solid(name=f"lesion{k}", material=self.material, primitives=(ball(place.at, self.diameter),))
             for k, place in enumerate(self.locations)
             if place.group != "none"
         )
-        absent = dataclasses.replace(body, materials=(*body.materials, material))
+        absent = dataclasses.replace(body, materials=(*body.materials, self.material))
         return dataclasses.replace(absent, solids=(*absent.solids, *lesions)), absent
 
     def check(self, body: Phantom) -> None:
