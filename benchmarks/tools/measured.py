@@ -3,7 +3,7 @@
     python -m ctsim.benchmarks.tools.measured PAGE RESULTS docs/measured
     python -m ctsim.benchmarks.tools.measured freshness [docs/measured]
 
-The first writes a page: PAGE is skipping, stability, speed, pareto, validation or ablation. The study's own table in
+The first writes a page: PAGE is detect, skipping, stability, speed, pareto, validation or ablation. The study's own table in
 RESULTS, which names commit and machine, becomes the page, under a title and the command that measures it.
 `run-benchmark report RESULTS --markdown docs/measured/results.md` writes the page of the results.
 
@@ -78,6 +78,11 @@ PAGES: dict[str, Page] = {
     "ablation": _of(
         "ablation", "Ablations of the published splat method", "splats.md",
         *SIMULATOR, "reconstruct/splat/", f"{STUDIES}ablation.py", f"{SUITES}ablation.toml", words="data/ results/",
+    ),
+    "detect": _of(
+        "detect", "Detection of lesions near metal", "protocols.md",
+        *METHODS, "benchmarks/scores/channels.py", "benchmarks/scores/observer.py", f"{STUDIES}detect/",
+        f"{SUITES}detect.toml",
     ),
     "skipping": _of(
         "skipping", "What is left out", "skipping.md",
