@@ -133,8 +133,10 @@ def test_channels_lie_around_their_location():
         found = channels(geometry, at, diameter, dimensions=dimensions)
         k, j, i = np.unravel_index(found.index, geometry.n_voxel)
         assert np.hypot(x[i] - at[0], y[j] - at[1]).max() <= REACH * diameter
-        assert (np.abs(z[k] - at[2]).max() <= 0.5) if dimensions == 2 else (len(np.unique(k)) == 7)
+        assert (np.abs(z[k] - at[2]).max() <= 0.5) if dimensions == 2 else (len(np.unique(k)) == 6)
         assert np.linalg.norm(found.weights, axis=1) == pytest.approx(np.ones(N_CHANNELS))
         volume = np.zeros(geometry.n_voxel, np.float32)
         volume[k[5], j[5], i[5]] = 2.0
         assert found.of(volume) == pytest.approx(2 * found.weights[:, 5])
+        less = channels(geometry, at, diameter, seen=volume == 0, dimensions=dimensions)
+        assert set(found.index) - set(less.index) == {found.index[5]} and not any(less.of(volume))

@@ -16,7 +16,7 @@ from ctsim.geometry import Geometry, Triple
 N_CHANNELS = 5
 WIDTH = 1.0
 """a, in diameters of the lesion."""
-REACH = 1.25
+REACH = 1.0
 """Radius of the region of interest, in diameters of the lesion."""
 
 
@@ -38,15 +38,18 @@ def laguerre_gauss(r: NDArray[np.float64], width: float, dimensions: int) -> NDA
     return np.stack([np.exp(-x / 2) * eval_genlaguerre(j, dimensions / 2 - 1, x) for j in range(N_CHANNELS)])
 
 
-def channels(geometry: Geometry, at: Triple, diameter: float, *, dimensions: int = 3) -> Channels:
+def channels(
+    geometry: Geometry, at: Triple, diameter: float, *, seen: NDArray[np.bool_] | None = None, dimensions: int = 3
+) -> Channels:
     """Return the channels around a location (x, y, z) in mm for a lesion of `diameter` mm.
 
-    With 3 `dimensions` they fill a ball, with 2 a disc in the axial slice nearest to the location.
+    With 3 `dimensions` they fill a ball, with 2 a disc in the axial slice nearest to the location. The voxels that are
+    not `seen` [z, y, x] are left out.
     """
     z, y, x = (c - p for c, p in zip(geometry.voxel_centres(), reversed(at), strict=True))
     if dimensions == 2:
         z = np.where(np.arange(len(z)) == np.argmin(np.abs(z)), 0.0, np.inf)
     r = np.sqrt(z[:, None, None] ** 2 + y[:, None] ** 2 + x**2).reshape(-1)
-    index = np.flatnonzero(r <= REACH * diameter)
+    index = np.flatnonzero((r <= REACH * diameter) & (True if seen is None else seen.reshape(-1)))
     weights = laguerre_gauss(r[index], WIDTH * diameter, dimensions)
     return Channels(index, weights / np.linalg.norm(weights, axis=1, keepdims=True))

@@ -3,8 +3,8 @@
     python -m ctsim.benchmarks.tools.measured PAGE RESULTS docs/measured
     python -m ctsim.benchmarks.tools.measured freshness [docs/measured]
 
-The first writes a page: PAGE is detect, skipping, stability, speed, pareto, validation or ablation. The study's own table in
-RESULTS, which names commit and machine, becomes the page, under a title and the command that measures it.
+The first writes a page: PAGE is detect, skipping, stability, speed, pareto, validation or ablation. The study's own
+table in RESULTS, which names commit and machine, becomes the page, under a title and the command that measures it.
 `run-benchmark report RESULTS --markdown docs/measured/results.md` writes the page of the results.
 
 The second lists, for every page, how many of its sources have changed between the oldest commit that the page names

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ctsim.baselines.morphology import dilate
 from ctsim.beam.quadrature import effective_weights
 from ctsim.benchmarks.engine.record import OK, Task
 from ctsim.benchmarks.methods import Method, chosen
@@ -107,15 +108,17 @@ def prepared(scene: DetectScene) -> Setup:
     only = dict.fromkeys(present.materials, 0.0) | {scene.material: contrast}
     image = attenuation_volume(present, scanner.geometry, only).reshape(-1).astype(np.float64)
     places = [place.at for place in scene.locations]
+    metal = metal_mask(absent, scanner.geometry) != 0
+    seen = ~dilate(metal, 1, corners=True)
     balls, slices = (
-        tuple(channels(scanner.geometry, at, scene.diameter, dimensions=n) for at in places) for n in (3, 2)
+        tuple(channels(scanner.geometry, at, scene.diameter, seen=seen, dimensions=n) for at in places) for n in (3, 2)
     )
     hounsfield = 1000 * contrast / float(attenuation("water", energies) @ omega)
     return Setup(
         stream_id=streams,
         present=expected(plan, present, scanner, without.scatter),
         absent=without,
-        metal=torch.from_numpy(metal_mask(absent, scanner.geometry) != 0),
+        metal=torch.from_numpy(metal),
         sites=_sites(scene, absent, scanner, hounsfield),
         balls=balls,
         slices=slices,

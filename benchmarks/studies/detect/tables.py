@@ -27,13 +27,14 @@ from ctsim.benchmarks.studies.detect.suite import Group
 BASE = "fdk"
 Observer = Callable[[Responses], Area]
 TEXT = (
-    f"A channelised Hotelling observer with {N_CHANNELS} Laguerre–Gauss channels in a ball around each location; it is "
-    f"trained and tested on different scans ({FOLDS} folds). AUC is the share of pairs of volumes, one with and one "
-    "without a lesion, that it puts in the right order: 0.5 is guessing. With artefacts known it is trained at the "
-    "location itself, so that only noise hides a lesion. With artefacts varying it is trained at the other locations, "
-    "knows the anatomy from the method's volume without metal, and what is left of artefacts hides a lesion, too. In "
-    "brackets are 95 % intervals over scans, for these bodies and locations; Δ is the difference from fdk on the same "
-    "scans. Recovered is the lesion's mean contrast over the true one. limar and nmar are told the true metal."
+    f"A channelised Hotelling observer with {N_CHANNELS} Laguerre–Gauss channels in a ball around each location, "
+    f"without metal and its neighbouring voxels, is trained and tested on different scans ({FOLDS} folds). AUC is "
+    "the share of pairs of volumes, one with and one without a lesion, that it puts in the right order: 0.5 is "
+    "guessing. With artefacts known it is trained at the location itself, so that only noise hides a lesion. With "
+    "artefacts varying it is trained at the other locations and knows the anatomy from the method's volume "
+    "without metal: what is left of artefacts hides a lesion, too. In brackets are 95 % intervals over scans, for "
+    "these bodies and locations; Δ is the difference from fdk on the same scans. Recovered is the lesion's mean "
+    "contrast over the true one. limar and nmar are told the true metal."
 )
 
 
