@@ -116,9 +116,9 @@ def test_finished_scenes_are_skipped(made, suite, tmp_path, capsys):
 def test_an_interrupted_run_goes_on_to_the_same_bytes(made, suite, tmp_path, monkeypatch, capsys, stop):
     real, first = dataset.simulate_views, []
 
-    def interrupted(plan, phantom, scanner, first_view=0):
+    def interrupted(plan, phantom, scanner, first_view=0, **more):
         first.append(first_view)
-        for view, arrays in real(plan, phantom, scanner, first_view=first_view):
+        for view, arrays in real(plan, phantom, scanner, first_view=first_view, **more):
             if view == stop and len(first) == 1:
                 raise KeyboardInterrupt
             yield view, arrays
