@@ -106,8 +106,8 @@ def test_a_volume_with_the_true_lesions_holds_all_of_them(setup):
     assert not any(seen.ball[3]) and abs(seen.ball[0][0]) > 0
     # muscle attenuates as 1.05 times as much water, to some percent: 0.3 of it is 315 HU
     assert all(site.contrast_hu == pytest.approx(315, rel=0.05) for site in setup.sites[:3])
-    # the lesion far from metal, where no voxel is left out: its mass is volume times contrast. Shares are painted to
-    # 1/250 of a voxel's side, of which the radius has half a one here; muscle at 60 keV: 0.0208/mm, at others to 8 %
+    # the lesion far from metal, where no voxel is left out: its mass is volume times contrast
+    # the radius is half a voxel, of which painted shares err by 1/250; muscle has 0.0208/mm at 60 keV, else within 8 %
     mass = float(setup.lesions[2].sum()) * setup.present.scanner.geometry.d_voxel[0] ** 3
     assert mass == pytest.approx(4 / 3 * np.pi * 4.0**3 * 0.3 * 0.0208, rel=0.1)
 
