@@ -25,6 +25,7 @@ from ctsim.benchmarks.studies.detect.records import Pair, Seen, Site
 from ctsim.benchmarks.studies.detect.suite import Group
 
 BASE = "fdk"
+WORDS = {"near": "near", "far": "far from"}
 Observer = Callable[[Responses], Area]
 TEXT = (
     f"A channelised Hotelling observer with {N_CHANNELS} Laguerre–Gauss channels in a ball around each location, "
@@ -198,7 +199,7 @@ def _scenes(listed: Sequence[Series]) -> list[str]:
             members = [site for site in sites if site.group == group]
             if members:
                 low, high = (f(site.distance_mm for site in members) for f in (min, max))
-                parts.append(f"{len(members)} {group} metal ({low:.1f} to {high:.1f} mm from it)")
+                parts.append(f"{len(members)} {WORDS[group]} metal ({low:.1f} to {high:.1f} mm from it)")
         contrast = next((site.contrast_hu for site in sites if site.group != "none"), 0.0)
         few = f", fewer than the {PAIRS} of the protocol" if min(counts) < PAIRS else ""
         pairs = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
