@@ -1,5 +1,6 @@
 """What a plan says of a scene before it is simulated, against what simulating it takes."""
 
+import dataclasses
 import tracemalloc
 
 import msgspec
@@ -44,10 +45,15 @@ def test_the_edge_error_is_found_where_inserts_are_and_falls_with_sub_rays():
 
 
 @pytest.mark.slow
-def test_the_memory_that_a_plan_names_is_what_simulating_takes():
+@pytest.mark.parametrize("dense", [False, True])
+def test_the_memory_that_a_plan_names_is_what_simulating_takes(dense):
     tracemalloc.start()
     try:
         parts = scene(160)
+        if dense:  # every voxel has a density of its own, and materials mix
+            labels = np.random.default_rng(0).integers(1, len(parts[0].materials), (160,) * 3).astype(np.uint8)
+            density = np.random.default_rng(1).random(labels.shape, np.float32)
+            parts = (dataclasses.replace(parts[0], labels=labels, density=density), parts[1])
         tracemalloc.reset_peak()
         made = plan(parts)
         for _ in simulate_views(made, *parts):

@@ -37,13 +37,14 @@ def _most(builder, a, b):
 
 
 def _meet(builder, base, near, far, size, slope, inverse):
-    """Return the uppermost voxel of each ray, counted from PAD − 1 below the run, and the λ that it spends below it."""
-    zero, one = _same(_FLOAT, 0.0), _same(_FLOAT, 1.0)
+    """Return the uppermost voxel of each ray, counted from the one below the run, and the λ that it spends below it.
+
+    Heights `base` + λ·slope count from the lower face of the voxel below the run, and voxels end at `size`.
+    """
+    zero = _same(_FLOAT, 0.0)
     a, b = (builder.fadd(base, builder.fmul(at, slope)) for at in (near, far))
-    top = builder.fadd(_most(builder, a, b), one)
-    cell = builder.fptosi(_least(builder, _most(builder, top, zero), size), _vector(_INT))
-    plane = builder.fsub(builder.sitofp(cell, _vector(_FLOAT)), one)
-    climb = _most(builder, builder.fsub(plane, _least(builder, a, b)), zero)
+    cell = builder.fptosi(_least(builder, _most(builder, _most(builder, a, b), zero), size), _vector(_INT))
+    climb = _most(builder, builder.fsub(builder.sitofp(cell, _vector(_FLOAT)), _least(builder, a, b)), zero)
     return cell, _least(builder, builder.fmul(climb, inverse), builder.fsub(far, near))
 
 
@@ -84,7 +85,8 @@ def add_rows(typingctx, total, material, slope, inverse, v, values, place, size,
             value.align = 8
             return value
 
-        base, near, far = (_spread(builder, number) for number in args[8:])
+        bottom = builder.fadd(args[8], ir.Constant(_FLOAT, 1.0))
+        base, near, far = (_spread(builder, number) for number in (bottom, *args[9:]))
         largest = builder.sitofp(builder.add(args[7], ir.Constant(_LONG, PAD)), _FLOAT)
         rays = load(address(2, args[4])), load(address(3, args[4]))
         cell, below = _meet(builder, base, near, far, _spread(builder, largest), *rays)
