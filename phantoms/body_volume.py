@@ -1,20 +1,20 @@
 """A CT volume from a file as a body: grey values become tissue and its density, metal is put into it."""
 
-import hashlib
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ctsim.dataset.arrayfile import MOST, read_array
+from ctsim.dataset.arrayfile import MOST
 from ctsim.errors import InputError
 from ctsim.geometry import Triple
 from ctsim.materials import attenuation
 from ctsim.phantoms.bodies import REACH, Millimetres, Recipe, Shape, assemble, half_box
+from ctsim.phantoms.ct_file import Ct, digest_of, read_hu, settle, without_metal
 from ctsim.phantoms.inserts import count, diameter, inserts
 from ctsim.solids import Solid
 from ctsim.types import Phantom
@@ -33,18 +33,22 @@ class CtVolume(Recipe, frozen=True, kw_only=True, tag="ct_volume"):
     """
 
     path: str
-    """A TIFF stack or .npy array [z, y, x], z upwards."""
-    spacing: tuple[Millimetres, Millimetres, Millimetres]
-    """Size of its voxels (z, y, x) in mm."""
+    """A folder of DICOM slices, or a file: NIfTI, MetaImage, NRRD, a TIFF stack or .npy array [z, y, x], z upwards."""
+    spacing: tuple[Millimetres, Millimetres, Millimetres] | None = None
+    """Size of its voxels (z, y, x) in mm; by default the file's. Needed for TIFF and .npy."""
     metal: str = "Ti"
-    rescale: tuple[float, float] = (1.0, 0.0)
-    """Slope and intercept: a value v is v·slope + intercept HU."""
+    rescale: tuple[float, float] | None = None
+    """Slope and intercept: a value v is v·slope + intercept HU. By default the file's, or 1 and 0."""
     kev: float = 70.0
     """The energy at which every voxel has the attenuation of its HU."""
     at: tuple[Triple, ...] = ()
     """Centres of the inserts (x, y, z) in mm from the middle; without, places in bone are drawn."""
     sha256: str = ""
     """The file's SHA-256, filled in where it is empty; another file is refused."""
+    existing_metal: Literal["refuse", "mask"] = "refuse"
+    """What becomes of metal in the CT itself: the CT is refused, or tissue near the metal takes its place."""
+    metal_hu: float = 3000.0
+    """A voxel above this many HU is metal of the CT; 1000 to 100000."""
 
     def __post_init__(self) -> None:
         """Check the ranges; take the file's hash, so that the recipe says what is scanned."""
@@ -52,15 +56,24 @@ class CtVolume(Recipe, frozen=True, kw_only=True, tag="ct_volume"):
         self.within("kev", 20, 200)
         if self.texture:
             raise InputError("texture: expected none, for a CT volume has a density of its own in every voxel")
-        if not np.isfinite(self.rescale).all() or self.rescale[0] <= 0:
+        self.within("metal_hu", 1000, 100_000)
+        if self.existing_metal not in ("refuse", "mask"):
+            raise InputError(f'existing_metal must be "refuse" or "mask", got {self.existing_metal!r}')
+        if self.rescale is not None and not (np.isfinite(self.rescale).all() and self.rescale[0] > 0):
             raise InputError(f"rescale must be a positive slope and an intercept in HU, got {self.rescale}")
         if self.at and self.n_inserts not in (None, len(self.at)):
             raise InputError(f"n_inserts is {self.n_inserts}, but at has {len(self.at)} places; give one of them")
         if not np.isfinite(self.at).all():
             raise InputError(f"at must be finite places in mm, got {self.at}")
-        if not self.sha256:
-            msgspec.structs.force_setattr(self, "sha256", _digest(self.path))
-            msgspec.structs.force_setattr(self, "path", str(Path(self.path).resolve()))
+        if not self.sha256 or self.spacing is None or self.rescale is None:
+            self._settle()
+
+    def _settle(self) -> None:
+        """Fill in what the file says, so that a scene says it, too."""
+        settled = settle(self.path, self.spacing, self.rescale)
+        said = {"spacing": settled.spacing, "rescale": settled.rescale, "path": str(Path(self.path).resolve())}
+        for key, value in (said | {"sha256": self.sha256 or digest_of(settled.file)}).items():
+            msgspec.structs.force_setattr(self, key, value)
 
 
 def ct_volume(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: CtVolume) -> Phantom:
@@ -68,9 +81,9 @@ def ct_volume(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: CtVol
 
     Raises InputError for a file that cannot be read, is none of a volume, or is not the recipe's.
     """
-    hu = _read(params)
-    labels, density = _tissues(_resampled(hu, params, n, d_voxel), params.kev)
-    phantom = assemble(labels, d_voxel, TISSUES, _inserts(hu, params, half_box(n, d_voxel), rng), params.grid_shift)
+    ct = _read(params)
+    labels, density = _tissues(_resampled(ct, params, n, d_voxel), params.kev)
+    phantom = assemble(labels, d_voxel, TISSUES, _inserts(ct, params, half_box(n, d_voxel), rng), params.grid_shift)
     return Phantom(
         labels=phantom.labels,
         materials=phantom.materials,
@@ -81,41 +94,32 @@ def ct_volume(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: CtVol
     )
 
 
-def _digest(path: str) -> str:
-    try:
-        with Path(path).open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(f"path: {path} cannot be read ({error.strerror}); expected a TIFF stack or a .npy") from None
-
-
-def _read(params: CtVolume) -> NDArray[np.float32]:
-    """Return the file's volume in HU."""
-    if (found := _digest(params.path)) != params.sha256:
+def _read(params: CtVolume) -> Ct:
+    """Return the file's volume in HU, its metal replaced. Raises InputError where it has some that is to be refused."""
+    settled = settle(params.path, params.spacing, params.rescale)
+    if (found := digest_of(settled.file)) != params.sha256:
         raise InputError(f"path: {params.path} has the SHA-256 {found}, the scene was made of {params.sha256}")
-    try:
-        values = read_array(Path(params.path))
-    except InputError as error:
-        raise InputError(f"path: {error}") from None
-    slope, intercept = params.rescale
-    with np.errstate(over="ignore", invalid="ignore"):
-        hu = values.astype(np.float32) * np.float32(slope) + np.float32(intercept)
-    if not np.isfinite(hu).all():
-        raise InputError(f"path: {params.path} holds values that are no finite HU under rescale = {params.rescale}")
-    return hu
+    ct = Ct(hu=read_hu(settled), spacing=settled.spacing)
+    if params.existing_metal == "mask":
+        return without_metal(ct, params.metal_hu)
+    if number := int(np.count_nonzero(ct.hu > params.metal_hu)):
+        raise InputError(
+            f"path: {params.path} holds metal, {number} voxels above metal_hu = {params.metal_hu:g} HU (up to "
+            f'{ct.hu.max():.0f}); expected a CT without, existing_metal = "mask", or a higher metal_hu'
+        )
+    return ct
 
 
-def _resampled(hu: NDArray[np.float32], params: CtVolume, n: Shape, d_voxel: Triple) -> NDArray[np.float32]:
+def _resampled(ct: Ct, params: CtVolume, n: Shape, d_voxel: Triple) -> NDArray[np.float32]:
     """Return mean HU over the voxels of the label grid, middle on middle; −1000 outside the volume.
 
     HU are interpolated at as many places in a voxel as it takes that none of the file's is passed over.
     """
-    times = np.ceil(np.divide(d_voxel, params.spacing) - 1e-9).astype(int)
+    hu, spacing = ct.hu, ct.spacing
+    times = np.ceil(np.divide(d_voxel, spacing) - 1e-9).astype(int)
     if math.prod(int(a * b) for a, b in zip(n, times, strict=True)) > MOST:
-        raise InputError(
-            f"spacing: {params.spacing} mm makes more than {MOST} places of the object's cube; expected less"
-        )
-    fine, step = np.multiply(n, times), np.divide(d_voxel, params.spacing) / times
+        raise InputError(f"spacing: {spacing} mm makes more than {MOST} places of the object's cube; expected less")
+    fine, step = np.multiply(n, times), np.divide(d_voxel, spacing) / times
     first: Any = (0.5 - fine / 2 + np.multiply(params.grid_shift, times)) * step + np.divide(hu.shape, 2) - 0.5
     out = np.empty(fine, np.float32)
     ndimage.affine_transform(hu, step, first, output=out, order=1, mode="nearest")
@@ -135,13 +139,13 @@ def _tissues(hu: NDArray[np.float32], kev: float) -> tuple[NDArray[np.uint8], ND
     return labels, np.where(labels, density, np.float32(1))
 
 
-def _inserts(hu: NDArray[np.float32], params: CtVolume, unit: float, rng: np.random.Generator) -> list[Solid]:
+def _inserts(ct: Ct, params: CtVolume, unit: float, rng: np.random.Generator) -> list[Solid]:
     """Return capsules of random direction at the places that are given, or at random ones."""
     if not (n := count(params, len(params.at) or 2)):
         return []
     make, d = inserts(params, unit), diameter(params, min(WIDEST, WIDEST * 30 / unit), unit)
     limit = REACH * unit - LENGTH / 2 * d
-    places = np.array(params.at) if params.at else _drawn(hu, params, limit, rng, n)
+    places = np.array(params.at) if params.at else _drawn(ct, params, limit, rng, n)
     if np.hypot(*places[:, :2].T).max() > limit or np.abs(places[:, 2]).max() > limit:
         raise InputError(
             f"at: inserts {LENGTH * d:.3g} mm long must be centred within {limit:.4g} mm of the axis and of the middle"
@@ -152,15 +156,13 @@ def _inserts(hu: NDArray[np.float32], params: CtVolume, unit: float, rng: np.ran
     return [make.rod(f"insert{k}", *both, d, round_ends=True) for k, both in enumerate(ends)]
 
 
-def _drawn(
-    hu: NDArray[np.float32], params: CtVolume, limit: float, rng: np.random.Generator, n: int
-) -> NDArray[np.float64]:
+def _drawn(ct: Ct, params: CtVolume, limit: float, rng: np.random.Generator, n: int) -> NDArray[np.float64]:
     """Draw n places (x, y, z) in mm from the file's own voxels, independent of the label grid: bone, or else tissue."""
-    z, y, x = ((np.arange(k) + 0.5 - k / 2) * d for k, d in zip(hu.shape, params.spacing, strict=True))
+    z, y, x = ((np.arange(k) + 0.5 - k / 2) * d for k, d in zip(ct.hu.shape, ct.spacing, strict=True))
     near = (np.abs(z)[:, None, None] <= limit) & (np.hypot(y[:, None], x) <= limit)
     for least in (FROM_HU[-1], FROM_HU[0]):
-        if (found := np.flatnonzero((hu >= least) & near)).size:
-            k, j, i = np.unravel_index(rng.choice(found, n, replace=n > found.size), hu.shape)
+        if (found := np.flatnonzero((ct.hu >= least) & near)).size:
+            k, j, i = np.unravel_index(rng.choice(found, n, replace=n > found.size), ct.hu.shape)
             return np.stack([x[i], y[j], z[k]], 1)
     raise InputError(
         f"path: {params.path} has no voxel above {FROM_HU[0]:g} HU within {limit:.4g} mm; is rescale right?"

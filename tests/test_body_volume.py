@@ -4,7 +4,6 @@ import hashlib
 import re
 import shutil
 
-import msgspec
 import numpy as np
 import pytest
 import tifffile
@@ -167,9 +166,8 @@ def test_what_makes_no_sense_is_one_sentence(head, tmp_path, changes, words):
 )
 def test_a_file_of_something_else_is_refused(tmp_path, data, words):
     np.save(tmp_path / "head.npy", data)
-    given = CtVolume(path=str(tmp_path / "head.npy"), spacing=SPACING)
     with pytest.raises(InputError, match=re.escape(words)):
-        build_recipe(given, 0)
+        build_recipe(CtVolume(path=str(tmp_path / "head.npy"), spacing=SPACING), 0)
     (tmp_path / "head.npy").write_bytes(b"no array")
     with pytest.raises(InputError, match=r"head\.npy is no TIFF stack or \.npy array"):
-        build_recipe(msgspec.structs.replace(given, sha256=""), 0)
+        CtVolume(path=str(tmp_path / "head.npy"), spacing=SPACING)

@@ -3,8 +3,11 @@
 A compressed file of a megabyte can hold a gigabyte of zeros, and a header can declare more than any memory holds.
 """
 
+import contextlib
 import math
+import warnings
 import zipfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -16,6 +19,7 @@ from ctsim.human import human_bytes
 
 MOST = 2**31  # values: a volume of 1290³, 8.6 GB as float32
 PLAIN, TIMES = 2**28, 100  # bytes, and times the file's own: no CT beyond both decodes to so much
+LONGEST = 200  # characters of what a decoder says
 
 
 def read_array(path: Path, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
@@ -24,37 +28,88 @@ def read_array(path: Path, shape: tuple[int, ...] | None = None) -> NDArray[Any]
     Raises InputError, a sentence that begins with the path: for a file that is neither, does not hold one array of
     numbers of that shape, three-dimensional where none is said, or would decode to more than is plausible.
     """
-    try:
+    with decoding(path, "TIFF stack or .npy array"):
         return _npy(path, shape) if path.suffix == ".npy" else _tiff(path, shape)
+
+
+def describe_array(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
+    """Return shape and type of the volume in a TIFF stack or .npy array, decoding nothing; raises as `read_array`."""
+    with decoding(path, "TIFF stack or .npy array"):
+        if path.suffix == ".npy":
+            (nz, ny, nx), dtype = _checked_npy(path, None)
+        else:
+            with _opened_tiff(path) as file:
+                (nz, ny, nx), dtype = _checked_series(path, file.series[0], None)
+    return (nz, ny, nx), dtype
+
+
+@contextlib.contextmanager
+def decoding(path: Path, kind: str) -> Iterator[None]:
+    """Turn whatever a decoder raises for a file that is not its kind into an InputError that begins with the path."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # decoders warn of what they then raise for
+            yield
     except (InputError, MemoryError):
         raise
-    except Exception as error:  # decoders raise anything for a file that is not theirs
+    except Exception as error:
         said = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path} is no TIFF stack or .npy array: {said}") from None
+        if isinstance(error, OSError) and error.strerror:
+            raise InputError(f"{path} cannot be read ({error.strerror}); expected a {kind}") from None
+        raise InputError(f"{path} is no {kind}: {said[:LONGEST]}") from None
+
+
+def check_size(path: Path, size: int, own: int) -> None:
+    """Refuse a file of `own` bytes that would decode to `size` bytes, more than a CT does."""
+    if size > max(PLAIN, TIMES * own):
+        raise InputError(
+            f"{path} has {human_bytes(own)} and would decode to {human_bytes(size)}, as no CT does; "
+            "expected a file that is not compressed, if this is meant"
+        )
+
+
+def check_volume(path: Path, shape: Sequence[int], dtype: Any) -> None:
+    """Refuse what is no array of numbers [z, y, x], or has more values than are read."""
+    if len(shape) != 3 or min(shape) < 1 or np.dtype(dtype).kind not in "iuf":
+        raise InputError(f"{path} holds {dtype} of shape {tuple(shape)}, expected one array of numbers [z, y, x]")
+    if math.prod(shape) > MOST:
+        raise InputError(f"{path} declares {math.prod(shape)} values of shape {tuple(shape)}, expected at most {MOST}")
 
 
 def _tiff(path: Path, shape: tuple[int, ...] | None) -> NDArray[Any]:
-    import tifffile
-
-    with tifffile.TiffFile(path) as file:
+    with _opened_tiff(path) as file:
         series = file.series[0]
-        _check(path, series.shape, series.dtype, shape)
-        size, own = math.prod(series.shape) * np.dtype(series.dtype).itemsize, path.stat().st_size
-        if shape is None and size > max(PLAIN, TIMES * own):
-            raise InputError(
-                f"{path} has {human_bytes(own)} and would decode to {human_bytes(size)}, as no CT does; "
-                "expected a file that is not compressed, if this is meant"
-            )
+        _checked_series(path, series, shape)
         return np.asarray(series.asarray())
 
 
+def _opened_tiff(path: Path) -> Any:
+    """Open a TIFF file as itself alone: some flavours name other files, which tifffile would open wherever they lie."""
+    import tifffile
+
+    return tifffile.TiffFile(path, is_ome=False, is_mmstack=False, is_ndtiff=False)
+
+
+def _checked_series(path: Path, series: Any, shape: tuple[int, ...] | None) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    found, dtype = tuple(series.shape), np.dtype(series.dtype)
+    _check(path, found, dtype, shape)
+    if shape is None:
+        check_size(path, math.prod(found) * dtype.itemsize, path.stat().st_size)
+    return found, dtype
+
+
 def _npy(path: Path, shape: tuple[int, ...] | None) -> NDArray[Any]:
+    _checked_npy(path, shape)
+    return np.load(path, allow_pickle=False)
+
+
+def _checked_npy(path: Path, shape: tuple[int, ...] | None) -> tuple[tuple[int, ...], np.dtype[Any]]:
     with path.open("rb") as file:
         found, _, dtype = _header(file)
         _check(path, found, dtype, shape)
         if math.prod(found) * dtype.itemsize > path.stat().st_size - file.tell():
             raise InputError(f"{path} ends before its array of shape {found} does")
-    return np.load(path, allow_pickle=False)
+    return found, dtype
 
 
 def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
@@ -95,7 +150,5 @@ def _check(path: Path, found: tuple[int, ...], dtype: Any, shape: tuple[int, ...
     """Refuse an array that is not what was asked for, or more than is read."""
     if shape is not None and found != shape:
         raise InputError(f"{path} holds {dtype} of shape {found}, expected {shape}")
-    if shape is None and (len(found) != 3 or not math.prod(found) or np.dtype(dtype).kind not in "iuf"):
-        raise InputError(f"{path} holds {dtype} of shape {found}, expected one array of numbers [z, y, x]")
-    if math.prod(found) > MOST:
-        raise InputError(f"{path} declares {math.prod(found)} values of shape {found}, expected at most {MOST}")
+    if shape is None:
+        check_volume(path, found, dtype)

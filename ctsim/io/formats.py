@@ -1,0 +1,63 @@
+"""The table of formats: who reads and who writes each of them. Their modules are imported when they are needed."""
+
+import dataclasses
+import importlib
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
+
+from ctsim.dataset.arrayfile import decoding
+from ctsim.errors import InputError
+from ctsim.io.volumefile import VolumeFile
+
+
+class Format(NamedTuple):
+    """A format: its name in sentences, the ends of its files' names, and the module with `open_volume`."""
+
+    kind: str
+    suffixes: tuple[str, ...]
+    module: str
+
+
+DICOM = Format("folder of DICOM slices", (".dcm", ".ima"), "ctsim.io.dicom")
+PLAIN = Format("TIFF stack or .npy array", (".tif", ".tiff", ".npy"), "ctsim.io.plain")
+FORMATS = (
+    DICOM,
+    Format("NIfTI file", (".nii", ".nii.gz"), "ctsim.io.nifti"),
+    Format("MetaImage", (".mha", ".mhd"), "ctsim.io.metaimage"),
+    Format("NRRD file", (".nrrd", ".nhdr"), "ctsim.io.nrrd"),
+    PLAIN,
+)
+WRITERS = {"nifti": "ctsim.io.nifti", "mha": "ctsim.io.metaimage", "dicom": "ctsim.io.dicomwrite"}
+"""Modules with `write_volume` by the name of the format."""
+ENDS = {"nifti": (".nii", ".nii.gz"), "mha": (".mha",), "dicom": ("",)}
+"""How the name of a written file ends; DICOM is a folder."""
+
+
+def open_volume(path: Path) -> VolumeFile:
+    """Read the headers of a CT volume; a folder is one of DICOM slices, a name of no known end is taken for TIFF.
+
+    Raises InputError, a sentence that begins with the path, for what cannot be read or is no single volume.
+    """
+    found = DICOM if path.is_dir() else next((f for f in FORMATS if path.name.lower().endswith(f.suffixes)), PLAIN)
+    if not path.exists():
+        raise InputError(f"{path} cannot be read (No such file or directory); expected a {found.kind}")
+    reader = load(found.module, path)
+    with decoding(path, found.kind):
+        volume: VolumeFile = reader.open_volume(path)
+
+    def read() -> NDArray[Any]:
+        with decoding(path, found.kind):
+            return volume.read()
+
+    return dataclasses.replace(volume, read=read)
+
+
+def load(module: str, path: Path) -> ModuleType:
+    """Import a format's module. Raises InputError where the library that it needs is not installed."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise InputError(f"{path}: this format needs {error.name}; pip install 'ctsim[io]' installs it") from None

@@ -1,0 +1,119 @@
+"""A CT volume from a file in HU: spacing and rescale by the file or the recipe, metal refused or replaced."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ctsim.errors import InputError
+from ctsim.geometry import Triple
+from ctsim.io.formats import open_volume
+from ctsim.io.volumefile import VolumeFile
+
+ALIKE = 1e-3
+"""Largest relative difference of a stated spacing to the file's: it is half a voxel over 500 of them."""
+SAME = 1e-5
+"""The same for slope and intercept, which NIfTI stores as float32."""
+BLOOM = 2.0
+"""Distance (mm) to metal within which its blur is replaced, too."""
+NO_CHANGE = (1.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settled:
+    """A file with the size of its voxels (z, y, x) in mm, and slope and intercept to HU."""
+
+    file: VolumeFile
+    spacing: Triple
+    rescale: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ct:
+    """A CT volume: HU [z, y, x] and the size of its voxels (z, y, x) in mm."""
+
+    hu: NDArray[np.float32]
+    spacing: Triple
+
+
+def settle(path: str, spacing: Triple | None, rescale: tuple[float, float] | None) -> Settled:
+    """Read a file's headers and settle what it leaves open by what is stated.
+
+    Raises InputError where something is stated by neither, or differently by both, and for a file that cannot be read.
+    """
+    try:
+        file = open_volume(Path(path))
+    except InputError as error:
+        raise InputError(f"path: {error}") from None
+    found = file.spacing or spacing
+    if found is None:
+        raise InputError(f"spacing: {path} states none; expected the size of its voxels (z, y, x) in mm")
+    if spacing and not np.allclose(spacing, found, rtol=ALIKE, atol=0):
+        raise InputError(f"spacing: got {spacing} mm, but {path} says {found} (z, y, x); expected the same or none")
+    if not all(1e-3 <= d <= 2000 for d in found):
+        raise InputError(f"path: {path} has voxels of {found} mm (z, y, x), expected 0.001 to 2000 mm")
+    if rescale and file.rescale and not np.allclose(rescale, file.rescale, rtol=SAME, atol=SAME):
+        raise InputError(f"rescale: got {rescale}, but {path} says {file.rescale}; expected the same or none")
+    if not rescale and not file.holds_hu:
+        raise InputError(
+            f"rescale: {path} holds grey values ({file.dtype.name}) that cannot be HU, for air has -1000; "
+            "expected a slope and an intercept"
+        )
+    return Settled(file=file, spacing=found, rescale=file.rescale or rescale or NO_CHANGE)
+
+
+def digest_of(file: VolumeFile) -> str:
+    """Return the SHA-256 of a volume's files. Raises InputError where one cannot be read."""
+    try:
+        return file.digest()
+    except InputError as error:
+        raise InputError(f"path: {error}") from None
+
+
+def read_hu(settled: Settled) -> NDArray[np.float32]:
+    """Return the volume in HU, [z, y, x]. Raises InputError for values that are no finite HU."""
+    try:
+        values = settled.file.values()
+    except InputError as error:
+        raise InputError(f"path: {error}") from None
+    slope, intercept = settled.rescale
+    with np.errstate(over="ignore", invalid="ignore"):
+        hu = values.astype(np.float32) * np.float32(slope) + np.float32(intercept)
+    if not np.isfinite(hu).all():
+        raise InputError(
+            f"path: {settled.file.path} holds values that are no finite HU under rescale = {settled.rescale}"
+        )
+    return hu
+
+
+def without_metal(ct: Ct, metal_hu: float) -> Ct:
+    """Replace voxels above `metal_hu`, and those within `BLOOM` of them, by the nearest voxel that is neither.
+
+    The streaks that the metal casts stay. Raises InputError where nothing but metal is there.
+    """
+    metal = ct.hu > metal_hu
+    if not metal.any():
+        return ct
+    reach = np.ceil(np.divide(BLOOM, ct.spacing)).astype(int) + 1
+    around = _box(metal, reach)
+    outside = np.asarray(ndimage.distance_transform_edt(~metal[around], sampling=ct.spacing)) > BLOOM
+    if not outside.any():
+        raise InputError(f"metal_hu: all voxels are above {metal_hu:g} HU or next to such; expected a CT of a body")
+    nearest: Any = ndimage.distance_transform_edt(
+        ~outside, sampling=ct.spacing, return_distances=False, return_indices=True
+    )
+    hu = ct.hu.copy()
+    hu[around] = hu[around][tuple(nearest)]
+    return Ct(hu=hu, spacing=ct.spacing)
+
+
+def _box(mask: NDArray[np.bool_], reach: NDArray[np.int_]) -> tuple[slice, ...]:
+    """Return the box around a mask with `reach` voxels to all sides: one more than what is replaced."""
+    spans = []
+    for axis, margin in enumerate(reach):
+        found = np.flatnonzero(mask.any(tuple(a for a in range(3) if a != axis)))
+        spans.append(slice(max(0, found[0] - margin), found[-1] + margin + 1))
+    return tuple(spans)

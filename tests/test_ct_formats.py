@@ -1,0 +1,255 @@
+"""A CT in every format is the same body, and what makes a volume doubtful is refused in one sentence."""
+
+import itertools
+import re
+import shutil
+import sys
+
+import nibabel
+import numpy as np
+import pydicom
+import pytest
+import tifffile
+from ct_files import SPACING, corner, oblique, stored, write, write_slices
+
+from ctsim.errors import InputError
+from ctsim.io.formats import open_volume
+from ctsim.phantoms.body_volume import TISSUES, CtVolume
+from ctsim.phantoms.recipes import build_recipe
+from ctsim.phantoms.scene import parse_suite, scene_id
+
+KINDS = ("dicom", ".nii", ".nii.gz", ".mha", ".mhd", ".nrrd", ".nhdr")
+PLACED = [(order, flips) for order in itertools.permutations(range(3)) for flips in ((False,) * 3, (True, False, True))]
+GRID = {"size": 20.0, "n_voxel": (20, 26, 30), "metal": "none"}
+
+
+def body(path, **changes):
+    return build_recipe(CtVolume(**({"path": str(path)} | GRID | changes)), 0)
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory):
+    path = tmp_path_factory.mktemp("plain") / "ct.npy"
+    np.save(path, corner())
+    return body(path, spacing=SPACING)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("order", "flips"), PLACED)
+def test_every_format_and_orientation_is_the_same_body_to_the_bit(expected, tmp_path, kind, order, flips):
+    found = body(write(tmp_path, kind, *stored(corner(), order, flips)))
+    assert np.array_equal(found.labels, expected.labels) and np.array_equal(found.density, expected.density)
+
+
+def test_the_marked_corner_is_right_front_and_at_the_feet(expected):
+    """x, y, z point to the patient's left, back and head, so the first voxel is the rightmost one, in front, below."""
+    bone = np.argwhere(expected.labels == TISSUES.index("cortical_bone"))
+    inside = np.argwhere(expected.labels)
+    assert (bone.min(0) == inside.min(0)).all()
+
+
+def test_tiff_is_taken_as_it_lies(expected, tmp_path):
+    tifffile.imwrite(tmp_path / "ct.tif", (corner() + 1024).astype(np.uint16))
+    found = body(tmp_path / "ct.tif", spacing=SPACING, rescale=(1.0, -1024.0))
+    assert np.array_equal(found.labels, expected.labels)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "coding"), [(np.int32, ".nii"), (np.float32, ".mha"), (np.float64, ".nrrd"), (">i2", ".nii")]
+)
+def test_the_stored_type_does_not_matter(expected, tmp_path, dtype, coding):
+    array, steps = stored(corner())
+    assert np.array_equal(body(write(tmp_path, coding, array.astype(dtype), steps)).labels, expected.labels)
+
+
+def test_units_of_metres_and_a_slope_are_those_of_the_file(expected, tmp_path):
+    array, steps = stored(corner())
+    affine = np.eye(4)
+    affine[:3, :3] = np.diag([-1, -1, 1]) @ steps[::-1].T / 1000
+    image = nibabel.Nifti1Image((array * 2 + 2048).T, affine)
+    image.header.set_xyzt_units("meter")
+    image.header.set_slope_inter(0.5, -1024)
+    data = bytearray(image.to_bytes())
+    data[112:120] = np.array([0.5, -1024], "<f4").tobytes()  # nibabel stores values that it scales itself
+    (tmp_path / "ct.nii").write_bytes(data)
+    found = open_volume(tmp_path / "ct.nii")
+    assert found.rescale == (0.5, -1024.0) and found.spacing == SPACING
+    assert np.array_equal(body(tmp_path / "ct.nii").labels, expected.labels)
+
+
+def test_signs_and_overlays_in_the_bits_of_a_slice_are_understood(expected, tmp_path):
+    """12 bits with a sign, above which an old overlay stands."""
+    folder = write_slices(tmp_path / "slices", *stored(corner()))
+    for path in folder.iterdir():
+        one = pydicom.dcmread(path)
+        values = np.frombuffer(one.PixelData, "<u2").astype(np.int32) - 1024
+        one.PixelRepresentation, one.RescaleIntercept = 1, 0
+        one.PixelData = ((values & 0x0FFF) | 0x5000).astype("<u2").tobytes()
+        one.save_as(path)
+    assert np.array_equal(body(folder).labels, expected.labels)
+
+
+def test_a_scene_says_what_its_file_says(tmp_path):
+    path = write(tmp_path, ".mha", *stored(corner()))
+    scene = 'name = "head"\nphantom = {{ recipe = "ct_volume", path = "{}", {} size = 20.0 }}\n'
+    scene += "scanner = {{ n_voxel = [16, 16, 16], n_detector = [24, 24], n_views = 4 }}"
+    (short,), (full,) = (
+        parse_suite(scene.format(path, more)) for more in ("", f"spacing = {list(SPACING)}, rescale = [1.0, 0.0],")
+    )
+    assert short == full and scene_id(short) == scene_id(full)
+    assert short.phantom.spacing == SPACING and short.phantom.rescale == (1.0, 0.0)
+
+
+def test_the_hash_of_a_folder_is_that_of_its_slices_whatever_their_names(tmp_path):
+    folder = write_slices(tmp_path / "slices", *stored(corner()))
+    before = CtVolume(path=str(folder))
+    (folder / "notes.txt").write_text("not a slice")
+    (folder / "IM00").rename(folder / "z")
+    assert CtVolume(path=str(folder)).sha256 == before.sha256
+    one = pydicom.dcmread(folder / "z")
+    one.PixelData = bytes(len(one.PixelData))
+    one.save_as(folder / "z")
+    with pytest.raises(InputError, match=r"has the SHA-256 .*, the scene was made of"):
+        build_recipe(before, 0)
+
+
+def test_the_hash_of_a_header_holds_its_data(tmp_path):
+    path = write(tmp_path, ".mhd", *stored(corner()))
+    before = CtVolume(path=str(path)).sha256
+    (tmp_path / "ct.raw").write_bytes((corner() + 1).tobytes())
+    assert CtVolume(path=str(path)).sha256 != before
+
+
+def refused(path, words, **changes):
+    with pytest.raises(InputError) as caught:
+        body(path, **changes)
+    assert re.search(words, str(caught.value)) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"spacing": (2.0, 1.5, 1.0)}, r"spacing: got \(2\.0, 1\.5, 1\.0\) mm, but .* says \(2\.0, 1\.5, 0\.8125\)"),
+        ({"rescale": (1.0, -1000.0)}, r"rescale: got \(1\.0, -1000\.0\), but .* says \(1\.0, -1024\.0\)"),
+        ({"path": "nowhere"}, r"path: nowhere cannot be read \(No such file or directory\)"),
+        ({"existing_metal": "keep"}, "existing_metal must be"),
+        ({"metal_hu": 10.0}, "metal_hu must be within 1000 to 100000"),
+    ],
+)
+def test_a_recipe_that_contradicts_its_file_is_refused(tmp_path, changes, words):
+    folder = write_slices(tmp_path / "slices", *stored(corner()))
+    refused(words=words, **{"path": folder, **changes})
+
+
+def tilted(array, steps):
+    return array, np.array([[0.0, 0.5, 2.0], *steps[1:]])
+
+
+UPRIGHT = np.eye(3)[::-1]
+DOUBTFUL = {
+    "a tilted gantry": ({"GantryDetectorTilt": "15"}, r"gantry tilted by 15° \(GantryDetectorTilt\)"),
+    "another modality": ({"Modality": "MR"}, "has the Modality MR, expected CT"),
+    "no spacing": ({"PixelSpacing": None}, "has the PixelSpacing none, expected 2 finite numbers"),
+    "frames": ({"NumberOfFrames": "4"}, "several frames or colours"),
+    "bits": ({"HighBit": 9}, "stores bits 0 to 9 of 16, 12 of them used"),
+    "a slope of 0": ({"RescaleSlope": "0"}, "RescaleSlope = 0, expected a positive"),
+    "no HU": ({"RescaleSlope": None}, r"rescale: .* grey values \(uint16\) that cannot be HU"),
+    "size": ({"Rows": 8}, "holds 154 bytes of pixels, its header declares 176"),
+}
+
+
+@pytest.mark.parametrize(("changes", "words"), DOUBTFUL.values(), ids=DOUBTFUL)
+def test_doubtful_slices_are_refused(tmp_path, changes, words):
+    refused(write_slices(tmp_path / "slices", *stored(corner()), **changes), words)
+
+
+def test_a_series_that_is_no_volume_is_refused(tmp_path):
+    array, steps = stored(corner(), directions=UPRIGHT)
+    refused(write_slices(tmp_path / "sheared", *tilted(array, steps)), "axes that meet at 75.96°")
+    folder = write_slices(tmp_path / "gap", array, steps)
+    (folder / "IM03").unlink()  # the third of five
+    refused(folder, "slices 2 to 4 mm apart, expected equal gaps")
+    shutil.copy(folder / "IM00", folder / "again")
+    refused(folder, "slices 0 to 4 mm apart")
+    folder = write_slices(tmp_path / "two", array, steps)
+    one = pydicom.dcmread(folder / "IM00")
+    one.SeriesInstanceUID, one.SeriesDescription = "1.2.4", "scout"
+    one.save_as(folder / "IM99")
+    refused(folder, r"holds 2 series \(5 slices 'head'; 1 slices 'scout'\)")
+    refused(folder / "IM00.dcm", "cannot be read")
+    refused(tmp_path, "holds 0 DICOM slices")
+    one.RescaleIntercept, one.SeriesInstanceUID = 0, "1.2.3"
+    one.save_as(folder / "IM99")
+    refused(folder, r"IM99 has the RescaleIntercept \(0\.0,\), IM00 \(-1024\.0,\)")
+
+
+def test_compressed_slices_are_refused(tmp_path):
+    folder = write_slices(tmp_path / "slices", *stored(corner()))
+    for path in folder.iterdir():
+        one = pydicom.dcmread(path)
+        one.compress("1.2.840.10008.1.2.5")
+        one.save_as(path)
+    refused(folder, r"compressed \(RLE Lossless\), expected plain pixels")
+
+
+@pytest.mark.parametrize("kind", [".nii", ".mha", ".nrrd", ".tif"])
+def test_grey_values_without_hu_need_a_rescale(tmp_path, kind):
+    array, steps = stored((corner() // 16 + 100).clip(0, 255).astype(np.uint8))
+    path = tmp_path / "ct.tif"
+    if kind == ".tif":
+        tifffile.imwrite(path, array)
+    else:
+        path = write(tmp_path, kind, array, steps)
+    refused(path, r"rescale: .* holds grey values \(uint8\) that cannot be HU", spacing=SPACING)
+    assert body(path, spacing=SPACING, rescale=(16.0, -1600.0)).labels.any()
+
+
+def test_a_spacing_that_no_one_states_is_missed(tmp_path):
+    np.save(tmp_path / "ct.npy", corner())
+    refused(tmp_path / "ct.npy", r"spacing: .*ct\.npy states none; expected the size of its voxels")
+
+
+def test_a_nifti_without_or_with_two_orientations_is_refused(tmp_path):
+    path = write(tmp_path, ".nii", *stored(corner()))
+    data = bytearray(path.read_bytes())
+    codes = data[252:256]
+    data[252:256] = bytes(4)
+    path.write_bytes(data)
+    refused(path, r"states no orientation \(sform_code and qform_code are 0\)")
+    data[252:256] = codes
+    data[80:84] = np.float32(3).tobytes()  # pixdim of x
+    path.write_bytes(data)
+    refused(path, r"contradicts itself: its voxels are \[3\.0, 1\.5, 2\.0\] by pixdim, \[0\.8125, 1\.5, 2\.0\]")
+
+
+def test_metal_of_the_ct_is_refused_or_replaced_never_kept(tmp_path):
+    hu = np.full((12, 20, 20), 40, np.int16)
+    hu[:, :, 9:] = 900
+    clean = hu.copy()
+    hu[5:7, 8:10, 14:16], hu[6, 9, 6] = 9000, 3000  # an implant in bone, and a voxel at the limit
+    np.save(tmp_path / "ct.npy", hu)
+    given = {"spacing": (1.0, 1.0, 1.0)}
+    refused(tmp_path / "ct.npy", r"holds metal, 8 voxels above metal_hu = 3000 HU \(up to 9000\)", **given)
+    np.save(tmp_path / "clean.npy", clean)
+    expected = body(tmp_path / "clean.npy", **given)
+    hu[6, 9, 6] = 40
+    hu[6, 9, 17] = 2900  # the implant's blur, 2 mm from its last voxel
+    np.save(tmp_path / "ct.npy", hu)
+    found = body(tmp_path / "ct.npy", existing_metal="mask", **given)
+    assert np.array_equal(found.labels, expected.labels) and np.array_equal(found.density, expected.density)
+    kept = body(tmp_path / "ct.npy", metal_hu=10_000.0, **given)
+    assert not np.array_equal(kept.density, expected.density)
+    np.save(tmp_path / "all.npy", np.full((4, 4, 4), 5000, np.int16))
+    refused(tmp_path / "all.npy", "metal_hu: all voxels are above 3000 HU", existing_metal="mask", **given)
+
+
+def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch):
+    path = write(tmp_path, ".nii", *stored(corner()))
+    for name in ("nibabel", "ctsim.io.nifti"):
+        monkeypatch.setitem(sys.modules, name, None) if name == "nibabel" else monkeypatch.delitem(sys.modules, name)
+    refused(path, r"this format needs nibabel; pip install 'ctsim\[io\]' installs it")
+
+
+def test_directions_are_a_rotation():
+    assert np.allclose(oblique() @ oblique().T, np.eye(3))
+    assert np.linalg.det(oblique()[::-1]) == pytest.approx(1)
