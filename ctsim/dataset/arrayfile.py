@@ -19,6 +19,7 @@ from ctsim.human import human_bytes
 
 MOST = 2**31  # values: a volume of 1290³, 8.6 GB as float32
 PLAIN, TIMES = 2**28, 100  # bytes, and times the file's own: no CT beyond both decodes to so much
+HEADER = 10_000  # bytes of a .npy header; NumPy makes room for what one declares, up to 4 GB
 LONGEST = 200  # characters of what a decoder says
 
 
@@ -142,6 +143,10 @@ def _check_member(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
 def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Read shape, whether the order is Fortran's, and dtype from the beginning of a .npy file."""
     version = np.lib.format.read_magic(file)
+    begin, width = file.tell(), 2 if version == (1, 0) else 4
+    if (size := int.from_bytes(file.read(width), "little")) > HEADER:
+        raise ValueError(f"its header declares {size} bytes of itself, expected at most {HEADER}")
+    file.seek(begin)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     return read(file)
 

@@ -12,7 +12,7 @@ import numpy as np
 import pydicom
 import pydicom.filereader
 from numpy.typing import NDArray
-from pydicom.uid import ExplicitVRBigEndian, ExplicitVRLittleEndian, ImplicitVRLittleEndian
+from pydicom.uid import UID, ExplicitVRBigEndian, ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
 from ctsim.errors import InputError
 from ctsim.io.frame import Axes, axes_of
@@ -120,15 +120,23 @@ def _dataset(path: Path, **options: Any) -> pydicom.FileDataset | None:
     """Parse a file, of which nothing is decompressed; None for a file that is no DICOM file."""
     if path.stat().st_size > LARGEST:
         raise InputError(f"{path} has more than {LARGEST} bytes, expected a DICOM slice")
-    data = path.read_bytes()
+    data = path.read_bytes()  # not the file: of that, room would be made for what a length declares
     if path.name == "DICOMDIR" or (data[128:132] != b"DICM" and not path.name.lower().endswith((".dcm", ".ima"))):
         return None
-    syntax = pydicom.filereader.read_file_meta_info(path).get("TransferSyntaxUID")
-    if syntax is None:
-        raise InputError(f"{path} does not say how it is coded (TransferSyntaxUID)")
+    syntax = _coding(data)
+    if not isinstance(syntax, UID):
+        raise InputError(f"{path} does not say how it is coded (TransferSyntaxUID); expected a DICOM slice")
     if syntax not in PLAIN:
         raise InputError(f"{path} is compressed ({syntax.name}), expected plain pixels: gdcmconv --raw makes them")
     return pydicom.dcmread(io.BytesIO(data), **options)
+
+
+def _coding(data: bytes) -> Any:
+    """Return the transfer syntax of a file. pydicom, where it parses a deflated file, inflates it whole."""
+    meta = pydicom.filereader.read_dataset(
+        io.BytesIO(data[132:]), is_implicit_VR=False, is_little_endian=True, stop_when=lambda tag, *_: tag.group != 2
+    )
+    return meta.get("TransferSyntaxUID")
 
 
 def _numbers(path: Path, found: pydicom.Dataset, key: str, count: int, *, optional: bool = False) -> Values:
