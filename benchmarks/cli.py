@@ -22,10 +22,14 @@ from ctsim.errors import InputError
 
 
 class Command(NamedTuple):
-    """A sub-command of `run-benchmark`: the module with its `main`, and what it does."""
+    """A sub-command of `make-dataset` or `run-benchmark`: the module with its `main`, and what it does.
+
+    After a stop the same command goes on where it `resumes`, and else starts from the beginning.
+    """
 
     module: str
     about: str
+    resumes: bool = True
 
 
 OTHERS = {
@@ -44,25 +48,33 @@ OTHERS = {
     "paper-tables": Command("ctsim.benchmarks.studies.paper.tables", "the paper's tables next to measured numbers"),
     "ablation": Command("ctsim.benchmarks.studies.ablation", "run the paper's ablations of its splat method"),
 }
+OF_DATASETS = {
+    "export": Command("ctsim.benchmarks.export.work", "write a volume as NIfTI, MetaImage or DICOM", resumes=False),
+}
 EXIT_USER, EXIT_INTERRUPTED = 2, 130
 
 
 def make_dataset() -> int:
-    """Run `make-dataset`; return the exit code."""
-    return guarded("make-dataset", "ctsim.benchmarks.make_dataset", sys.argv[1:])
+    """Run `make-dataset` or one of its subcommands, the keys of `OF_DATASETS`; return the exit code."""
+    return _dispatch("make-dataset", "ctsim.benchmarks.make_dataset", OF_DATASETS)
 
 
 def run_benchmark() -> int:
     """Run `run-benchmark` or one of its subcommands, the keys of `OTHERS`; return the exit code."""
+    return _dispatch("run-benchmark", "ctsim.benchmarks.studies.methods.study", OTHERS)
+
+
+def _dispatch(command: str, module: str, others: dict[str, Command]) -> int:
     arguments = sys.argv[1:]
-    if arguments and arguments[0] in OTHERS:
-        return guarded(f"run-benchmark {arguments[0]}", OTHERS[arguments[0]].module, arguments[1:])
+    if arguments and arguments[0] in others:
+        name = arguments[0]
+        return guarded(f"{command} {name}", others[name].module, arguments[1:], resumes=others[name].resumes)
     try:
-        return guarded("run-benchmark", "ctsim.benchmarks.studies.methods.study", arguments)
+        return guarded(command, module, arguments)
     finally:
         if {"-h", "--help"} & {*arguments}:
-            lines = "".join(f"  {name:14}{command.about}\n" for name, command in OTHERS.items())
-            sys.stdout.write(f"Other commands, each with its own --help (run-benchmark NAME --help):\n{lines}")
+            lines = "".join(f"  {name:14}{other.about}\n" for name, other in others.items())
+            sys.stdout.write(f"Other commands, each with its own --help ({command} NAME --help):\n{lines}")
 
 
 def guarded(name: str, module: str, arguments: list[str], *, resumes: bool = True) -> int:

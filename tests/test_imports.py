@@ -13,11 +13,13 @@ import grimp
 import pytest
 from setuptools import find_packages
 
-from ctsim.benchmarks.cli import OTHERS
+from ctsim.benchmarks.cli import OF_DATASETS, OTHERS
 
 ROOT = Path(__file__).parents[1]
 DRAWS = {"matplotlib", "pandas", "tyro", "rich"}
 SLOW = {"torch", "numba", "scipy", "xraylib", "skimage"}
+COMMANDS = ("make-dataset", "run-benchmark")
+SUBCOMMANDS = [*(f"make-dataset {name}" for name in OF_DATASETS), *(f"run-benchmark {name}" for name in OTHERS)]
 PARTS = ("phantoms", "reconstruct", "baselines", "benchmarks", "reports")
 
 
@@ -107,7 +109,7 @@ def test_nothing_below_benchmarks_draws_or_talks():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", ["make-dataset", "run-benchmark", *(f"run-benchmark {name}" for name in OTHERS)])
+@pytest.mark.parametrize("words", [*COMMANDS, *SUBCOMMANDS])
 def test_help_loads_nothing_slow(words):
     command, *more = words.split()
     (entry,) = importlib.metadata.entry_points(group="console_scripts", name=command)

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import msgspec
 import tyro
 
-from ctsim.benchmarks.cli import OTHERS, guarded
+from ctsim.benchmarks.cli import OF_DATASETS, OTHERS, guarded
 from ctsim.benchmarks.methods import TABLE, find, parameters, resolve
 from ctsim.benchmarks.suites import bundled, load
 from ctsim.errors import InputError
@@ -74,7 +74,8 @@ def pages() -> dict[str, str]:
 def forms() -> dict[str, type]:
     """Return every command with the dataclass of its flags."""
     names = {"make-dataset": "ctsim.benchmarks.make_dataset", "run-benchmark": "ctsim.benchmarks.studies.methods.study"}
-    names |= {f"run-benchmark {name}": command.module for name, command in sorted(OTHERS.items())}
+    for first, others in (("make-dataset", OF_DATASETS), ("run-benchmark", OTHERS)):
+        names |= {f"{first} {name}": command.module for name, command in sorted(others.items())}
     return {name: _form(importlib.import_module(module)) for name, module in names.items()}
 
 

@@ -17,7 +17,7 @@ from pydicom.valuerep import format_number_as_ds
 
 from ctsim.dataset.durable import put_in_place
 from ctsim.errors import InputError
-from ctsim.geometry import Triple
+from ctsim.io.placed import Placed
 
 INTERCEPT = -1024  # HU of the stored value 0, unless the volume has less
 MOST = 2**16 - 1
@@ -26,23 +26,23 @@ EMPTY += ("PositionReferenceIndicator", "AcquisitionNumber", "KVP", "StudyID")
 """Attributes that DICOM wants to be there, if only empty."""
 
 
-def write_volume(path: Path, values: NDArray[Any], spacing: Triple, centre: Triple) -> None:
-    """Write a volume [z, y, x] in HU as a new folder; `spacing` and the `centre` of the array (z, y, x) are mm.
+def write_volume(path: Path, volume: Placed) -> None:
+    """Write a volume in HU as a new folder of slices.
 
     Values are rounded to a step of 1 HU, or of the least power of two at which their range fits into 16 bits.
     Raises InputError for a volume of one slice, and for values that are not finite.
     """
-    stored, rescale = quantised(path, values)
+    stored, rescale = quantised(path, volume.values)
     folder = path.with_name(f".{path.name}.partial")
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     try:
-        shown = repr((rescale, spacing, centre, stored.shape)).encode()
-        identity = hashlib.sha256(shown + stored.tobytes()).hexdigest()
-        z, y, x = (c - (n - 1) / 2 * d for c, n, d in zip(centre, stored.shape, spacing, strict=True))
+        shown = repr((rescale, volume.spacing, volume.centre, stored.shape)).encode()
+        series = hashlib.sha256(shown + stored.tobytes()).hexdigest()
         for k, image in enumerate(stored):
-            one = _slice(identity, k, path.name[:64])
-            _add_place(one, (x, y, z + k * spacing[0]), spacing)
+            one = _slice(volume, series, k)
+            one.SeriesDescription = path.name[:64]
+            _add_place(one, volume, k)
             _add_pixels(one, image, rescale)
             one.save_as(folder / f"{k:04d}.dcm", enforce_file_format=True)
         put_in_place(folder, path)
@@ -62,31 +62,35 @@ def quantised(path: Path, values: NDArray[Any]) -> tuple[NDArray[np.uint16], tup
     return np.rint((values.astype(np.float64) - intercept) / slope).astype("<u2"), (slope, intercept)
 
 
-def _slice(identity: str, k: int, name: str) -> FileDataset:
-    """Return slice k of a volume without place and pixels; its identifiers follow from the volume's `identity`."""
+def _slice(volume: Placed, series: str, k: int) -> FileDataset:
+    """Return slice k of a volume without place and pixels; `series` identifies the volume's content."""
+    study = volume.study or series
+    series = study + series
     meta = FileMetaDataset()
     meta.MediaStorageSOPClassUID = CTImageStorage
-    meta.MediaStorageSOPInstanceUID = _uid(identity, f"slice {k}")
+    meta.MediaStorageSOPInstanceUID = _uid(series, f"slice {k}")
     meta.TransferSyntaxUID = ExplicitVRLittleEndian
     one = FileDataset("", {}, file_meta=meta, preamble=b"\0" * 128)
     one.SOPClassUID, one.SOPInstanceUID = CTImageStorage, meta.MediaStorageSOPInstanceUID
-    one.StudyInstanceUID, one.SeriesInstanceUID = _uid(identity, "study"), _uid(identity, "series")
-    one.FrameOfReferenceUID = _uid(identity, "frame")
+    one.StudyInstanceUID, one.FrameOfReferenceUID = _uid(study, "study"), _uid(study, "frame")
+    one.SeriesInstanceUID = _uid(series, "series")
     for keyword in EMPTY:
         setattr(one, keyword, None)
-    one.PatientName = one.PatientID = one.SeriesDescription = name
+    one.PatientName = one.PatientID = volume.subject[:64]
     one.Modality, one.Manufacturer, one.PatientPosition = "CT", "ctsim", "HFS"
     one.ImageType = ["DERIVED", "SECONDARY", "AXIAL"]
     one.SeriesNumber, one.InstanceNumber = 1, k + 1
     return one
 
 
-def _add_place(one: FileDataset, first: Triple, spacing: Triple) -> None:
-    """Say where the slice's first pixel (x, y, z) is, in mm, and how large its voxels (z, y, x) are."""
-    one.ImagePositionPatient = [format_number_as_ds(float(v)) for v in first]
+def _add_place(one: FileDataset, volume: Placed, k: int) -> None:
+    """Say where the middle of the slice's first pixel is, and how large its voxels are."""
+    x, y, z = volume.first.tolist()
+    dz, dy, dx = (format_number_as_ds(float(d)) for d in volume.spacing)
+    one.ImagePositionPatient = [format_number_as_ds(v) for v in (x, y, z + k * volume.spacing[0])]
     one.ImageOrientationPatient = [1, 0, 0, 0, 1, 0]
-    one.PixelSpacing = [format_number_as_ds(float(v)) for v in spacing[1:]]
-    one.SliceThickness = one.SpacingBetweenSlices = format_number_as_ds(float(spacing[0]))
+    one.PixelSpacing = [dy, dx]
+    one.SliceThickness = one.SpacingBetweenSlices = dz
 
 
 def _add_pixels(one: FileDataset, image: NDArray[np.uint16], rescale: tuple[int, int]) -> None:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ctsim.dataset.durable import replacing
 from ctsim.errors import InputError
-from ctsim.geometry import Triple
 from ctsim.io.frame import axes_of
 from ctsim.io.payload import beside, declared, inflated, raw
+from ctsim.io.placed import Placed
 from ctsim.io.volumefile import VolumeFile
 
 TYPES = {
@@ -53,12 +53,15 @@ def open_volume(path: Path) -> VolumeFile:
     return VolumeFile(path=path, files=files, shape=shape, dtype=dtype, read=read, axes=axes_of(steps[::-1], path))
 
 
-def write_volume(path: Path, values: NDArray, spacing: Triple, centre: Triple) -> None:
-    """Write a volume [z, y, x] as .mha; `spacing` and the `centre` of the array (z, y, x) are mm."""
-    kind = next((name for name, code in TYPES.items() if np.dtype(code) == values.dtype), None)
+def write_volume(path: Path, volume: Placed) -> None:
+    """Write a volume as .mha, not compressed. Raises InputError for a type that MetaImage lacks."""
+    values = volume.values
+    known = {np.dtype(code): name for name, code in TYPES.items()}
+    kind = known.get(values.dtype)
     if kind is None:
-        raise InputError(f"{path}: MetaImage has no {values.dtype}")
-    first = [c - (n - 1) / 2 * d for c, n, d in zip(centre, values.shape, spacing, strict=True)]
+        raise InputError(
+            f"{path}: MetaImage has no {values.dtype}, expected one of {', '.join(sorted(set(TYPES.values())))}"
+        )
     header = {
         "ObjectType": "Image",
         "NDims": "3",
@@ -66,10 +69,10 @@ def write_volume(path: Path, values: NDArray, spacing: Triple, centre: Triple) -
         "BinaryDataByteOrderMSB": "False",
         "CompressedData": "False",
         "TransformMatrix": "1 0 0 0 1 0 0 0 1",
-        "Offset": _words(float(v) for v in first[::-1]),
+        "Offset": _words(volume.first.tolist()),
         "CenterOfRotation": "0 0 0",
         "AnatomicalOrientation": "RAI",
-        "ElementSpacing": _words(float(v) for v in spacing[::-1]),
+        "ElementSpacing": _words(float(v) for v in volume.spacing[::-1]),
         "DimSize": _words(values.shape[::-1]),
         "ElementType": kind,
         _LAST: "LOCAL",

@@ -3,7 +3,6 @@
 import gzip
 import math
 from pathlib import Path
-from typing import Any
 
 import nibabel
 import numpy as np
@@ -11,9 +10,9 @@ from numpy.typing import NDArray
 
 from ctsim.dataset.durable import replacing
 from ctsim.errors import InputError
-from ctsim.geometry import Triple
 from ctsim.io.frame import FROM_RAS, SKEW, Axes, axes_of
 from ctsim.io.payload import declared, inflated, raw
+from ctsim.io.placed import Placed
 from ctsim.io.volumefile import VolumeFile
 
 Header = nibabel.Nifti1Header | nibabel.Nifti2Header
@@ -40,13 +39,12 @@ def open_volume(path: Path) -> VolumeFile:
     return VolumeFile(path=path, files=(path,), shape=shape, dtype=dtype, read=read, axes=axes, rescale=rescale)
 
 
-def write_volume(path: Path, values: NDArray[Any], spacing: Triple, centre: Triple) -> None:
-    """Write a volume [z, y, x], compressed if the name ends in .gz; `spacing` and `centre` (z, y, x) are mm."""
+def write_volume(path: Path, volume: Placed) -> None:
+    """Write a volume in its own type, compressed if the name ends in .gz."""
     affine = np.eye(4)
-    affine[:3, :3] = np.diag(FROM_RAS * spacing[::-1])
-    first = [c - (n - 1) / 2 * d for c, n, d in zip(centre, values.shape, spacing, strict=True)]
-    affine[:3, 3] = FROM_RAS * first[::-1]
-    image = nibabel.Nifti1Image(values.T, affine, dtype=values.dtype)
+    affine[:3, :3] = np.diag(FROM_RAS * volume.spacing[::-1])
+    affine[:3, 3] = FROM_RAS * volume.first
+    image = nibabel.Nifti1Image(volume.values.T, affine, dtype=volume.values.dtype)
     image.header.set_xyzt_units("mm")
     image.set_sform(affine, 1)
     image.set_qform(affine, 1)

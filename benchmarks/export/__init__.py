@@ -1,0 +1,30 @@
+"""`make-dataset export`: volumes of a scan's grid in the formats of medical imaging. The flags of the command."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flags:
+    """Write a volume on a scan's grid as NIfTI, MetaImage or DICOM, with its spacing and its place.
+
+    NIfTI and MetaImage keep the values in 1/mm, or HU with --hu. DICOM slices are HU in 16 bits.
+    """
+
+    scan: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCAN")]
+    """Folder of a scan, data/SCENE."""
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """New file (.nii, .nii.gz or .mha), or new folder of DICOM slices."""
+    to: Literal["nifti", "mha", "dicom"]
+    """Format."""
+    volume: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "reference_effective"
+    """A volume of the scan (reference_effective, reference_50kev, labels, metal, metal_free/…), or a TIFF stack or .npy
+    array on the scan's grid, such as a reconstruction in results/volumes."""
+    hu: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Write HU instead of 1/mm."""
+    kev: float | None = None
+    """Energy whose attenuation of water is 0 HU; by default that of the scan's effective spectrum, and 50 for
+    reference_50kev."""
