@@ -64,7 +64,7 @@ def write_slices(folder: Path, array, steps, **changes) -> Path:
         one.PixelSpacing = [f"{v:.8f}" for v in lengths[1:]]
         for keyword, value in changes.items():
             setattr(one, keyword, value)
-        one.save_as(folder / f"IM{(7 * k) % 11:02d}", enforce_file_format=True)  # names are in no order
+        one.save_as(folder / f"IM{37 * k % 53:02d}", enforce_file_format=True)  # names are in no order
     return folder
 
 

@@ -80,7 +80,7 @@ def whole(folder, kind):
         tifffile.imwrite(folder / "ct.tif", corner(), photometric="minisblack", compression="zlib")
         return folder / "ct.tif", folder / "ct.tif"
     path = write(folder, kind, *stored(corner((3, 7, 11) if kind == "dicom" else (5, 7, 11))))
-    return path, path / "IM07" if kind == "dicom" else path
+    return path, path / "IM37" if kind == "dicom" else path
 
 
 @pytest.mark.slow
@@ -182,9 +182,9 @@ def test_a_bomb_does_not_go_off(tmp_path):
 
 def test_a_deflated_slice_is_not_inflated(tmp_path):
     path = write(tmp_path, "dicom", *stored(corner()))
-    one = pydicom.dcmread(path / "IM07")
+    one = pydicom.dcmread(path / "IM37")
     one.file_meta.TransferSyntaxUID = "1.2.840.10008.1.2.1.99"
-    one.save_as(path / "IM07")
+    one.save_as(path / "IM37")
     assert "is compressed (Deflated Explicit VR Little Endian)" in read(path)
 
 

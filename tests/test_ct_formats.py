@@ -167,7 +167,7 @@ def test_a_series_that_is_no_volume_is_refused(tmp_path):
     array, steps = stored(corner(), directions=UPRIGHT)
     refused(write_slices(tmp_path / "sheared", *tilted(array, steps)), "axes that meet at 75.96°")
     folder = write_slices(tmp_path / "gap", array, steps)
-    (folder / "IM03").unlink()  # the third of five
+    (folder / "IM21").unlink()  # the third of five
     refused(folder, "slices 2 to 4 mm apart, expected equal gaps")
     shutil.copy(folder / "IM00", folder / "again")
     refused(folder, "slices 0 to 4 mm apart")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 import tyro
+from ct_files import stored, write_slices
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
@@ -28,9 +29,11 @@ def test_there_are_examples():
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "text"), MARKED)
 def test_an_example_works(kind, text, smallest, tmp_path, monkeypatch):
-    """Python runs where data/ holds a dataset; TOML is read as scenes, one of head.tif, and every phantom is built."""
+    """Python runs where data/ holds a dataset; TOML is read as scenes, of head/ and head.tif, too, and built."""
     (tmp_path / "data").symlink_to(smallest)
     tifffile.imwrite(tmp_path / "head.tif", np.full((50, 150, 150), 1074, np.uint16))
+    if '"head"' in text:
+        write_slices(tmp_path / "head", *stored(np.full((50, 150, 150), 50, np.int16), spacing=(2.4, 0.8, 0.8)))
     monkeypatch.chdir(tmp_path)
     if kind == "python":
         exec(compile(text, "example", "exec"), {"__name__": "example"})

@@ -130,6 +130,13 @@ def run(monkeypatch, *words):
     return cli.make_dataset()
 
 
+def test_help_lists_the_command(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["make-dataset", "--help"])
+    with pytest.raises(SystemExit):
+        cli.make_dataset()
+    assert "  export        write a volume as NIfTI, MetaImage or DICOM\n" in capsys.readouterr().out
+
+
 def test_the_command_writes_references_labels_and_reconstructions(smallest, tmp_path, monkeypatch, capsys):
     scan = smallest / "smallest"
     stored = open_scan(scan)

@@ -1,7 +1,7 @@
 """Our axes in the words of other libraries: TIGRE, LEAP, ASTRA, RTK, and R2-Gaussian, whose order NAF has, too.
 
-The only module that permutes axes. Ours: volume [z, y, x], projections [view, v, u], angles in radians,
-right-handed x, y, z in mm. Functions take and return views of the array where they can.
+Only this module and `ctsim.io`, for files of patients, permute axes. Ours: volume [z, y, x], projections [view, v, u],
+angles in radians, right-handed x, y, z in mm. Functions take and return views of the array where they can.
 """
 
 from enum import StrEnum
