@@ -23,6 +23,8 @@ TISSUES = ("air", "lung", "adipose", "soft_tissue", "cortical_bone")
 FROM_HU = (-900.0, -250.0, -20.0, 200.0)
 """The HU from which a voxel is the next of `TISSUES`."""
 WIDEST = 4.0  # mm: in a cube of 60 mm and above an insert's diameter, for implants do not grow with the body
+FEW, EACH = 2**24, 64
+"""Places to interpolate at: always allowed, and of each of the file's voxels, 4³ where it is as large as a label."""
 LENGTH = 3.0  # of an insert, in its diameters
 
 
@@ -117,17 +119,33 @@ def _resampled(ct: Ct, params: CtVolume, n: Shape, d_voxel: Triple) -> NDArray[n
     """
     hu, spacing = ct.hu, ct.spacing
     times = np.ceil(np.divide(d_voxel, spacing) - 1e-9).astype(int)
-    if math.prod(int(a * b) for a, b in zip(n, times, strict=True)) > MOST:
-        raise InputError(f"spacing: {spacing} mm makes more than {MOST} places of the object's cube; expected less")
-    fine, step = np.multiply(n, times), np.divide(d_voxel, spacing) / times
-    first: Any = (0.5 - fine / 2 + np.multiply(params.grid_shift, times)) * step + np.divide(hu.shape, 2) - 0.5
-    out = np.empty(fine, np.float32)
-    ndimage.affine_transform(hu, step, first, output=out, order=1, mode="nearest")
+    step = np.divide(d_voxel, spacing) / times  # in the file's voxels, whose middles are whole numbers
+    first = (0.5 - np.multiply(n, times) / 2 + np.multiply(params.grid_shift, times)) * step
+    first += np.divide(hu.shape, 2) - 0.5
+    low, high = _covered(n, times, first, step, hu.shape)
+    fine = (high - low) * times
+    places, most = math.prod(fine.tolist()), min(MOST, max(FEW, EACH * hu.size))
+    if places > most:
+        raise InputError(f"spacing: {spacing} mm makes {places} places of {hu.size} voxels, expected at most {most}")
+    start: Any = first + low * times * step
+    found = np.empty(fine, np.float32)
+    ndimage.affine_transform(hu, step, start, output=found, order=1, mode="nearest")
     for axis, (count_fine, size) in enumerate(zip(fine, hu.shape, strict=True)):
-        at = first[axis] + step[axis] * np.arange(count_fine)  # in the file's voxels, whose middles are whole numbers
-        np.moveaxis(out, axis, 0)[(at < -0.5) | (at > size - 0.5)] = -1000
-    blocks = out.reshape(n[0], times[0], n[1], times[1], n[2], times[2])
-    return blocks.mean((1, 3, 5), dtype=np.float32)
+        at = start[axis] + step[axis] * np.arange(count_fine)
+        np.moveaxis(found, axis, 0)[(at < -0.5) | (at > size - 0.5)] = -1000
+    blocks = found.reshape(np.stack([high - low, times], 1).reshape(-1)).mean((1, 3, 5), dtype=np.float32)
+    out = np.full(n, -1000, np.float32)
+    out[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] = blocks
+    return out
+
+
+def _covered(
+    n: Shape, times: NDArray[np.int_], first: NDArray[np.float64], step: NDArray[np.float64], shape: Shape
+) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    """Return the first label voxel that the file covers, and the one after the last, along each axis."""
+    ends = np.floor((np.array([[-0.5] * 3, np.subtract(shape, 0.5)]) - first) / step / times).astype(int)
+    low = np.clip(ends[0], 0, np.subtract(n, 1))
+    return low, np.clip(ends[1] + 1, low + 1, n)
 
 
 def _tissues(hu: NDArray[np.float32], kev: float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
