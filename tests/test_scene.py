@@ -174,6 +174,7 @@ def test_the_defaults_of_later_keys_stay() -> None:
     """An id without such a key means its default: a new key is added here, and no entry ever changes."""
     body = {"grid_shift": (0.0, 0.0, 0.0), "texture": 0.0, "texture_mm": None}
     known = {kind.__name__: body for kind in BUILDERS} | {
+        "CtVolume": {**body, "existing_metal": "refuse", "metal_hu": 3000.0},
         "Teeth": {**body, "fillings": 0, "gold_crowns": 0, "bridges": 0},
         "ScannerSettings": {"scan_kerma": None, "scan_mas": None},
         "Tube": {"falloff": False, "focal_spot": None, "off_focal": None},
