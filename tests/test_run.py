@@ -13,6 +13,7 @@ import torch
 from run_records import run_jobs, run_methods
 
 from ctsim.benchmarks import cli, methods
+from ctsim.benchmarks.scores import judge
 from ctsim.benchmarks.scores.protocol import truth_of
 from ctsim.benchmarks.scores.score import NOT_ASKED
 from ctsim.benchmarks.studies.methods import attempt, plan, records
@@ -51,6 +52,7 @@ class Double:
     code: str = "v1"
     l0: float = 10.0
     kerma: float | None = 1.25
+    phantom: str = "box"
 
     @property
     def info(self):
@@ -237,6 +239,18 @@ def test_a_rerun_does_only_what_is_missing(tmp_path):
     assert [task.subject for task in left] == ["test_run:broken"]
     other = plan.jobs([double(tmp_path)], [methods.find("test_run:good", {"level": 0.02})], anchor=False)
     assert plan.pending([job.task for job in other], records.read(tmp_path), tmp_path) == [other[0].task]
+
+
+def test_a_scans_held_out_views_are_simulated_once(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(judge, "held_out", lambda stored: made.append(stored.content_hash) or "none here")
+    scans = [double(tmp_path), dataclasses.replace(double(tmp_path), content_hash="another", name="other")]
+    found = [methods.find("test_run:good", {"level": level}) for level in (0.018, 0.02)]
+    jobs = [job for method in found for job in plan.jobs(scans, [method], anchor=False)]
+    records = run_jobs(jobs, tmp_path, anchor=False)
+    assert [r.run.scene for r in records] == [scan.name for scan in scans] * 2
+    assert made == [scans[0].content_hash, "another"]
+    assert {r.scores["projection"].note for r in records} == {"none here"}
 
 
 def test_the_anchor_is_judged_in_the_region_of_the_metal_scan(tmp_path, monkeypatch):

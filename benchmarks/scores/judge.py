@@ -40,10 +40,14 @@ class Judge:
     absent: str = ""
 
     @classmethod
-    def of(cls, stored: StoredScan) -> "Judge":
-        """Load a scan's references and choose where its artefacts are measured."""
+    def of(cls, stored: StoredScan, views: HeldOut | str | None = None) -> "Judge":
+        """Load a scan's references and choose where its artefacts are measured.
+
+        `views` are those of an earlier judge of the scan: to simulate them is most of the work.
+        """
         truth = truth_of(stored)
-        views = with_floor(held_out(stored), truth)
+        if views is None:
+            views = with_floor(held_out(stored), truth)
         water, bone = (effective_attenuation(stored, name) for name in ("water", "cortical_bone"))
         soft = soft_layout(np.asarray(stored.labels), truth, stored.info.materials, water)
         return cls(

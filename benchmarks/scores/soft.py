@@ -155,7 +155,7 @@ def _fine(reference: NDArray[np.float64], truth: Truth, classes: dict[str, Mask]
     found = np.zeros_like(truth.tissue)
     for mask in classes.values():
         found |= mask & ~ndimage.binary_opening(mask, np.ones((FINE,) * 3, np.bool_))
-    strong = (reference > SOFT_HU) | (reference < AIR_HU) | ~truth.body
+    strong: Mask = (reference > SOFT_HU) | (reference < AIR_HU) | ~truth.body
     away = truth.tissue & ~dilate(strong, 2)
     return dilate(found & away, 2) & away
 

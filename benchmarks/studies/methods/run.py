@@ -18,6 +18,7 @@ from ctsim.benchmarks.engine.process import Process, Stopped
 from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.methods import Method
 from ctsim.benchmarks.scores.judge import Judge, Twin
+from ctsim.benchmarks.scores.projection import HeldOut
 from ctsim.benchmarks.scores.score import NO_TWIN, NOT_ASKED, TWIN_ENDED
 from ctsim.benchmarks.studies.methods.attempt import SCORED, Outcome, describe, run_here, scan_for, skip, warm_up
 from ctsim.benchmarks.studies.methods.grids import with_grid
@@ -32,12 +33,14 @@ from ctsim.benchmarks.studies.methods.volumes import (
     volume_name,
     write_intermediates,
 )
+from ctsim.dataset.store import StoredScan
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.splat.course import PASSES, affordable
 from ctsim.reconstruct.splat.fast import finer
 from ctsim.types import Scan
 
+MOST_VIEWS = 32  # scans whose held-out views are kept: 10 MB each at the size of `core`
 LATE = 120.0  # further seconds for a method that gets its time limit as a parameter
 
 
@@ -62,13 +65,14 @@ class Runner:
         self._given, self._results = given, given.results
         self._warm: dict[tuple[str, str], float] = {}
         self._judge: tuple[str, Judge] | None = None
+        self._views: dict[str, HeldOut | str] = {}
         self._twin: tuple[Job, Outcome] | None = None
 
     def run(self, job: Job) -> Result:
         """Run and score a job, and keep its volume."""
         if self._judge is None or self._judge[0] != job.stored.content_hash:
             self._judge = self._twin = None  # frees the last scan's masks first
-            self._judge = (job.stored.content_hash, Judge.of(job.stored))
+            self._judge = (job.stored.content_hash, self._judge_of(job.stored))
         outcome = self._outcome(job)
         if job.variant == METAL:
             pair = self._pair(job)
@@ -78,6 +82,14 @@ class Runner:
         result = self._scored(job, outcome, self._judge[1], pair)
         outcome.at_50kev = None  # a twin is kept for its scan's run, which needs its main volume only
         return result
+
+    def _judge_of(self, stored: StoredScan) -> Judge:
+        """Load what a scan's volumes are scored with; methods come round by round, so its views are kept."""
+        judge = Judge.of(stored, self._views.pop(stored.content_hash, None))
+        self._views[stored.content_hash] = judge.views
+        if len(self._views) > MOST_VIEWS:
+            del self._views[next(iter(self._views))]
+        return judge
 
     def _outcome(self, job: Job) -> Outcome:
         """Run a job in this process or, with --isolate, in its own."""
