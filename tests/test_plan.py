@@ -53,7 +53,7 @@ def test_the_memory_that_a_plan_names_is_what_simulating_takes(dense):
         if dense:  # every voxel has a density of its own, and materials mix
             labels = np.random.default_rng(0).integers(1, len(parts[0].materials), (160,) * 3).astype(np.uint8)
             density = np.random.default_rng(1).random(labels.shape, np.float32)
-            parts = (dataclasses.replace(parts[0], labels=labels, density=density), parts[1])
+            parts = (dataclasses.replace(parts[0], labels=labels, density=density, solids=()), parts[1])
         tracemalloc.reset_peak()
         made = plan(parts)
         for _ in simulate_views(made, *parts):
@@ -63,7 +63,8 @@ def test_the_memory_that_a_plan_names_is_what_simulating_takes(dense):
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert made.memory_bytes / 1.6 < peak < made.memory_bytes * 1.6
+    within = 1.3 if dense else 1.6  # a plan without the map's share would be 1.4 times too low
+    assert made.memory_bytes / within < peak < made.memory_bytes * within
 
 
 @pytest.mark.parametrize(("metal", "scans"), [("none", 1), ("Fe", 2)])
