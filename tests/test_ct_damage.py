@@ -103,7 +103,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_sentence(tmp_path, capfd, kind
             tracemalloc.reset_peak()
             sentence = read(path)
             assert tracemalloc.get_traced_memory()[1] < ROOM, (number, sentence)
-            assert "\n" not in sentence and len(sentence) < 600
+            assert sentence.isprintable() and len(sentence) < 600
             assert not sentence or re.match(r"path: .*ct|path: .*slices|rescale: |spacing: ", sentence)
             strangers = [p for p in opened if not p.startswith(str(tmp_path)) and not p.endswith((".py", ".pyc"))]
             assert not strangers, (number, strangers)
@@ -185,7 +185,7 @@ def test_a_deflated_slice_is_not_inflated(tmp_path):
     one = pydicom.dcmread(path / "IM37")
     one.file_meta.TransferSyntaxUID = "1.2.840.10008.1.2.1.99"
     one.save_as(path / "IM37")
-    assert "is compressed (Deflated Explicit VR Little Endian)" in read(path)
+    assert "is compressed ('Deflated Explicit VR Little Endian')" in read(path)
 
 
 def test_the_command_ends_with_2(tmp_path, capsys):

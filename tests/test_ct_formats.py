@@ -148,12 +148,16 @@ def tilted(array, steps):
 UPRIGHT = np.eye(3)[::-1]
 DOUBTFUL = {
     "a tilted gantry": ({"GantryDetectorTilt": "15"}, r"gantry tilted by 15° \(GantryDetectorTilt\)"),
-    "another modality": ({"Modality": "MR"}, "has the Modality MR, expected CT"),
+    "another modality": ({"Modality": "MR"}, "has the Modality 'MR', expected CT"),
     "no spacing": ({"PixelSpacing": None}, "has the PixelSpacing none, expected 2 finite numbers"),
     "frames": ({"NumberOfFrames": "4"}, "several frames or colours"),
     "bits": ({"HighBit": 9}, "stores bits 0 to 9 of 16, 12 of them used"),
     "a slope of 0": ({"RescaleSlope": "0"}, "RescaleSlope = 0, expected a positive"),
     "no HU": ({"RescaleSlope": None}, r"rescale: .* grey values \(uint16\) that cannot be HU"),
+    "directions": (
+        {"ImageOrientationPatient": [1, 0, 0, 0, 2, 0]},
+        r"has ImageOrientationPatient of the lengths \[1\.0, 2\.0\]",
+    ),
     "size": ({"Rows": 8}, "holds 154 bytes of pixels, its header declares 176"),
 }
 
@@ -189,7 +193,18 @@ def test_compressed_slices_are_refused(tmp_path):
         one = pydicom.dcmread(path)
         one.compress("1.2.840.10008.1.2.5")
         one.save_as(path)
-    refused(folder, r"compressed \(RLE Lossless\), expected plain pixels")
+    refused(folder, r"compressed \('RLE Lossless'\), expected plain pixels")
+
+
+def test_old_names_and_words_of_a_metaimage_are_understood(expected, tmp_path):
+    path = write(tmp_path, ".mhd", *stored(corner(), (1, 0, 2)))
+    text = path.read_text().replace("TransformMatrix", "Rotation")
+    path.write_bytes(b"Comment = M\xfcnchen\n" + text.encode())
+    assert np.array_equal(body(path).labels, expected.labels)
+    path.write_text(re.sub("ElementSpacing = .*", "ElementSpacing = 1 1", text))
+    refused(path, "has ElementSpacing = '1 1', expected 3 numbers")
+    path.write_text(re.sub("Rotation = .*", "Rotation = 2 0 0 0 1 0 0 0 1", text))
+    refused(path, r"has Rotation of the lengths \[2\.0, 1\.0, 1\.0\], expected unit vectors")
 
 
 @pytest.mark.parametrize("kind", [".nii", ".mha", ".nrrd", ".tif"])

@@ -67,7 +67,7 @@ def test_our_reader_returns_what_we_wrote(tmp_path, name):
     assert np.array_equal(found.values() * slope + intercept, values) and found.spacing == SPACING
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.int32, np.float32, np.float64])
 @pytest.mark.parametrize("name", ["ct.nii.gz", "ct.mha"])
 def test_values_keep_their_type(tmp_path, name, dtype):
     values = np.abs(corner()).astype(dtype)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pydicom.uid import UID, ExplicitVRBigEndian, ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
 from ctsim.errors import InputError
-from ctsim.io.frame import Axes, axes_of
-from ctsim.io.payload import declared
+from ctsim.io.frame import Axes, axes_of, unit_vectors
+from ctsim.io.payload import declared, quoted
 from ctsim.io.volumefile import VolumeFile
 
 PLAIN = (ImplicitVRLittleEndian, ExplicitVRLittleEndian, ExplicitVRBigEndian)
@@ -61,10 +61,13 @@ def open_volume(path: Path) -> VolumeFile:
         raise InputError(f"{path} is one file; expected the folder that holds all slices of a series")
     slices = [found for file in sorted(path.iterdir()) if file.is_file() and (found := _read_slice(file))]
     if len(slices) < 2:
-        raise InputError(f"{path} holds {len(slices)} DICOM slices, expected a folder of one series of at least two")
+        raise InputError(
+            f"{path} holds {len(slices)} DICOM slices (not counting sub-folders), expected one series of at least two"
+        )
     _check_same(path, slices)
     first, shared = slices[0], slices[0].shared
-    along = np.array(shared["ImageOrientationPatient"]).reshape(2, 3)  # a row's direction, then a column's
+    key = "ImageOrientationPatient"  # a row's direction, then a column's
+    along = unit_vectors(first.path, key, np.reshape(shared[key], (2, 3)))
     slices.sort(key=lambda s: float(s.position @ np.cross(along[0], along[1])))
     dtype = _dtype(first)
     shape = declared(path, (len(slices), int(shared["Rows"][0]), int(shared["Columns"][0])), dtype)
@@ -96,7 +99,7 @@ def _read_slice(path: Path) -> Slice | None:
     if found is None or (found.get("Rows") is None and found.get("Modality") != "CT"):
         return None
     if (modality := found.get("Modality")) != "CT":
-        raise InputError(f"{path} has the Modality {modality}, expected CT")
+        raise InputError(f"{path} has the Modality {quoted(str(modality))}, expected CT")
     if (found.get("NumberOfFrames") or 1) != 1 or (found.get("SamplesPerPixel") or 1) != 1:
         raise InputError(f"{path} holds several frames or colours, expected one slice of grey values")
     tilt = _numbers(path, found, "GantryDetectorTilt", 1, optional=True)
@@ -127,7 +130,9 @@ def _dataset(path: Path, **options: Any) -> pydicom.FileDataset | None:
     if not isinstance(syntax, UID):
         raise InputError(f"{path} does not say how it is coded (TransferSyntaxUID); expected a DICOM slice")
     if syntax not in PLAIN:
-        raise InputError(f"{path} is compressed ({syntax.name}), expected plain pixels: gdcmconv --raw makes them")
+        raise InputError(
+            f"{path} is compressed ({quoted(syntax.name)}), expected plain pixels, as gdcmconv --raw writes"
+        )
     return pydicom.dcmread(io.BytesIO(data), **options)
 
 
@@ -149,7 +154,7 @@ def _numbers(path: Path, found: pydicom.Dataset, key: str, count: int, *, option
     except (TypeError, ValueError):
         values = ()
     if len(values) != count or not np.isfinite(values).all():
-        shown = "none" if value in (None, "") else str(value)[:60]
+        shown = "none" if value in (None, "") else quoted(str(value))
         raise InputError(f"{path} has the {key} {shown}, expected {count} finite number{'s' * (count > 1)}")
     return values
 
@@ -160,7 +165,7 @@ def _check_same(folder: Path, slices: list[Slice]) -> None:
     for one in slices:
         series.setdefault(one.series, []).append(one)
     if len(series) > 1:
-        names = [f"{len(found)} slices {found[0].description!r}" for found in list(series.values())[:5]]
+        names = [f"{len(found)} slices {quoted(found[0].description)}" for found in list(series.values())[:5]]
         raise InputError(
             f"{folder} holds {len(series)} series ({'; '.join(names)}{'; …' * (len(series) > 5)}); "
             "expected one: move the others to folders of their own"

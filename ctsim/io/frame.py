@@ -42,6 +42,15 @@ class Axes:
         return np.transpose(array, self.order)[back]
 
 
+def unit_vectors(path: Path, key: str, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return directions [n, 3]. Raises InputError unless each is 1 long: a longer one would pass for a spacing."""
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(rows, axis=1)
+    if not (np.abs(lengths - 1) <= SKEW).all():
+        raise InputError(f"{path} has {key} of the lengths {np.round(lengths, 4).tolist()}, expected unit vectors")
+    return rows
+
+
 def axes_of(steps: NDArray[np.float64], path: Path) -> Axes:
     """Find the axes from the steps between neighbours: row a is the step (x, y, z) in mm along array axis a.
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ctsim.dataset.durable import replacing
 from ctsim.errors import InputError
-from ctsim.io.frame import axes_of
-from ctsim.io.payload import beside, declared, inflated, raw
+from ctsim.io.frame import axes_of, unit_vectors
+from ctsim.io.payload import beside, declared, inflated, quoted, raw
 from ctsim.io.placed import Placed
 from ctsim.io.volumefile import VolumeFile
 
@@ -30,6 +30,8 @@ TYPES = {
     "MET_FLOAT": "f4",
     "MET_DOUBLE": "f8",
 }
+MATRICES = ("TransformMatrix", "Rotation", "Orientation")
+"""Names of the key with the directions; none of them means the identity."""
 LONGEST = 2**16  # bytes of a header
 _LAST = "ElementDataFile"  # the voxels begin after its line
 
@@ -43,7 +45,8 @@ def open_volume(path: Path) -> VolumeFile:
     shape = declared(path, _sizes(path, keys), dtype)
     offset = end if data == path else _skipped(path, keys)
     packed = _flag(keys, "CompressedData")
-    directions = np.reshape(_numbers(path, keys, "TransformMatrix", "1 0 0 0 1 0 0 0 1", 9), (3, 3))
+    key = next((key for key in MATRICES if key in keys), MATRICES[0])
+    directions = unit_vectors(path, key, np.reshape(_numbers(path, keys, key, "1 0 0 0 1 0 0 0 1", 9), (3, 3)))
     steps = directions * np.array(_numbers(path, keys, "ElementSpacing"))[:, None]
 
     def read() -> NDArray:
@@ -56,12 +59,10 @@ def open_volume(path: Path) -> VolumeFile:
 def write_volume(path: Path, volume: Placed) -> None:
     """Write a volume as .mha, not compressed. Raises InputError for a type that MetaImage lacks."""
     values = volume.values
-    known = {np.dtype(code): name for name, code in TYPES.items()}
+    known = {np.dtype(code): name for name, code in reversed(TYPES.items())}  # int before long
     kind = known.get(values.dtype)
     if kind is None:
-        raise InputError(
-            f"{path}: MetaImage has no {values.dtype}, expected one of {', '.join(sorted(set(TYPES.values())))}"
-        )
+        raise InputError(f"{path}: MetaImage has no {values.dtype}, expected one of {', '.join(map(str, known))}")
     header = {
         "ObjectType": "Image",
         "NDims": "3",
@@ -94,7 +95,7 @@ def _header(path: Path) -> tuple[dict[str, str], int]:
     end = 0
     while _LAST not in keys:
         line, newline, _ = head[end:].partition(b"\n")
-        key, equals, value = line.decode("ascii").partition("=")
+        key, equals, value = line.decode("utf-8", "replace").partition("=")
         if not equals or not (newline or key.strip() == _LAST):
             raise InputError(f"{path} is no MetaImage: its header has no line {_LAST} = …")
         keys[key.strip()] = value.strip()
@@ -108,14 +109,14 @@ def _check_kind(path: Path, keys: dict[str, str]) -> None:
     expected = {"ObjectType": "Image", "NDims": "3", "BinaryData": "True", "ElementNumberOfChannels": "1"}
     for key, value in expected.items():
         if keys.get(key, value).lower() != value.lower():
-            raise InputError(f"{path} has {key} = {keys[key]}, expected {value}")
+            raise InputError(f"{path} has {key} = {quoted(keys[key])}, expected {value}")
     if keys[_LAST].split()[:1] == ["LIST"] or "%" in keys[_LAST]:
         raise InputError(f"{path} has its voxels in several files; expected one")
 
 
 def _dtype(path: Path, keys: dict[str, str]) -> np.dtype:
     if (kind := keys.get("ElementType", "")) not in TYPES:
-        raise InputError(f"{path} has ElementType = {kind}, expected one of {', '.join(TYPES)}")
+        raise InputError(f"{path} has ElementType = {quoted(kind)}, expected one of {', '.join(TYPES)}")
     swapped = _flag(keys, "BinaryDataByteOrderMSB") or _flag(keys, "ElementByteOrderMSB")
     return np.dtype(TYPES[kind]).newbyteorder(">" if swapped else "<")
 
@@ -132,7 +133,7 @@ def _numbers(path: Path, keys: dict[str, str], key: str, default: str = "", coun
     except ValueError:
         values = []
     if len(values) != count:
-        raise InputError(f"{path} has {key} = {text}, expected {count} numbers")
+        raise InputError(f"{path} has {key} = {quoted(text)}, expected {count} numbers")
     return values
 
 
@@ -140,7 +141,7 @@ def _sizes(path: Path, keys: dict[str, str]) -> tuple[int, ...]:
     """Return the shape [k, j, i]."""
     values = _numbers(path, keys, "DimSize")
     if not all(v.is_integer() for v in values):
-        raise InputError(f"{path} has DimSize = {keys['DimSize']}, expected three integers")
+        raise InputError(f"{path} has DimSize = {quoted(keys['DimSize'])}, expected three integers")
     return tuple(int(v) for v in values[::-1])
 
 
@@ -151,5 +152,5 @@ def _skipped(path: Path, keys: dict[str, str]) -> int:
     except ValueError:
         size = -1
     if size < 0:
-        raise InputError(f"{path} has HeaderSize = {keys['HeaderSize']}, expected a number of bytes from 0")
+        raise InputError(f"{path} has HeaderSize = {quoted(keys['HeaderSize'])}, expected a number of bytes from 0")
     return size

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.io.frame import axes_of
-from ctsim.io.payload import beside, declared, inflated, raw
+from ctsim.io.payload import beside, declared, inflated, quoted, raw
 from ctsim.io.volumefile import VolumeFile
 
 TYPES = {
@@ -48,7 +48,7 @@ def open_volume(path: Path) -> VolumeFile:
     for key in ("line skip", "lineskip", "byte skip", "byteskip"):
         if fields.get(key, "0") != "0":
             raise InputError(
-                f"{path} has {key}: {fields[key]}, expected voxels that begin the file or follow the header"
+                f"{path} has {key}: {quoted(fields[key])}, expected voxels at the beginning or after the header"
             )
     offset = end if name is None else 0
     axes = axes_of(_steps(path, fields)[::-1], path)
@@ -71,7 +71,7 @@ def _header(path: Path) -> tuple[dict[str, str], int]:
     while end < len(head):
         line, _, _ = head[end:].partition(b"\n")
         end += len(line) + 1
-        text = line.decode("utf-8").rstrip("\r")
+        text = line.decode("utf-8", "replace").rstrip("\r")
         if not text:
             break
         key, colon, value = text.partition(": ")
@@ -88,7 +88,7 @@ def _needed(path: Path, fields: dict[str, str], key: str) -> str:
 
 def _known(path: Path, fields: dict[str, str], key: str, table: dict[str, str]) -> str:
     if (given := _needed(path, fields, key).lower()) not in table:
-        raise InputError(f"{path} has {key}: {given}, expected one of {', '.join(table)}")
+        raise InputError(f"{path} has {key}: {quoted(given)}, expected one of {', '.join(table)}")
     return table[given]
 
 
@@ -103,15 +103,15 @@ def _steps(path: Path, fields: dict[str, str]) -> NDArray[np.float64]:
     """Return the steps (x, y, z) in mm along the file's axes, the fastest first, in the patient's frame."""
     space = _needed(path, fields, "space").lower()
     if space not in SPACES:
-        raise InputError(f"{path} has space: {space}, expected one of {', '.join(SPACES)}")
+        raise InputError(f"{path} has space: {quoted(space)}, expected one of {', '.join(SPACES)}")
     units = fields.get("space units", "").replace('"', "").split()
     if any(unit != "mm" for unit in units):
-        raise InputError(f"{path} has space units {' '.join(units)}, expected mm")
+        raise InputError(f"{path} has space units: {quoted(' '.join(units))}, expected mm")
     text = _needed(path, fields, "space directions")
     try:
         rows = [[float(v) for v in row.split(",")] for row in text.strip("() ").replace(") (", ")(").split(")(")]
     except ValueError:
         rows = []
     if [len(row) for row in rows] != [3, 3, 3]:
-        raise InputError(f"{path} has space directions: {text}, expected three vectors of three numbers")
+        raise InputError(f"{path} has space directions: {quoted(text)}, expected three vectors of three numbers")
     return np.array(rows) * SPACES[space]

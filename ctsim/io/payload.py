@@ -16,8 +16,14 @@ from numpy.typing import NDArray
 from ctsim.dataset.arrayfile import check_size, check_volume
 from ctsim.errors import InputError
 
+QUOTED = 60  # characters of a header that a sentence repeats
 PIECE = 2**20  # bytes decoded at a time, so that a stream that ends early takes no room
 Shape = tuple[int, int, int]
+
+
+def quoted(text: str) -> str:
+    """Return what a header says for a sentence: short, and without characters that a terminal acts on."""
+    return repr(text if len(text) <= QUOTED else f"{text[:QUOTED]}…")
 
 
 def declared(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Shape:
@@ -31,9 +37,9 @@ def beside(header: Path, name: str) -> Path:
     """Return the data file that a header names. Raises InputError unless it lies in the header's own folder."""
     found = header.parent / name
     if found.resolve().parent != header.parent.resolve():  # of links, too
-        raise InputError(f"{header} names {name!r} as its data; expected the name of a file in the same folder")
+        raise InputError(f"{header} names {quoted(name)} as its data; expected the name of a file in the same folder")
     if not found.is_file():
-        raise InputError(f"{header} names {name!r} as its data, but there is no such file")
+        raise InputError(f"{header} names {quoted(name)} as its data, but there is no such file")
     return found
 
 
