@@ -131,7 +131,10 @@ def refused(path, words, **changes):
     [
         ({"spacing": (2.0, 1.5, 1.0)}, r"spacing: got \(2\.0, 1\.5, 1\.0\) mm, but .* says \(2\.0, 1\.5, 0\.8125\)"),
         ({"rescale": (1.0, -1000.0)}, r"rescale: got \(1\.0, -1000\.0\), but .* says \(1\.0, -1024\.0\)"),
-        ({"path": "nowhere"}, r"path: nowhere cannot be read \(No such file or directory\)"),
+        (
+            {"path": "nowhere"},
+            r"path: nowhere cannot be read .*; expected a folder of DICOM slices, NIfTI file",
+        ),
         ({"existing_metal": "keep"}, "existing_metal must be"),
         ({"metal_hu": 10.0}, "metal_hu must be within 1000 to 100000"),
     ],

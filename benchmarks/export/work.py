@@ -13,7 +13,7 @@ from ctsim.benchmarks.scores.artefact import effective_attenuation
 from ctsim.dataset.arrayfile import read_array
 from ctsim.dataset.store import StoredScan, open_scan
 from ctsim.errors import InputError
-from ctsim.io.formats import ENDS, WRITERS, load
+from ctsim.io.formats import FORMATS, load
 from ctsim.io.placed import Placed
 from ctsim.materials import attenuation
 
@@ -40,7 +40,7 @@ def export(given: Flags) -> None:
     if given.hu or given.to == "dicom":
         values, unit = _in_hu(stored, values, given), "HU"
     grid = stored.geometry
-    writer = load(WRITERS[given.to], given.out)
+    writer = load(FORMATS[given.to].writer, given.out)
     given.out.parent.mkdir(parents=True, exist_ok=True)
     writer.write_volume(
         given.out,
@@ -59,7 +59,7 @@ def export(given: Flags) -> None:
 def _check_out(out: Path, to: str) -> None:
     if out.exists():
         raise InputError(f"OUT: {out} is there already, expected a new name")
-    ends = ENDS[to]
+    ends = FORMATS[to].ends
     if not out.name.endswith(ends):
         raise InputError(f"OUT: {out} is to be {to}, expected a name that ends in {' or '.join(ends)}")
     if to == "dicom" and out.suffix in (".dcm", ".nii", ".mha"):

@@ -14,26 +14,24 @@ from ctsim.io.volumefile import VolumeFile
 
 
 class Format(NamedTuple):
-    """A format: its name in sentences, the ends of its files' names, and the module with `open_volume`."""
+    """A format: its name in sentences, the ends of its files' names, and the module with `open_volume`.
+
+    Where volumes are written in it, `writer` is the module with `write_volume`, and `ends` are the names that it takes.
+    """
 
     kind: str
     suffixes: tuple[str, ...]
     module: str
+    writer: str = ""
+    ends: tuple[str, ...] = ()
 
 
-DICOM = Format("folder of DICOM slices", (".dcm", ".ima"), "ctsim.io.dicom")
+DICOM = Format("folder of DICOM slices", (".dcm", ".ima"), "ctsim.io.dicom", "ctsim.io.dicomwrite", ("",))
+NIFTI = Format("NIfTI file", (".nii", ".nii.gz"), "ctsim.io.nifti", "ctsim.io.nifti", (".nii", ".nii.gz"))
+METAIMAGE = Format("MetaImage", (".mha", ".mhd"), "ctsim.io.metaimage", "ctsim.io.metaimage", (".mha",))
+NRRD = Format("NRRD file", (".nrrd", ".nhdr"), "ctsim.io.nrrd")
 PLAIN = Format("TIFF stack or .npy array", (".tif", ".tiff", ".npy"), "ctsim.io.plain")
-FORMATS = (
-    DICOM,
-    Format("NIfTI file", (".nii", ".nii.gz"), "ctsim.io.nifti"),
-    Format("MetaImage", (".mha", ".mhd"), "ctsim.io.metaimage"),
-    Format("NRRD file", (".nrrd", ".nhdr"), "ctsim.io.nrrd"),
-    PLAIN,
-)
-WRITERS = {"nifti": "ctsim.io.nifti", "mha": "ctsim.io.metaimage", "dicom": "ctsim.io.dicomwrite"}
-"""Modules with `write_volume` by the name of the format."""
-ENDS = {"nifti": (".nii", ".nii.gz"), "mha": (".mha",), "dicom": ("",)}
-"""How the name of a written file ends; DICOM is a folder."""
+FORMATS = {"dicom": DICOM, "nifti": NIFTI, "mha": METAIMAGE, "nrrd": NRRD, "plain": PLAIN}
 
 
 def open_volume(path: Path) -> VolumeFile:
@@ -41,9 +39,11 @@ def open_volume(path: Path) -> VolumeFile:
 
     Raises InputError, a sentence that begins with the path, for what cannot be read or is no single volume.
     """
-    found = DICOM if path.is_dir() else next((f for f in FORMATS if path.name.lower().endswith(f.suffixes)), PLAIN)
+    named = next((f for f in FORMATS.values() if path.name.lower().endswith(f.suffixes)), None)
     if not path.exists():
-        raise InputError(f"{path} cannot be read (No such file or directory); expected a {found.kind}")
+        kinds = named.kind if named else ", ".join(f.kind for f in FORMATS.values())
+        raise InputError(f"{path} cannot be read (No such file or directory); expected a {kinds}")
+    found = DICOM if path.is_dir() else named or PLAIN
     reader = load(found.module, path)
     with decoding(path, found.kind):
         volume: VolumeFile = reader.open_volume(path)
