@@ -89,6 +89,18 @@ def test_signs_and_overlays_in_the_bits_of_a_slice_are_understood(expected, tmp_
     assert np.array_equal(body(folder).labels, expected.labels)
 
 
+def test_slices_of_another_byte_order_are_understood(expected, tmp_path):
+    folder = write_slices(tmp_path / "slices", *stored(corner()))
+    for name, syntax, order in (("IM37", "1.2.840.10008.1.2.2", ">u2"), ("IM05", "1.2.840.10008.1.2", "<u2")):
+        one = pydicom.dcmread(folder / name)
+        one.PixelData = np.frombuffer(one.PixelData, "<u2").astype(order).tobytes()
+        one.file_meta.TransferSyntaxUID = syntax
+        assert len(list(one.iterall())) > 10  # decoded before they are written in another order
+        little = order == "<u2"
+        pydicom.dcmwrite(folder / name, one, implicit_vr=little, little_endian=little, enforce_file_format=True)
+    assert np.array_equal(body(folder).labels, expected.labels)
+
+
 def test_a_scene_says_what_its_file_says(tmp_path):
     path = write(tmp_path, ".mha", *stored(corner()))
     scene = 'name = "head"\nphantom = {{ recipe = "ct_volume", path = "{}", {} size = 20.0 }}\n'
@@ -104,6 +116,8 @@ def test_the_hash_of_a_folder_is_that_of_its_slices_whatever_their_names(tmp_pat
     folder = write_slices(tmp_path / "slices", *stored(corner()))
     before = CtVolume(path=str(folder))
     (folder / "notes.txt").write_text("not a slice")
+    with (folder / "backup.zip").open("wb") as file:
+        file.truncate(2**29)  # larger than any slice, and not read
     (folder / "IM00").rename(folder / "z")
     assert CtVolume(path=str(folder)).sha256 == before.sha256
     one = pydicom.dcmread(folder / "z")
@@ -161,6 +175,7 @@ DOUBTFUL = {
         {"ImageOrientationPatient": [1, 0, 0, 0, 2, 0]},
         r"has ImageOrientationPatient of the lengths \[1\.0, 2\.0\]",
     ),
+    "large size": ({"Rows": 20000, "Columns": 20000}, r"fewer than pixels of the shape \(5, 20000, 20000\)"),
     "size": ({"Rows": 8}, "holds 154 bytes of pixels, its header declares 176"),
 }
 

@@ -4,6 +4,7 @@ Rows and columns lie along ImageOrientationPatient; slices are ordered by ImageP
 """
 
 import io
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,8 @@ def open_volume(path: Path) -> VolumeFile:
     slices.sort(key=lambda s: float(s.position @ np.cross(along[0], along[1])))
     dtype = _dtype(first)
     shape = declared(path, (len(slices), int(shared["Rows"][0]), int(shared["Columns"][0])), dtype)
+    if math.prod(shape) * dtype.itemsize > (there := sum(s.path.stat().st_size for s in slices)):
+        raise InputError(f"{path} has {there} bytes, fewer than pixels of the shape {shape} that its slices declare")
     slope, intercept = shared["RescaleSlope"], shared["RescaleIntercept"]
     if slope and slope[0] <= 0:
         raise InputError(f"{first.path} has RescaleSlope = {slope[0]:g}, expected a positive number")
@@ -79,7 +82,7 @@ def open_volume(path: Path) -> VolumeFile:
     def read() -> NDArray[Any]:
         out = np.empty(shape, dtype.newbyteorder("="))
         for k, one in enumerate(slices):
-            out[k] = _pixels(one, dtype)
+            out[k] = _pixels(one)
         return out
 
     return VolumeFile(
@@ -121,11 +124,13 @@ def _read_slice(path: Path) -> Slice | None:
 
 def _dataset(path: Path, **options: Any) -> pydicom.FileDataset | None:
     """Parse a file, of which nothing is decompressed; None for a file that is no DICOM file."""
+    with path.open("rb") as file:
+        is_dicom = file.read(132)[128:] == b"DICM" or path.name.lower().endswith((".dcm", ".ima"))
+    if path.name == "DICOMDIR" or not is_dicom:
+        return None
     if path.stat().st_size > LARGEST:
         raise InputError(f"{path} has more than {LARGEST} bytes, expected a DICOM slice")
     data = path.read_bytes()  # not the file: of that, room would be made for what a length declares
-    if path.name == "DICOMDIR" or (data[128:132] != b"DICM" and not path.name.lower().endswith((".dcm", ".ima"))):
-        return None
     syntax = _coding(data)
     if not isinstance(syntax, UID):
         raise InputError(f"{path} does not say how it is coded (TransferSyntaxUID); expected a DICOM slice")
@@ -207,8 +212,9 @@ def _dtype(one: Slice) -> np.dtype[Any]:
     return np.dtype(f"{'>' if one.big_endian else '<'}{'i' if signed else 'u'}{allocated // 8}")
 
 
-def _pixels(one: Slice, dtype: np.dtype[Any]) -> NDArray[Any]:
+def _pixels(one: Slice) -> NDArray[Any]:
     """Return the stored values of a slice; bits outside of those that are used are left out."""
+    dtype = _dtype(one)
     found = _dataset(one.path)
     data = found.get("PixelData") if found is not None else None
     rows, columns = (int(one.shared[key][0]) for key in ("Rows", "Columns"))
