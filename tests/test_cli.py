@@ -94,7 +94,7 @@ def test_what_cannot_go_on_does_not_say_that_it_will(monkeypatch, capsys):
     [
         (cli.make_dataset, ["quick", "out", "--dry-run", "--only", "broccoli-Al"], "broccoli-Al"),
         (cli.make_dataset, ["–", "out"], ""),
-        (cli.run_benchmark, ["data", "r", "--table"], "Lost: dB"),
+        (cli.run_benchmark, ["data", "r", "--table"], "lost: dB"),
         (cli.run_benchmark, ["paper-tables", "r", "--table", "3"], "| – |"),
         (cli.run_benchmark, ["paper-tables", "r\udcff"], ""),
     ],

@@ -242,7 +242,7 @@ def test_a_scan_with_lag_goes_on_with_the_same_bytes(first):
 def test_only_the_views_that_matter_are_made_again(monkeypatch):
     made = []
     monkeypatch.setattr(
-        "ctsim.simulate.stream_key", lambda scene, what, k: made.append(k) or rng.stream_key(scene, what, k)
+        "ctsim.readout.stream_key", lambda scene, what, k: made.append(k) or rng.stream_key(scene, what, k)
     )
     n = 20
     scanner = machine(lag=LAG, geometry=msgspec.structs.replace(GEOMETRY, n_views=n))

@@ -154,7 +154,7 @@ def _fine(reference: NDArray[np.float64], truth: Truth, classes: dict[str, Mask]
     """
     found = np.zeros_like(truth.tissue)
     for mask in classes.values():
-        found |= mask & ~ndimage.binary_opening(mask, np.ones((FINE,) * 3, np.bool_))
+        found |= mask & np.logical_not(ndimage.binary_opening(mask, np.ones((FINE,) * 3, np.bool_)))
     strong: Mask = (reference > SOFT_HU) | (reference < AIR_HU) | ~truth.body
     away = truth.tissue & ~dilate(strong, 2)
     return dilate(found & away, 2) & away
