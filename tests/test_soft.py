@@ -220,6 +220,10 @@ def test_a_painted_bar_is_counted(scan):
     # bone has 1500 HU, muscle 60: half-way are 720 more than muscle's own
     assert structures(scan, np.where(bar, 719.0, 0.0))["false_bone"] == 0
     assert structures(scan, np.where(bar, 721.0, 0.0))["false_bone"] > 0
+    # where bone has 4000 HU, half-way would be 2030: false bone begins at 1000, which is 940 more than muscle
+    dense = (*scan[:3], structure_layout(scan[2], truth_of(scan[0]), 5.0))
+    assert structures(dense, np.where(bar, 939.0, 0.0))["false_bone"] == 0
+    assert structures(dense, np.where(bar, 941.0, 0.0))["false_bone"] > 0
     # air lies 1060 below muscle
     assert structures(scan, np.where(bar, -529.0, 0.0))["false_air"] == 0
     assert structures(scan, np.where(bar, -531.0, 0.0))["false_air"] > 0

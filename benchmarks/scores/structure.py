@@ -20,6 +20,8 @@ from ctsim.benchmarks.scores.protocol import Truth
 from ctsim.benchmarks.scores.score import COLUMNS, Score
 from ctsim.benchmarks.scores.soft import SoftLayout
 
+BONE_HU = 1000.0
+"""What attenuates twice as much as water reads as bone, whatever cortical bone has under a soft spectrum."""
 REGION = (
     "soft tissue without its outermost voxel, within 5 mm of the metal or between two pieces of it, outside the metal "
     "dilated by 2 voxels"
@@ -68,14 +70,16 @@ def between_metal(truth: Truth) -> Mask:
 def structure_score(values: NDArray[Any], layout: StructureLayout | str) -> Score:
     """Score false bone and false air; all None with the reason where the layout is a sentence.
 
-    A voxel reads as bone where it is nearer to cortical bone than to its own reference, as air where nearer to air.
+    A voxel reads as bone above `BONE_HU`, or where it is nearer to cortical bone than to its own reference if that is
+    less; as air where it is nearer to air.
     """
     if isinstance(layout, str):
         return Score.none(REGION, COLUMNS["structure"], layout)
     region = layout.near | layout.between
     reference = layout.soft.reference[region]
     hu = (values[region].astype(np.float64) / layout.soft.water - 1) * 1000
-    bone, air = hu > (reference + layout.bone) / 2, hu < (reference + layout.air) / 2
+    bone = hu > np.minimum((reference + layout.bone) / 2, BONE_HU)
+    air = hu < (reference + layout.air) / 2
     parts = {"": np.ones_like(bone), "_near": layout.near[region], "_between": layout.between[region]}
     found: dict[str, float | None] = {}
     for end, part in parts.items():
