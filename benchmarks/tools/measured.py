@@ -58,8 +58,8 @@ STUDIES, SUITES = "benchmarks/studies/", "benchmarks/suites/"
 PAGES: dict[str, Page] = {
     "results": Page(
         title="Results",
-        command="run-benchmark report quick --markdown docs/measured/results.md --also core-scatter",
-        sources=(*METHODS, "benchmarks/scores/", f"{SUITES}quick.toml", f"{SUITES}core-scatter.toml"),
+        command="run-benchmark report quick --markdown docs/measured/results.md --also headline",
+        sources=(*METHODS, "benchmarks/scores/", f"{SUITES}quick.toml", f"{SUITES}headline.toml"),
     ),
     "sensitivity": Page(
         title="Which score sees which fault",
