@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import msgspec
 import numpy as np
@@ -15,7 +15,7 @@ from ctsim.solids import Solid
 from ctsim.types import Phantom
 
 REACH = 0.92
-"""Every object stays within this share of its cube: radius and half height are REACH·size/2."""
+"""Every object stays within this share of its cube: the radius is REACH·size/2, the half height at most that."""
 
 FINEST = 200
 """The finest texture, in correlation lengths along the cube's edge."""
@@ -28,6 +28,9 @@ InsertCount = Annotated[int, msgspec.Meta(ge=0, le=16)]
 
 class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="recipe"):
     """Settings common to all recipes."""
+
+    height: ClassVar[float] = REACH
+    """Height of the object as a share of its cube's edge."""
 
     n_voxel: tuple[Side, Side, Side] = (96, 96, 96)
     """Label grid (z, y, x) over the cube: how finely the body is drawn, never its shape."""

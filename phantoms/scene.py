@@ -47,28 +47,31 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise InputError(f"name: {self.name!r} is what the data folder's own index is called; expected another")
         if not 0 <= self.seed < 2**63:
             raise InputError(f"seed must be within 0 to 2^63 - 1, got {self.seed}")
-        _check_imaging(self.scanner, self.phantom.size, self.truncated)
+        _check_imaging(self.scanner, (self.phantom.size, self.phantom.height), self.truncated)
 
     def resolve(self) -> Scanner:
         """Return the scanner with the preset and its overrides worked out."""
         return self.scanner.resolve(self.phantom.size)
 
 
-def _check_imaging(settings: ScannerSettings, size: float, truncated: bool) -> None:
-    """Refuse a scanner that cannot image an object of a cube of `size` mm; most scenes of a suite have the same."""
+def _check_imaging(settings: ScannerSettings, body: tuple[float, float], truncated: bool) -> None:
+    """Refuse a scanner that cannot image the object; most scenes of a suite have the same.
+
+    `body` is the edge (mm) of the object's cube and the share of it that the object's height takes.
+    """
     try:
-        _known_to_image(settings, size, truncated)
+        _known_to_image(settings, body, truncated)
     except TypeError:  # lists, which cannot be remembered, where a scene was not read from a file
-        _known_to_image.__wrapped__(settings, size, truncated)
+        _known_to_image.__wrapped__(settings, body, truncated)
 
 
 @functools.lru_cache(16)
-def _known_to_image(settings: ScannerSettings, size: float, truncated: bool) -> None:
+def _known_to_image(settings: ScannerSettings, body: tuple[float, float], truncated: bool) -> None:
     try:
-        scanner = settings.resolve(size)
+        scanner = settings.resolve(body[0])
     except InputError as error:
         raise InputError(f"scanner.{error}") from error
-    check_geometry(scanner.geometry, size, truncated)
+    check_geometry(scanner.geometry, body[0], truncated, height=body[1])
 
 
 def build(scene: Scene) -> Phantom:
@@ -146,8 +149,8 @@ def _plain(value: Any) -> Any:
     return [_plain(v) for v in value] if isinstance(value, tuple | list) else value
 
 
-def check_geometry(geometry: Geometry, size: float, truncated: bool) -> None:
-    """Refuse a geometry that cannot image an object of a cube of `size` mm.
+def check_geometry(geometry: Geometry, size: float, truncated: bool, height: float = REACH) -> None:
+    """Refuse a geometry that cannot image an object of a cube of `size` mm, `height` times as tall.
 
     Raises `InputError` when the source comes inside the object or the reconstructed volume, when no
     view sees the object, and when a view cuts it off although `truncated` is false.
@@ -156,7 +159,7 @@ def check_geometry(geometry: Geometry, size: float, truncated: bool) -> None:
     _check_source(poses[:, :3], geometry, size)
     if geometry.poses is None:
         poses = poses[:: max(1, len(poses) // 1000)]  # on a circle every view casts the same shadow
-    u, v = _shadow(poses, size)
+    u, v = _shadow(poses, size, height)
     half_v, half_u = ((n / 2) for n in geometry.n_detector)
     seen = (u.min(1) < half_u) & (u.max(1) > -half_u) & (v.min(1) < half_v) & (v.max(1) > -half_v)
     if not seen.any():
@@ -190,11 +193,11 @@ def _check_source(source: NDArray[np.float64], geometry: Geometry, size: float) 
         )
 
 
-def _shadow(poses: NDArray[np.float64], size: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _shadow(poses: NDArray[np.float64], size: float, height: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Detector coordinates (pixels from the centre) of the object's bounding cylinder: u, v [view, point]."""
     angle = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     ring = REACH * size / 2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
-    points = np.concatenate([np.add(ring, [0, 0, h]) for h in (-REACH * size / 2, REACH * size / 2)])
+    points = np.concatenate([np.add(ring, [0, 0, h]) for h in (-height * size / 2, height * size / 2)])
     source, centre, du, dv = (poses[:, k : k + 3] for k in (0, 3, 6, 9))
     normal = np.cross(du, dv)
     ray = points[None] - source[:, None]

@@ -22,6 +22,7 @@ N = 96
 KINDS = pytest.mark.parametrize("kind", (Hip, Spine))
 SEEDED = pytest.mark.parametrize("seed", (1, 2, 3))
 BONES = ("cortical_bone", "spongiosa")
+SIZE = 60.0
 CAPPED = slice(int(N * 0.22), int(N * 0.78))  # slices between the planes in which these bodies are cut, and 1 mm
 
 
@@ -137,8 +138,32 @@ def test_restorations_sit_in_teeth_and_need_free_ones(seed: int) -> None:
     assert not any(s.metal for s in body(Teeth, seed, metal="none", fillings=4, bridges=2).solids)
 
 
+@SEEDED
+def test_a_plug_lies_where_the_artery_enters_the_kidney(seed: int) -> None:
+    plain, full = body(Spine, seed), body(Spine, seed, plug="W")
+    assert np.array_equal(plain.labels, full.labels) and full.solids[:-1] == plain.solids
+    plug = full.solids[-1]
+    assert (plug.material, plug.metal) == ("W", True)
+    inside = cells(full, [plug])
+    assert part(full, "adipose", "blood", "soft_tissue", "kidney")[inside].all()
+    grown = ndimage.binary_dilation(inside, iterations=2)
+    assert part(full, "kidney")[grown].any() and part(full, "blood")[grown].any()
+    assert body(Spine, seed, metal="none", plug="W").solids == ()
+
+
+@SEEDED
+@KINDS
+def test_a_body_is_as_tall_as_it_says(kind: type[Hip] | type[Spine], seed: int) -> None:
+    phantom = body(kind, seed)
+    half = kind.height * SIZE / 2
+    z = (np.arange(N) + 0.5) * SIZE / N - SIZE / 2
+    for filled in (phantom.labels > 0, cells(phantom, list(phantom.solids))):
+        assert np.abs(z[filled.any((1, 2))]).max() <= half
+    assert np.abs(z[phantom.labels.any((1, 2))]).max() > half - SIZE / N
+
+
 def test_the_second_metal_is_checked_and_told() -> None:
-    for kind, key in ((Hip, "head"), (Spine, "rods")):
+    for kind, key in ((Hip, "head"), (Spine, "rods"), (Spine, "plug")):
         with pytest.raises(InputError, match=f"^{key}: unknown material"):
             kind(**{key: "CoCrr"})
         assert any(s.material == "W" for s in body(kind, 1, **{key: "W"}).solids)

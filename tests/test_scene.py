@@ -176,6 +176,7 @@ def test_the_defaults_of_later_keys_stay() -> None:
     known = {kind.__name__: body for kind in BUILDERS} | {
         "CtVolume": {**body, "existing_metal": "refuse", "metal_hu": 3000.0},
         "Teeth": {**body, "fillings": 0, "gold_crowns": 0, "bridges": 0},
+        "Spine": {**body, "plug": "none"},
         "ScannerSettings": {"scan_kerma": None, "scan_mas": None},
         "Tube": {"falloff": False, "focal_spot": None, "off_focal": None},
         "Detector": {"blur": None, "lag": ()},

@@ -4,7 +4,7 @@ One relative unit is about 190 mm in a patient; the cube's `size` scales it. Pat
 +z; the hip joints are at z = 0.
 """
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from ctsim.solids import Solid
 from ctsim.types import Phantom
 
 END = 0.62  # |z| of the planes in which the body is cut
+SHRINK = 0.95  # of a relative unit to half the cube's edge
 HEAD = np.array([0.47, -0.02, 0.0])  # centre of the left joint
 OPENING = np.array([0.66, 0.26, -0.70])  # way in which the left socket opens: 45° down, 20° forward
 KNEE = np.array([0.54, 0.0, -0.70])  # where the left shaft's axis goes
@@ -44,6 +45,8 @@ class Hip(Recipe, frozen=True, kw_only=True, tag="hip"):
     `metal` is that of cups and stems. `n_inserts` is the number of replaced joints, the left one first (2 by
     default); `insert_mm` is a head's diameter.
     """
+
+    height: ClassVar[float] = END * SHRINK
 
     metal: str = "Ti"
     head: str = "CoCr"
@@ -58,7 +61,7 @@ class Hip(Recipe, frozen=True, kw_only=True, tag="hip"):
 def hip(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Hip) -> Phantom:
     """Draw a pelvis with muscles, bladder, bowel and vessels; metal: a cup, a head and a stem a side."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel, shrink=0.95, shift=params.grid_shift)
+    canvas = Canvas(n, d_voxel, shrink=SHRINK, shift=params.grid_shift)
     wall = _body(canvas, body)
     _muscles(canvas, body, wall)
     _organs(canvas, body)

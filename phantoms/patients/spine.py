@@ -1,10 +1,10 @@
-"""A slice of the abdomen about the lumbar spine, with pedicle screws and the rods that join them.
+"""A slice of the abdomen about the lumbar spine, with pedicle screws, the rods that join them, and a vessel's plug.
 
 One relative unit is about 170 mm in a patient; the cube's `size` scales it. Patient's left is +x, front is +y, head is
 +z; the third lumbar vertebra is at z = 0.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -33,10 +33,12 @@ from ctsim.solids import Solid
 from ctsim.types import Phantom
 
 END = 0.62  # |z| of the planes in which the body is cut
+SHRINK = 0.95  # of a relative unit to half the cube's edge
 PITCH, HEIGHT = 0.215, 0.160  # of a vertebra with its disc, and of the vertebra
 LEVELS = (0, 1, -1, 2, -2)  # vertebrae that carry screws, in order of use
 ENTRY = np.array([0.135, -0.215, 0.012])  # of the left screw, from its vertebra's middle
 TIP = np.array([0.060, 0.055, -0.002])
+PLUG, WIDE = (0.335, -0.05, 0.21), 0.048  # where the artery enters the left kidney; 8 mm in a patient
 
 
 class Spine(Recipe, frozen=True, kw_only=True, tag="spine"):
@@ -46,20 +48,26 @@ class Spine(Recipe, frozen=True, kw_only=True, tag="spine"):
     `insert_mm` is a screw's diameter.
     """
 
+    height: ClassVar[float] = END * SHRINK
+
     metal: str = "Ti"
     rods: str = "CoCr"
     """Material of the rods."""
+    plug: str = "none"
+    """Material of the plug that closes the left kidney's artery, such as W: a nest of coils, drawn as one ball."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         Recipe.__post_init__(self)
         self.known("rods")
+        if self.plug != "none":
+            self.known("plug")
 
 
 def spine(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Spine) -> Phantom:
     """Draw an abdomen with kidneys, aorta, bowel and five vertebrae; metal: screws in pedicles, two rods."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel, shrink=0.95, shift=params.grid_shift)
+    canvas = Canvas(n, d_voxel, shrink=SHRINK, shift=params.grid_shift)
     wall = _body(canvas, body)
     _muscles(canvas, wall)
     _organs(canvas, body)
@@ -234,4 +242,6 @@ def _metal(rng: np.random.Generator, params: Spine, unit: float) -> list[Solid]:
             ends = at[[0, -1]] + np.array([[0, 0, -0.05], [0, 0, 0.05]])
             points = np.concatenate([ends[:1], at, ends[1:]])
             solids.append(rod.wire(f"rod-{'left' if side > 0 else 'right'}", points, 0.85 * d))
+    if params.plug != "none" and params.metal != "none":
+        solids.append(Inserts(params.plug, unit).ball("plug", PLUG, WIDE * unit))
     return solids
