@@ -1,10 +1,12 @@
-"""What a user of a scan should know of it and would not look for: that its metal is on no grid or in no view."""
+"""What a user of a scan should know of it and would not look for: whether its metal is on the grid and in view."""
+
+from collections.abc import Iterable
 
 import msgspec
 import numpy as np
 
 from ctsim.geometry import Geometry
-from ctsim.tracer.project import Response, Tracer, transmit
+from ctsim.tracer.project import Response, Tracer, path_lengths, transmit
 from ctsim.tracer.shadow import primitive_corners, row_spans
 from ctsim.tracer.voxelise import metal_mask
 from ctsim.types import Phantom
@@ -22,10 +24,7 @@ def metal_notes(phantom: Phantom, geometry: Geometry, response: Response, subray
     metals = ", ".join(sorted({s.material for s in phantom.solids if s.metal}))
     if not metals:
         return ()
-    # the body does not matter, and is left out: so a view costs next to nothing
-    solids = Phantom(
-        labels=np.zeros((1, 1, 1), np.uint8), materials=phantom.materials, d_voxel=(1, 1, 1), solids=phantom.solids
-    )
+    solids = _solids(phantom)
     tracer = Tracer.of(solids)
     notes = []
     if not _on_grid(solids, tracer, geometry):
@@ -33,6 +32,27 @@ def metal_notes(phantom: Phantom, geometry: Geometry, response: Response, subray
     if not any(_in_view(tracer, geometry, view, response, subrays) for view in range(geometry.n_views)):
         notes.append(f"no metal in any view: without {metals} no pixel would read 1 % more or less")
     return tuple(notes)
+
+
+def metal_share(phantom: Phantom, geometry: Geometry, views: Iterable[int] | None = None) -> float:
+    """Return the share of all rays through pixel centres that meet metal, in these views or in all."""
+    tracer = Tracer.of(_solids(phantom))
+    metal = np.array([any(s.metal and s.material == m for s in phantom.solids) for m in phantom.materials])
+    if not metal.any():
+        return 0.0
+    nothing = np.zeros((len(tracer.materials), *geometry.n_detector), np.float32)
+    shares = [
+        float((path_lengths(tracer, geometry, view, nothing)[metal].sum(0) > 0).mean())
+        for view in (range(geometry.n_views) if views is None else views)
+    ]
+    return float(np.mean(shares))
+
+
+def _solids(phantom: Phantom) -> Phantom:
+    """Return the solids without the body, which then cost next to nothing a view."""
+    return Phantom(
+        labels=np.zeros((1, 1, 1), np.uint8), materials=phantom.materials, d_voxel=(1, 1, 1), solids=phantom.solids
+    )
 
 
 def _on_grid(solids: Phantom, tracer: Tracer, geometry: Geometry) -> bool:

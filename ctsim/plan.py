@@ -163,7 +163,7 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
     present = present_materials(phantom) if simulation.skip else phantom.materials
     if len(present) == 1 and not phantom.solids:
         raise InputError("the scene is empty: its labels are all air and it has no solids")
-    source, tracer = spectrum(scanner.tube), Tracer.of(phantom)
+    source, tracer = spectrum(scanner.tube), Tracer.of(phantom, geometry=all_rays(scanner))
     found = survey(tracer, scanner.geometry)
     a1, _ = response(scanner.detector, source.energies)
     if not (source.weights * a1).any():
@@ -176,7 +176,7 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
     tried = trial(tracer, scanner.geometry, seen, settings=simulation, twin=twin)
     levels = density_levels(phantom)
     tissues = tuple(levels[m][0] for m in present)
-    outputs = _outputs(phantom, scanner, truth, len(set(tissues)))
+    outputs = _outputs(any(s.metal for s in phantom.solids), scanner, truth, len(set(tissues)))
     spot = _spot(tracer, scanner, simulation)
     n_rays, n_voxels = int(np.prod(scanner.geometry.shape)), int(np.prod(scanner.geometry.n_voxel))
     draws = n_rays * (2 if twin else 1) * (scanner.noise.model != "none")
@@ -212,6 +212,12 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
         memory_bytes=_memory_bytes(phantom, scanner.geometry) + _lag_bytes(scanner, outputs),
         notes=metal_notes(phantom, scanner.geometry, seen, simulation.subrays),
     )
+
+
+def all_rays(scanner: Scanner) -> Geometry | None:
+    """Return the geometry if its rays are all there are; None where a focal spot has more than one point."""
+    spread = scanner.tube.focal_spot is not None or scanner.tube.off_focal is not None
+    return None if spread else scanner.geometry
 
 
 def _rule(
@@ -276,7 +282,12 @@ def _has_twin(phantom: Phantom, truth: Truth) -> bool:
     return truth.twin and any(s.metal for s in phantom.solids)
 
 
-def _outputs(phantom: Phantom, scanner: Scanner, truth: Truth, n_tissues: int) -> tuple[Output, ...]:
+def disk_estimate(scanner: Scanner, truth: Truth, *, metal: bool, n_tissues: int) -> int:
+    """Return the bytes of a scan of a phantom that is not known: whether with metal, and of how many materials."""
+    return _disk_bytes(_outputs(metal, scanner, truth, n_tissues), scanner.geometry, metal and truth.twin)
+
+
+def _outputs(metal: bool, scanner: Scanner, truth: Truth, n_tissues: int) -> tuple[Output, ...]:
     image = scanner.geometry.n_detector
     counts = np.dtype(scanner.noise.dtype).name
     asked = [Output(name="counts", shape=image, dtype=counts)]
@@ -286,8 +297,8 @@ def _outputs(phantom: Phantom, scanner: Scanner, truth: Truth, n_tissues: int) -
         asked.append(Output(name="scatter_free", shape=image, dtype="float32"))
     asked += [Output(name=f"mono_{e:g}kev", shape=image, dtype="float32") for e in truth.mono_kev]
     twins = [Output(name=f"metal_free/{o.name}", shape=o.shape, dtype=o.dtype) for o in asked]
-    asked += twins if _has_twin(phantom, truth) else []
-    if any(s.metal for s in phantom.solids):
+    asked += twins if metal and truth.twin else []
+    if metal:
         if truth.trace:
             asked.append(Output(name="trace", shape=image, dtype="uint8"))
         if truth.metal_path:

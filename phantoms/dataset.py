@@ -1,7 +1,9 @@
 """Datasets: one scene simulated into a folder, with its truth, so that a stopped run goes on where it was."""
 
 import contextlib
+import functools
 import hashlib
+import operator
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -10,14 +12,18 @@ import msgspec
 import numpy as np
 
 from ctsim.beam.spectrum import spectrum
+from ctsim.dataset.manifest import About
 from ctsim.dataset.writer import SceneWriter, Stack
 from ctsim.detector.response import response
 from ctsim.errors import InputError
-from ctsim.phantoms.scene import Scene, build, scene_id, scene_to_toml, stream_id
-from ctsim.plan import Plan, make_plan
+from ctsim.notes import metal_share
+from ctsim.phantoms.scene import Scene, build, individual, scene_id, scene_to_toml, stream_id
+from ctsim.phantoms.vary import Drawn
+from ctsim.plan import Plan, disk_estimate, make_plan
 from ctsim.simulate import Scattered, scan_info, scatter_of, simulate_views, truth_volumes
 from ctsim.types import Phantom, Scanner
 
+FEW_TISSUES = 7  # air among them: what recipes have, mostly
 Watch = Callable[[Iterable[Any], int, int], Iterable[Any]]
 """Passes on views while it shows how far they are: (views, number of the first, number of all) -> the same views."""
 
@@ -36,14 +42,14 @@ def make_scene(
     scene: Scene,
     out: Path,
     *,
-    plan: Plan | None = None,
     force: bool = False,
     watch: Watch = lambda views, first, n: views,
+    tell: Callable[[str], object] = lambda note: None,
 ) -> Path:
     """Simulate a scene into the data folder `out` and return its folder.
 
-    Goes on after the last view that an earlier run of the same scene and code left safe. `plan` is that of
-    `plan_scene`, where it is known; with `force`, another scene of the same name is replaced.
+    Goes on after the last view that an earlier run of the same scene and code left safe. With `force`, another scene
+    of the same name is replaced. `tell` gets the notes of the plan before the simulation begins.
 
     Raises
     ------
@@ -52,7 +58,9 @@ def make_scene(
     """
     with _memory(scene.name):
         phantom, scanner = build(scene), scene.resolve()
-        plan = plan or _plan(scene, phantom, scanner)
+        plan = _plan(scene, phantom, scanner)
+        for note in plan.notes:
+            tell(note)
         stacks = tuple(
             Stack(
                 name=o.name,
@@ -71,7 +79,24 @@ def make_scene(
                 writer.put(view, arrays)
             _write_truth(writer, plan, phantom, scanner, scatter)
             writer.write_text("scene.toml", scene_to_toml(scene))
-            return writer.finish()
+            return writer.finish(about(scene, phantom, scanner) if scene.drawn else None)
+
+
+def about(scene: Scene, phantom: Phantom, scanner: Scanner) -> About:
+    """Return what the index says of a drawn scene."""
+    drawn, plain = scene.drawn or Drawn(table="", index=0), msgspec.to_builtins(scene)
+    return About(
+        individual=individual(scene),
+        split=drawn.split,
+        metal_share=metal_share(phantom, scanner.geometry),
+        drawn={key: functools.reduce(operator.getitem, key.split("."), plain) for key in drawn.keys},
+    )
+
+
+def disk_bytes(scene: Scene) -> int:
+    """Estimate what a scene takes on disk without building it: path lengths as of `FEW_TISSUES` materials."""
+    metal = scene.phantom.metal != "none"
+    return disk_estimate(scene.resolve(), scene.truth, metal=metal, n_tissues=FEW_TISSUES)
 
 
 def _write_truth(writer: SceneWriter, plan: Plan, phantom: Phantom, scanner: Scanner, scatter: Scattered) -> None:

@@ -48,12 +48,13 @@ BUILDERS: dict[type[Recipe], Builder] = {
 NAMES = tuple(str(kind.__struct_config__.tag) for kind in BUILDERS)
 
 
-def build_recipe(params: Recipe, seed: int) -> Phantom:
+def build_recipe(params: Recipe, seed: int, again: int = 0) -> Phantom:
     """Build the phantom of a recipe; the same settings and seed give the same phantom.
 
-    Raises `InputError` when nothing is left to scan.
+    `again` counts further draws of the same individual. Raises `InputError` when nothing is left to scan.
     """
-    digest = hashlib.sha256(f"{params.recipe}/{seed}".encode()).digest()
+    name = f"{params.recipe}/{seed}" + (f"/again {again}" if again else "")
+    digest = hashlib.sha256(name.encode()).digest()
     rng = np.random.default_rng(np.frombuffer(digest, np.uint32))
     phantom = BUILDERS[type(params)](params.n_voxel, params.d_voxel, rng, params)
     if not phantom.labels.any() and not phantom.solids:

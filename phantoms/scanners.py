@@ -98,6 +98,7 @@ def preset(
 ) -> Scanner:
     """Return a preset scanner whose square pixels and voxels cover a cube of `object_mm`.
 
+    One row of several pixels covers a slice: one layer of voxels is then as thick as the row is high on the axis.
     Raises `InputError` for an unknown name and for an object that the panel cannot cover.
     """
     if name not in MACHINES:
@@ -111,6 +112,9 @@ def preset(
         need = [s * MARGIN for s in shadow(machine.dso, machine.dsd, object_mm)]
     except InputError as error:
         raise InputError(f"preset {name!r}, phantom.size = {object_mm} mm: {error}") from None
+    fan = n_detector[0] == 1 < n_detector[1]
+    if fan:
+        need[0] = need[1] / n_detector[1]
     if need[0] > machine.panel[0] or need[1] > machine.panel[1]:
         raise InputError(
             f"preset {name!r}: an object of {object_mm} mm needs {need[0]:.0f} x {need[1]:.0f} mm of panel (v, u), "
@@ -118,6 +122,8 @@ def preset(
         )
     pixel = max(s / n for s, n in zip(need, n_detector, strict=True))
     z, y, x = (object_mm / n for n in n_voxel)
+    if fan and n_voxel[0] == 1:
+        z = pixel * machine.dso / machine.dsd
     geometry = Geometry(
         dso=machine.dso,
         dsd=machine.dsd,
@@ -194,7 +200,9 @@ class ScannerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
             names = ("start_deg", "arc_deg", "angles_deg", "off_detector", "off_origin")
             changes = {k: getattr(self, k) for k in names if getattr(self, k) is not None}
             if self.field_mm is not None:
-                changes["d_voxel"] = tuple(self.field_mm / n for n in n_voxel)
+                z, *across = (self.field_mm / n for n in n_voxel)
+                slices = n_voxel[0] == scanner.geometry.n_detector[0] == 1 < scanner.geometry.n_detector[1]
+                changes["d_voxel"] = (scanner.geometry.d_voxel[0] if slices else z, *across)
             if self.angles_deg is not None and self.n_views is None:
                 changes["n_views"] = len(self.angles_deg)
             scanner = msgspec.structs.replace(scanner, geometry=msgspec.structs.replace(scanner.geometry, **changes))

@@ -18,8 +18,12 @@ from ctsim.phantoms.identity import identity
 from ctsim.phantoms.recipes import AnyRecipe, build_recipe
 from ctsim.phantoms.scanners import REACH, ScannerSettings
 from ctsim.phantoms.suites import NULL, decode, parse_toml, read_toml, scenes_of
+from ctsim.phantoms.vary import Drawn, expand, individual_of
+from ctsim.phantoms.visible import build_in_view
 from ctsim.settings import Simulation, Truth
 from ctsim.types import Phantom, Scanner
+
+_LATER = {"metal_in_view": False, "drawn": None}  # keys that old ids mean by their default: see `identity`
 
 
 class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -39,6 +43,13 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Which ground truth is written in addition to the references."""
     simulation: Simulation = Simulation()
     """Accuracy of the simulation."""
+    metal_in_view: bool = False
+    """Draw the object again until a view shows metal; a scan of one row is of a slice with metal.
+
+    Where `count` stands, it is true unless it is stated.
+    """
+    drawn: Drawn | None = None
+    """Where a scene of a table with `count` comes from."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", self.name):
@@ -75,8 +86,18 @@ def _known_to_image(settings: ScannerSettings, body: tuple[float, float], trunca
 
 
 def build(scene: Scene) -> Phantom:
-    """Build the scene's phantom, the same for the same recipe and seed."""
+    """Build the scene's phantom, the same for the same recipe and seed.
+
+    Raises InputError where the scene asks for metal in view and there is none.
+    """
+    if scene.metal_in_view:
+        return build_in_view(scene.phantom, scene.seed, scene.resolve().geometry)
     return build_recipe(scene.phantom, scene.seed)
+
+
+def individual(scene: Scene) -> str:
+    """Name whose body is scanned; scans of one individual must not be divided between training and test."""
+    return individual_of(scene.phantom.recipe, scene.seed, getattr(scene.phantom, "sha256", ""))
 
 
 def scene_id(scene: Scene) -> str:
@@ -85,11 +106,11 @@ def scene_id(scene: Scene) -> str:
 
 
 def stream_id(scene: Scene) -> str:
-    """Return the key of the scene's noise streams: its id without `truth` and `simulation`.
+    """Return the key of the scene's noise streams: its id without `truth`, `simulation` and `drawn`.
 
-    Asking for more ground truth, or for another tolerance, must not change the noise.
+    Asking for more ground truth, for another tolerance or another split must not change the noise.
     """
-    return _digest(scene, ("truth", "simulation"))
+    return _digest(scene, ("truth", "simulation", "drawn"))
 
 
 def _digest(scene: Scene, without: tuple[str, ...]) -> str:
@@ -98,7 +119,7 @@ def _digest(scene: Scene, without: tuple[str, ...]) -> str:
     kept = {
         name: identity(msgspec.convert(msgspec.to_builtins(getattr(scene, name)), kind))
         for name, kind in _kinds().items()
-        if name not in without
+        if name not in without and (name not in _LATER or getattr(scene, name) != _LATER[name])
     }
     if "sha256" in kept["phantom"]:  # the file is known by its content, wherever it lies
         del kept["phantom"]["path"]
@@ -132,8 +153,10 @@ def parse_suite(text: str, where: str = "scene") -> tuple[Scene, ...]:
 
 def _scenes(data: dict[str, Any], where: str) -> tuple[Scene, ...]:
     if "scene" not in data and not set(data).isdisjoint(Scene.__struct_fields__):
-        return (decode(data, Scene, where),)
-    return scenes_of(data, Scene, where)
+        data = {"scene": [data]} if "count" in data else data
+        if "scene" not in data:
+            return (decode(data, Scene, where),)
+    return scenes_of(data, Scene, where, expand)
 
 
 def _plain(value: Any) -> Any:
@@ -153,7 +176,7 @@ def check_geometry(geometry: Geometry, size: float, truncated: bool, height: flo
     """Refuse a geometry that cannot image an object of a cube of `size` mm, `height` times as tall.
 
     Raises `InputError` when the source comes inside the object or the reconstructed volume, when no
-    view sees the object, and when a view cuts it off although `truncated` is false.
+    view sees the object, and when a view cuts it off although `truncated` is false; one row may see a slice of it.
     """
     poses = geometry.pose_array()
     _check_source(poses[:, :3], geometry, size)
@@ -161,6 +184,7 @@ def check_geometry(geometry: Geometry, size: float, truncated: bool, height: flo
         poses = poses[:: max(1, len(poses) // 1000)]  # on a circle every view casts the same shadow
     u, v = _shadow(poses, size, height)
     half_v, half_u = ((n / 2) for n in geometry.n_detector)
+    fan = geometry.n_detector[0] == 1 < geometry.n_detector[1]  # a slice is all that one row is to see
     seen = (u.min(1) < half_u) & (u.max(1) > -half_u) & (v.min(1) < half_v) & (v.max(1) > -half_v)
     if not seen.any():
         raise InputError(
@@ -169,7 +193,7 @@ def check_geometry(geometry: Geometry, size: float, truncated: bool, height: flo
     off = geometry.off_detector[1] / geometry.d_detector[1]
     if geometry.is_full_turn and abs(off) < half_u:  # the opposite view sees the other side
         u, half_u = u + off, half_u + abs(off)
-    outside = (np.abs(u) > half_u).any() or (np.abs(v) > half_v).any()
+    outside = (np.abs(u) > half_u).any() or ((np.abs(v) > half_v).any() and not fan)
     if outside and not truncated:
         raise InputError(
             f"phantom.size = {size} mm: the object reaches out of the cone: its shadow needs "

@@ -4,7 +4,7 @@ What is wrong is an `InputError` that names the file, the key's path and what wa
 """
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
 
@@ -14,6 +14,8 @@ from ctsim.errors import InputError
 from ctsim.phantoms.messages import explain
 
 S = TypeVar("S", bound=msgspec.Struct)
+Expand = Callable[[str, dict[str, Any], str], Iterable[tuple[str, dict[str, Any]]]]
+"""(place of a table in the file, the table, the file) → the same of each scene that it stands for."""
 DEEPEST = 32  # tables and lists within each other; no scene has more than eight
 _TOO_DEEP = f"nested more than {DEEPEST} deep"
 NULL = "null"  # how a file says None, which TOML lacks, where None is not the default
@@ -64,8 +66,11 @@ def _below(path: str, key: str | int) -> str:
     return f"{path}[{key}]" if isinstance(key, int) else f"{path}.{key}" if path else key
 
 
-def scenes_of(data: Mapping[str, Any], kind: type[S], where: str) -> tuple[S, ...]:
-    """Decode the tables to structs with a name, which must differ; defaults are merged under each, table by table."""
+def scenes_of(data: Mapping[str, Any], kind: type[S], where: str, expand: Expand | None = None) -> tuple[S, ...]:
+    """Decode the tables to structs with a name, which must differ; defaults are merged under each, table by table.
+
+    `expand` turns a merged table into several, each with its place in the file.
+    """
     if extra := sorted(set(data) - {"defaults", "scene"}):
         raise InputError(f"{where}: unknown key {extra[0]!r}; expected [defaults] and [[scene]]")
     tables, defaults = data.get("scene", []), data.get("defaults", {})
@@ -73,7 +78,9 @@ def scenes_of(data: Mapping[str, Any], kind: type[S], where: str) -> tuple[S, ..
         raise InputError(f"{where}: defaults must be a table")
     if not isinstance(tables, list) or not tables or not all(isinstance(t, dict) for t in tables):
         raise InputError(f"{where}: no scenes; expected at least one [[scene]] table")
-    scenes = tuple(decode(_merge(defaults, t), kind, where, f"scene[{k}]") for k, t in enumerate(tables))
+    places = ((f"scene[{k}]", _merge(defaults, table)) for k, table in enumerate(tables))
+    rows = (row for place, table in places for row in (expand(place, table, where) if expand else [(place, table)]))
+    scenes = tuple(decode(table, kind, where, place) for place, table in rows)
     _check_names([cast(_Named, s).name for s in scenes], where)
     return scenes
 

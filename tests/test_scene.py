@@ -184,6 +184,8 @@ def test_the_defaults_of_later_keys_stay() -> None:
         "Blur": {"tail": 0.0, "tail_fwhm": None},
         "FocalSpot": {"shape": "gaussian", "weights": None},
         "Simulation": {"scatter_error": 0.05, "spot_error": 0.02},
+        "Scene": {"drawn": None, "metal_in_view": False},
+        "Drawn": {"keys": (), "split": ""},
     }
     found: dict[str, dict] = {}
 

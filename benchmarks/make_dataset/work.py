@@ -31,9 +31,8 @@ from ctsim.dataset.manifest import Manifest, mend_index, read_index, verify
 from ctsim.dataset.sources import source_hash
 from ctsim.errors import InputError
 from ctsim.human import human_bytes, human_time
-from ctsim.phantoms.dataset import make_scene, plan_scene
+from ctsim.phantoms.dataset import disk_bytes, make_scene, plan_scene
 from ctsim.phantoms.scene import Scene, scene_id
-from ctsim.plan import Plan
 
 T = TypeVar("T")
 _SPARE = 64 * 2**20  # bytes left free for the file system's own needs
@@ -69,17 +68,34 @@ def _verify(data_dir: Path) -> int:
 def _dry_run(scenes: tuple[Scene, ...], options: Flags) -> int:
     there = {} if options.out is None else _finished(scenes, options.out, options.force)
     seconds, size = 0.0, 0
-    for scene in scenes:
-        if scene.name in there:
-            sys.stdout.write(f"{_complete(there[scene.name])}\n")
+    for name, group in _alike(scenes, there).items():
+        if group[0].name in there:
+            sys.stdout.write(f"{_complete(there[group[0].name])}\n")
             continue
-        plan = plan_scene(scene)
-        sys.stdout.write(f"{scene.name}\n{plan.text()}\n")
-        seconds, size = seconds + plan.seconds, size + plan.disk_bytes
+        plan, n = plan_scene(group[0]), len(group)
+        sys.stdout.write(f"{name}\n{plan.text()}\n")
+        seconds, size = seconds + n * plan.seconds, size + n * plan.disk_bytes
     sys.stdout.write(f"total: {human_time(seconds)}, {human_bytes(size)} on disk\n")
     for text in _of_other_code(scenes, there, options.out):
         sys.stdout.write(f"{text}\n")
     return 0
+
+
+def _alike(scenes: tuple[Scene, ...], there: dict[str, Manifest]) -> dict[str, list[Scene]]:
+    """Return what a dry run plans by what it is called: one scene, or those of a table with `count` that are missing.
+
+    Of a table the first scene stands for all.
+    """
+    found: dict[str, list[Scene]] = {}
+    for scene in scenes:
+        table = scene.drawn.table if scene.drawn and scene.name not in there else ""
+        found.setdefault(f"{table}/" if table else scene.name, []).append(scene)
+    named = {n if not n.endswith("/") else _title(group): group for n, group in found.items()}
+    return named
+
+
+def _title(group: list[Scene]) -> str:
+    return f"{group[0].name}, and {len(group) - 1} more of its table" if len(group) > 1 else group[0].name
 
 
 def _finished(scenes: tuple[Scene, ...], out: Path, force: bool) -> dict[str, Manifest]:
@@ -108,7 +124,6 @@ class SceneJob:
     """A scene to make, as it travels to a worker."""
 
     scene: Scene
-    plan: Plan
     out: Path
     force: bool
     code: str
@@ -132,22 +147,18 @@ def _make(scenes: tuple[Scene, ...], out: Path, options: Flags) -> int:
 
 
 def _make_all(scenes: list[Scene], out: Path, options: Flags) -> None:
-    """Plan the scenes, then make them here or on workers."""
+    """Make the scenes here or on workers; each is planned where it is made."""
     with open_jobs(options.workers, options.scheduler) as pool:
-        plans = {scene.name: plan_scene(scene) for scene in scenes}  # all phantoms may not fit into memory
-        for name, plan in plans.items():
-            for note in plan.notes:
-                say(f"{name}: {note}")
-        _check_space(out, plans)
+        _check_space(out, scenes)
         if pool is None:
-            _make_here(scenes, plans, out, options.force)
+            _make_here(scenes, out, options.force)
             return
         where, code = out.resolve(), source_hash()
-        jobs = [SceneJob(scene=s, plan=plans[s.name], out=where, force=options.force, code=code) for s in scenes]
+        jobs = [SceneJob(scene=s, out=where, force=options.force, code=code) for s in scenes]
         _make_apart(jobs, pool)
 
 
-def _make_here(scenes: list[Scene], plans: dict[str, Plan], out: Path, force: bool) -> None:
+def _make_here(scenes: list[Scene], out: Path, force: bool) -> None:
     """Make scenes one after another in this process; one that another process has finished meanwhile is there."""
     views = {scene.name: scene.resolve().geometry.n_views for scene in scenes}
     with Bar(sum(views.values()), "view") as bar:
@@ -157,7 +168,7 @@ def _make_here(scenes: list[Scene], plans: dict[str, Plan], out: Path, force: bo
                 say(f"{scene.name}: already complete")
             else:
                 watch = functools.partial(_watch, bar, scene.name, title)
-                make_scene(scene, out, plan=plans[scene.name], force=force, watch=watch)
+                make_scene(scene, out, force=force, watch=watch, tell=functools.partial(_note, scene.name))
             bar.at(before + views[scene.name], title)
 
 
@@ -167,6 +178,10 @@ def _watch(bar: Bar, name: str, title: str, views: Iterable[T], first: int, n_vi
         say(f"{name}: goes on from view {first} of {n_views}")
         bar.at(bar.done + first)
     return bar.over(views, title)
+
+
+def _note(name: str, text: str) -> None:
+    say(f"{name}: {text}")
 
 
 def say(text: str) -> None:
@@ -186,39 +201,42 @@ def _make_apart(jobs: list[SceneJob], pool: Jobs) -> None:
                 name = jobs[number].scene.name
                 if isinstance(end, Lost):
                     raise InputError(f"{name}: {end.reason}, as happens when memory is short; expected fewer workers")
+                for note in end:
+                    _note(name, note)
                 left.discard(number)
                 ended = f"{len(jobs) - len(left)}/{len(jobs)} {name}"
             noted = {name: progress.views for name, progress in unfinished(jobs[0].out).items()}
             bar.at(sum(noted.get(jobs[k].scene.name, 0) if k in left else n for k, n in enumerate(views)), ended)
 
 
-def do(job: SceneJob) -> None:
-    """Be the worker: make a scene unless it is there, after any process that makes it just now.
+def do(job: SceneJob) -> tuple[str, ...]:
+    """Be the worker: make a scene unless it is there, after any process that makes it just now; return its notes.
 
-    Raises InputError where this process has other code than the command, whose plan it is, and where the scene's lock
-    stays that a process of another machine has, which may have been killed.
+    Raises InputError where this process has other code than the command, and where the scene's lock stays that a
+    process of another machine has, which may have been killed.
     """
-    name, waited = job.scene.name, 0.0
+    name, waited, notes = job.scene.name, 0.0, list[str]()
     if source_hash() != job.code:
         raise InputError(f"{name}: a worker runs other code of the simulator than make-dataset; restart the workers")
     while job.force or not is_complete(job.out, name, scene_id(job.scene)):
         try:
-            make_scene(job.scene, job.out, plan=job.plan, force=job.force)
-            return
+            make_scene(job.scene, job.out, force=job.force, tell=notes.append)
+            break
         except Busy as error:
             if not error.certain and waited >= PATIENCE:
                 raise
         time.sleep(TICK)  # a worker that was taken for lost may still make it
         waited += TICK
+    return tuple(notes)
 
 
-def _check_space(out: Path, plans: dict[str, Plan]) -> None:
+def _check_space(out: Path, scenes: list[Scene]) -> None:
     """Refuse scenes that have no room, counting what unfinished ones have taken already."""
-    need = sum(plan.disk_bytes for plan in plans.values())
+    need = sum(disk_bytes(scene) for scene in scenes)
     folder = out.absolute()
     while not folder.exists():
         folder = folder.parent
-    begun = (path for name in plans for path in partial_of(out, name).glob("**/*.tif"))
+    begun = (path for scene in scenes for path in partial_of(out, scene.name).glob("**/*.tif"))
     free = shutil.disk_usage(folder).free + sum(path.stat().st_blocks * 512 for path in begun)
     if need + _SPARE > free:
         raise InputError(f"{out}: the dataset needs {human_bytes(need)} but only {human_bytes(free)} are free")

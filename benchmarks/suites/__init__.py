@@ -60,6 +60,8 @@ def select(scenes: "tuple[Scene, ...]", only: tuple[str, ...], seeds: tuple[int,
     chosen = tuple(scene for scene in scenes if not only or scene.name in only)
     if not seeds:
         return chosen
+    if drawn := next((scene for scene in chosen if scene.drawn), None):
+        raise InputError(f"--seeds: {drawn.name} comes from count, which gives it its seed; raise count instead")
     return tuple(
         msgspec.structs.replace(scene, name=f"{scene.name}-s{seed}", seed=seed) for scene in chosen for seed in seeds
     )

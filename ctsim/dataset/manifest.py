@@ -11,6 +11,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -40,10 +41,23 @@ class FileEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     offset: int | None = None
 
 
+class About(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
+    """What a trainer chooses scans by: whose body it is, its split, and what was drawn for it.
+
+    `metal_share` is the share of all rays through pixel centres that meet metal; `drawn` values by key.
+    """
+
+    individual: str
+    split: str = ""
+    metal_share: float = 0.0
+    drawn: dict[str, Any] = {}
+
+
 class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All files of one finished scene by their path inside its folder.
 
-    `code` is the `ctsim.dataset.sources.source_hash` of what made it, empty in the format `WITHOUT_CODE`.
+    `code` is the `ctsim.dataset.sources.source_hash` of what made it, empty in the format `WITHOUT_CODE`. `about` is
+    there for scenes of a table with `count`.
     """
 
     format: int
@@ -53,15 +67,17 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     content_hash: str
     files: dict[str, FileEntry]
     code: str = ""
+    about: About | None = None
 
 
 class IndexLine(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One finished scene in the index; `code` as in its manifest."""
+    """One finished scene in the index; `code` and `about` as in its manifest."""
 
     name: str
     scene_id: str
     content_hash: str
     code: str = ""
+    about: About | None = None
 
 
 class _Format(msgspec.Struct):
@@ -166,7 +182,10 @@ def read_index(data_dir: Path) -> dict[str, IndexLine]:
 
 def append_index(data_dir: Path, *manifests: Manifest) -> None:
     """Append the lines of finished scenes to the index, except those that are already the last of their name."""
-    entries = [IndexLine(name=m.name, scene_id=m.scene_id, content_hash=m.content_hash, code=m.code) for m in manifests]
+    entries = [
+        IndexLine(name=m.name, scene_id=m.scene_id, content_hash=m.content_hash, code=m.code, about=m.about)
+        for m in manifests
+    ]
     with locked(data_dir / INDEX) as handle:
         cut_torn(handle)
         index = read_index(data_dir)

@@ -133,7 +133,7 @@ class SceneWriter:
         with self._full_disk():
             self._path(name).write_bytes(text.encode() if isinstance(text, str) else text)
 
-    def finish(self) -> Path:
+    def finish(self, about: mf.About | None = None) -> Path:
         """Hash and flush everything, put the folder in its place and list it in the index."""
         if self._views != self.n_views:
             raise ValueError(f"only {self._views} of {self.n_views} views were written")
@@ -150,6 +150,7 @@ class SceneWriter:
                 content_hash=mf.content_hash(entries),
                 files=entries,
                 code=source_hash(),
+                about=about,
             )
             text = msgspec.json.format(msgspec.json.encode(whole), indent=1)
             (self._partial / mf.MANIFEST).write_bytes(text)
