@@ -4,6 +4,7 @@ For a circular orbit the detector column u and the distance weight depend on a v
 the detector row is affine in z. Volume columns (fixed x, y) are therefore the unit of work: two detector
 columns are blended once per view, then read along z. Each thread owns tiles of volume columns, sums views
 in one fixed order and writes nobody else's voxels: results are bitwise equal for any number of threads.
+A volume of one slice has no columns to speak of: there each thread owns rows of voxels.
 """
 
 import math
@@ -33,6 +34,9 @@ def backproject(
     samples off the detector (more than half a pixel past the outermost centres) count as zero.
     """
     n_view, n_v, n_u = filtered.shape
+    if volume.shape[0] == 1:
+        _add_slice(filtered, np.cos(angles), np.sin(angles), orbit, grid, volume[0])
+        return
     columns = np.empty((n_view, n_u + 2, n_v + 2), np.float32)
     _pad_transposed(filtered, columns)
     tiles = _tiles(volume.shape, grid)
@@ -62,6 +66,42 @@ def _pad_transposed(filtered, columns):
                 row = min(max(v - 1, 0), n_v - 1)
                 for u in range(first, min(first + 16, n_u + 2)):
                     columns[view, u, v] = filtered[view, row, min(max(u - 1, 0), n_u - 1)]
+
+
+@njit(parallel=True, cache=True, fastmath=FAST)
+def _add_slice(filtered, cos, sin, orbit, grid, image):
+    """Add all views to a volume of one slice, `image` [y, x]: a column of one voxel is not worth its set-up."""
+    n_y, n_x = image.shape
+    n_view, n_v, n_u = filtered.shape
+    z_mm, middle_u, middle_v = grid[3], (n_u - 1) / 2, (n_v - 1) / 2
+    for y in prange(n_y):
+        total = np.zeros(n_x, np.float32)
+        y_mm = (y + 0.5 - n_y / 2) * grid[1] + grid[4]
+        first, last = n_x, 0  # columns within the field of view
+        for x in range(n_x):
+            x_mm = (x + 0.5 - n_x / 2) * grid[2] + grid[5]
+            if x_mm * x_mm + y_mm * y_mm <= grid[6] * grid[6]:
+                first, last = min(first, x), x + 1
+        for view in range(n_view):
+            c, s = cos[view], sin[view]
+            for x in range(first, last):
+                x_mm = (x + 0.5 - n_x / 2) * grid[2] + grid[5]
+                inverse = 1.0 / (orbit[0] - (x_mm * c + y_mm * s))
+                scale = orbit[1] * inverse
+                u = (scale * (y_mm * c - x_mm * s) - orbit[5]) / orbit[3] + middle_u
+                v = (scale * z_mm - orbit[4]) / orbit[2] + middle_v
+                if u < -0.5 or u > n_u - 0.5 or v < -0.5 or v > n_v - 0.5:
+                    continue
+                # the border pixels count once more on every side
+                u, v = min(max(u, 0.0), n_u - 1.0), min(max(v, 0.0), n_v - 1.0)
+                i, j = np.uint32(u), np.uint32(v)
+                right, above = np.uint32(min(i + 1, n_u - 1)), np.uint32(min(j + 1, n_v - 1))
+                t, r = np.float32(u - i), np.float32(v - j)
+                low = filtered[view, j, i] + t * (filtered[view, j, right] - filtered[view, j, i])
+                high = filtered[view, above, i] + t * (filtered[view, above, right] - filtered[view, above, i])
+                total[x] += np.float32((orbit[0] * inverse) ** 2) * (low + r * (high - low))
+        for x in range(first, last):
+            image[y, x] += total[x]
 
 
 @njit(parallel=True, cache=True)
