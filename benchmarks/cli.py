@@ -50,6 +50,7 @@ OTHERS = {
 }
 OF_DATASETS = {
     "export": Command("ctsim.benchmarks.export.work", "write a volume as NIfTI, MetaImage or DICOM", resumes=False),
+    "shards": Command("ctsim.benchmarks.shards.work", "write scans into HDF5 files for training"),
 }
 EXIT_USER, EXIT_INTERRUPTED = 2, 130
 

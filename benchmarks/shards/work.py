@@ -1,0 +1,139 @@
+"""What `make-dataset shards` does: divide scans into shards by split, reconstruct them, write what is missing."""
+
+import dataclasses
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+
+from ctsim.benchmarks.engine.host import open_jobs
+from ctsim.benchmarks.engine.process import Lost
+from ctsim.benchmarks.engine.terminal import Bar
+from ctsim.benchmarks.shards import Flags
+from ctsim.dataset.manifest import IndexLine, read_index
+from ctsim.dataset.store import StoredScan, open_scan
+from ctsim.errors import InputError
+from ctsim.human import human_bytes, human_choice
+from ctsim.io.formats import load
+from ctsim.reconstruct.fdk import reconstruct
+from ctsim.reconstruct.log import LineIntegrals
+
+FORMAT = "ctsim.io.shards"
+REST = "all"  # name of the shards of scans that are in no split
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Shard:
+    """A shard to write, as it travels to a worker."""
+
+    path: Path
+    data: Path
+    scans: tuple[IndexLine, ...]
+    items: tuple[str, ...]
+
+
+def main(argv: list[str]) -> int:
+    """Run the command; return 0."""
+    given: Any = tyro.cli(Flags, prog="make-dataset shards", args=argv)
+    shards(given)
+    return 0
+
+
+def shards(given: Flags) -> None:
+    """Write the shards that are missing, and say what there is.
+
+    Raises InputError for a data folder that cannot be read, unknown items, and items that a scan lacks.
+    """
+    form = load(FORMAT, given.out)
+    if unknown := [item for item in given.items if item not in form.ITEMS]:
+        raise InputError(f"--items {unknown[0]}: expected some of {human_choice(form.ITEMS, unknown[0])}")
+    if given.scans_per_shard < 1:
+        raise InputError(f"--scans-per-shard {given.scans_per_shard}: expected 1 or more")
+    wanted = list(_divided(given))
+    todo = [shard for shard in wanted if not _is_there(shard, form)]
+    with open_jobs(given.workers, None) as pool, Bar(len(wanted), "shard", len(wanted) - len(todo)) as bar:
+        if pool is None:
+            for shard in todo:
+                write(shard)
+                bar.at(bar.done + 1, shard.path.name)
+        else:
+            for answer in pool.answers(write, todo):
+                if answer is not None:
+                    number, end = answer
+                    if isinstance(end, Lost):
+                        raise InputError(f"{todo[number].path}: {end.reason}; expected fewer workers")
+                    bar.at(bar.done + 1, todo[number].path.name)
+    size = sum(shard.path.stat().st_size for shard in wanted)
+    n_scans = sum(len(shard.scans) for shard in wanted)
+    sys.stdout.write(f"{given.out}: {n_scans} scans in {len(wanted)} shards, {human_bytes(size)}\n")
+
+
+def _divided(given: Flags) -> Iterator[Shard]:
+    """Yield the shards of a data folder: split by split, in the order of its index."""
+    by_split: dict[str, list[IndexLine]] = {}
+    for line in read_index(given.data).values():
+        by_split.setdefault(line.about.split if line.about and line.about.split else REST, []).append(line)
+    data = given.data.resolve()
+    for split, lines in by_split.items():
+        for number, first in enumerate(range(0, len(lines), given.scans_per_shard)):
+            chosen = tuple(lines[first : first + given.scans_per_shard])
+            path = given.out.resolve() / f"{split}-{number:05d}.h5"
+            yield Shard(path=path, data=data, scans=chosen, items=given.items)
+
+
+def _is_there(shard: Shard, form: ModuleType) -> bool:
+    """Say whether a shard is there with these very scans, and with the items where they are stated."""
+    if not shard.path.exists():
+        return False
+    try:
+        found = form.contents(shard.path)
+    except InputError:
+        return False
+    same = [(e.name, e.content_hash) for e in found] == [(s.name, s.content_hash) for s in shard.scans]
+    return same and (not shard.items or all({*e.shapes} == {*shard.items} for e in found))
+
+
+def write(shard: Shard) -> None:
+    """Be the worker: reconstruct a shard's scans and write them."""
+    form = load(FORMAT, shard.path)
+    form.write(shard.path, (_scan(shard, line, form) for line in shard.scans))
+
+
+def _scan(shard: Shard, line: IndexLine, form: ModuleType) -> tuple[Any, dict[str, NDArray[Any]], str]:
+    stored = open_scan(shard.data / line.name)
+    about = line.about
+    entry = form.Entry(
+        name=line.name,
+        content_hash=line.content_hash,
+        individual=about.individual if about else "",
+        split=about.split if about else "",
+    )
+    arrays = arrays_of(stored, shard.items)
+    if missing := [item for item in shard.items if item not in arrays]:
+        raise InputError(f"--items {missing[0]}: {stored.folder} was written without; see truth in its scene.toml")
+    return entry, arrays, (stored.folder / "scene.toml").read_text(encoding="utf-8")
+
+
+def arrays_of(stored: StoredScan, items: tuple[str, ...] = ()) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a scan by item, all that it has where none is named; without metal it is its own twin."""
+    scans, found = {"p": stored, "fdk": stored}, dict[str, NDArray[Any]]()
+    twin = stored.metal_free if stored.info.metal else stored
+    if twin is not None:
+        scans |= {"twin_p": twin, "twin": twin}
+    for item, source in scans.items():
+        if items and item not in items:
+            continue
+        scan = source.scan
+        is_stack = item.endswith("p")
+        found[item] = LineIntegrals(scan).of(slice(None))[0] if is_stack else reconstruct(scan).values.numpy()
+    found["reference"], found["metal"] = stored.reference("effective"), stored.metal
+    if "trace.tif" in stored.files:
+        found["trace"] = stored.array("trace")
+    elif not stored.info.metal:
+        found["trace"] = np.zeros(stored.geometry.shape, np.uint8)
+    return {item: array for item, array in found.items() if not items or item in items}

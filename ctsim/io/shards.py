@@ -1,0 +1,91 @@
+"""Shards: many scans in a few HDF5 files, compressed without loss, for training.
+
+A shard has one group a scan, named as the scan, with an array for each of `ITEMS`. Stacks [view, v, u] and volumes
+[z, y, x] are in chunks of one image each, so that a slice is read without its neighbours. The file's attribute
+`contents` lists the scans with their shapes as JSON, so that opening a thousand of them reads no array.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.dataset.durable import replacing
+from ctsim.errors import InputError
+
+STACKS = ("p", "twin_p", "trace")
+VOLUMES = ("fdk", "twin", "reference", "metal")
+ITEMS = STACKS + VOLUMES
+FORMAT = 1
+_CONTENTS = "contents"
+
+
+class Entry(msgspec.Struct, frozen=True, kw_only=True):
+    """A scan in a shard: its name, its content hash in the data folder, whose body, which split, shapes by item."""
+
+    name: str
+    content_hash: str
+    individual: str = ""
+    split: str = ""
+    shapes: dict[str, tuple[int, int, int]] = {}
+
+
+class Contents(msgspec.Struct, frozen=True, kw_only=True):
+    """What a shard says of itself."""
+
+    format: int
+    scans: tuple[Entry, ...]
+
+
+def write(path: Path, scans: Iterable[tuple[Entry, Mapping[str, NDArray[Any]], str]]) -> None:
+    """Write a shard of (entry without shapes, arrays by item, scene.toml); it appears whole or not at all."""
+    entries = []
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as new, h5py.File(new, "w") as file:
+        for entry, arrays, scene in scans:
+            group = file.create_group(entry.name)
+            group.attrs["scene"] = scene
+            for item, array in arrays.items():
+                group.create_dataset(
+                    item, data=array, chunks=(1, *array.shape[1:]), shuffle=True, compression="gzip", compression_opts=1
+                )
+            shapes = {item: array.shape for item, array in arrays.items()}
+            entries.append(msgspec.structs.replace(entry, shapes=shapes))
+        file.attrs[_CONTENTS] = msgspec.json.encode(Contents(format=FORMAT, scans=tuple(entries))).decode()
+
+
+def contents(path: Path) -> tuple[Entry, ...]:
+    """Return what a shard holds.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read, or is no shard of this format.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            found = msgspec.json.decode(str(file.attrs[_CONTENTS]), type=Contents)
+    except (OSError, KeyError, msgspec.DecodeError) as error:
+        raise InputError(
+            f"{path}: is no shard ({' '.join(str(error).split())}); make-dataset shards writes them"
+        ) from None
+    if found.format != FORMAT:
+        raise InputError(f"{path}: format {found.format}, this version reads format {FORMAT}")
+    return found.scans
+
+
+def shards_of(root: Path) -> Iterator[Path]:
+    """Yield the shards of a folder by name. Raises InputError where there are none."""
+    found = sorted(root.glob("*.h5"))
+    if not found:
+        raise InputError(f"{root}: holds no shards (*.h5); make-dataset shards writes them")
+    yield from found
+
+
+def read(file: h5py.File, name: str, item: str, place: tuple[slice | int, ...]) -> NDArray[np.float32]:
+    """Read a part of an item as float32."""
+    return np.asarray(file[name][item][place], np.float32)  # pyright: ignore[reportIndexIssue]

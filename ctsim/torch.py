@@ -1,0 +1,121 @@
+"""Scans for training: a PyTorch dataset over shards that `make-dataset shards` has written. Needs `ctsim[io]`."""
+
+import bisect
+import itertools
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import torch
+from torch.utils.data import Dataset
+
+from ctsim.errors import InputError
+from ctsim.human import human_choice
+from ctsim.io.shards import ITEMS, STACKS, Entry, contents, read, shards_of
+
+AXES = {"z": 0, "y": 1, "x": 2}
+
+
+class Scans(Dataset[dict[str, torch.Tensor]]):
+    """Scans, or their slices, as float32 tensors by item.
+
+    Items are "p" (line integrals of the scan), "twin_p" (those of the twin without metal), "trace" (1 where a ray meets
+    metal), each [view, v, u]; and "fdk", "twin" (FDK of scan and twin), "reference" (true attenuation, 1/mm), "metal"
+    (1 in metal), each [z, y, x]. With `plane`, "z", "y" or "x", a sample is one slice across that axis: volumes become
+    images, and stacks, which go with "z" only, those of a scan of one row, [view, u].
+
+    Nothing is held in memory but the list of scans. Each process opens the files for itself at its first sample, so
+    instances can be pickled, and workers of a DataLoader may be forked or spawned.
+
+    Raises
+    ------
+    InputError
+        When there is no shard, no scan in the split, or a scan lacks an item.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        items: Sequence[str] = ("fdk", "reference"),
+        *,
+        plane: str | None = None,
+        split: str = "",
+    ) -> None:
+        self.root, self.items, self.plane = Path(root), tuple(items), plane
+        if unknown := [item for item in self.items if item not in ITEMS]:
+            raise InputError(f"items: {unknown[0]!r} is unknown, expected some of {human_choice(ITEMS, unknown[0])}")
+        if plane is not None and plane not in AXES:
+            raise InputError(f"plane must be 'z', 'y', 'x' or None, got {plane!r}")
+        listed = [(path, entry) for path in shards_of(self.root) for entry in contents(path)]
+        self._scans = [(path, entry) for path, entry in listed if not split or entry.split == split]
+        if not self._scans:
+            known = ", ".join(sorted({entry.split for _, entry in listed if entry.split})) or "no split"
+            raise InputError(f"{root}: no scan in split {split!r}, expected {known}")
+        sizes = [self._samples(path, entry) for path, entry in self._scans]
+        self._ends = list(itertools.accumulate(sizes))
+        self._files: dict[Path, h5py.File] = {}
+        self._process = os.getpid()
+
+    def __len__(self) -> int:
+        return self._ends[-1]
+
+    def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
+        path, entry, at = self._place(index)
+        file = self._file(path)
+        return {item: torch.from_numpy(read(file, entry.name, item, self._part(item, at))) for item in self.items}
+
+    def where(self, index: int) -> tuple[str, str, int]:
+        """Return the scan's name, its individual, and the number of the slice (0 without `plane`)."""
+        _, entry, at = self._place(index)
+        return entry.name, entry.individual, at
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_files": {}}
+
+    def _samples(self, path: Path, entry: Entry) -> int:
+        """Return how many samples a scan gives. Raises InputError where it lacks an item or its slice has no stack."""
+        for item in self.items:
+            if item not in entry.shapes:
+                raise InputError(
+                    f"{path}: {entry.name} has no {item!r}, expected some of {', '.join(entry.shapes)}"
+                    + ("; the trace needs truth.trace = true in the scene" if item == "trace" else "")
+                )
+        if self.plane is None:
+            return 1
+        stacks = [item for item in self.items if item in STACKS]
+        for item in stacks:
+            rows, layers = entry.shapes[item][1], entry.shapes.get("reference", (1,))[0]
+            if self.plane != "z" or (rows, layers) != (1, 1):
+                raise InputError(
+                    f"{item}: {entry.name} has {rows} rows and {layers} slices, but projections go with plane = 'z' of "
+                    "a scan with one of each; expected plane = None"
+                )
+        volumes = [item for item in self.items if item not in STACKS]
+        return entry.shapes[volumes[0]][AXES[self.plane]] if volumes else 1
+
+    def _place(self, index: int) -> tuple[Path, Entry, int]:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"sample {index} of {len(self)}")
+        index %= len(self)
+        k = bisect.bisect_right(self._ends, index)
+        return *self._scans[k], index - (self._ends[k - 1] if k else 0)
+
+    def _part(self, item: str, at: int) -> tuple[slice | int, ...]:
+        every = slice(None)
+        if self.plane is None:
+            return every, every, every
+        if item in STACKS:
+            return every, 0, every
+        place: list[slice | int] = [every, every, every]
+        place[AXES[self.plane]] = at
+        return tuple(place)
+
+    def _file(self, path: Path) -> h5py.File:
+        """Return the open file; one that another process opened before it forked is not used."""
+        if self._process != os.getpid():
+            self._files, self._process = {}, os.getpid()
+        if path not in self._files:
+            self._files[path] = h5py.File(path, "r")
+        return self._files[path]
