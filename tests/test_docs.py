@@ -40,7 +40,8 @@ def test_an_example_works(kind, text, smallest, tmp_path, monkeypatch):
     else:
         from ctsim.phantoms.scene import build, parse_suite
 
-        assert all(build(scene).labels.any() for scene in parse_suite(text))
+        scenes = [scene for scene in parse_suite(text) if not (scene.drawn and scene.drawn.index)]
+        assert all(build(scene).labels.any() for scene in scenes)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
