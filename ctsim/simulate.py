@@ -4,12 +4,14 @@ Nothing here grows with the number of views. A view depends on its own index onl
 before it, which are made again where a run that was interrupted goes on. It gives the same bytes.
 """
 
+import contextlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,11 +23,12 @@ from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.montecarlo.series import ScatterSeries, scatter_series
 from ctsim.montecarlo.transport import Source
-from ctsim.plan import Plan, density_levels
+from ctsim.plan import Plan, all_rays, density_levels
 from ctsim.readout import TWIN, Image, Moments, Readout, panel_of
+from ctsim.tracer.kernels.raytrace_cpu import STRIP
 from ctsim.tracer.project import Response, Tracer, path_lengths, transmit
 from ctsim.tracer.shadow import join, row_spans
-from ctsim.tracer.voxelise import attenuation_volume, label_volume, metal_mask
+from ctsim.tracer.voxelise import body_attenuation, body_labels, cover_of, label_volume, metal_mask, painted
 from ctsim.types import Phantom, Scanner
 
 Scattered = Sequence[ScatterSeries | None]
@@ -132,7 +135,8 @@ class Simulator:
         self.beam = _beam(plan, scanner)
         self.fold = _fold(plan, phantom)
         body = compact(phantom, plan.materials)
-        self.tracer = Tracer.of(body, skip=plan.settings.skip, extra=self.beam.layer_material)
+        layer, rays = self.beam.layer_material, all_rays(scanner)
+        self.tracer = Tracer.of(body, skip=plan.settings.skip, extra=layer, geometry=rays)
         self.bare = self.tracer.without_metal()
         self.response = Response.of(plan.rule, self.tracer.materials)
         self.metal = np.array([any(s.metal and s.material == m for s in body.solids) for m in self.tracer.materials])
@@ -288,6 +292,18 @@ class Simulator:
         return out
 
 
+@contextlib.contextmanager
+def threads_of_view(geometry: Geometry) -> Iterator[None]:
+    """Use one thread for views of one strip of rows: nothing is to be shared, and threads that wait spin."""
+    before = numba.get_num_threads()
+    if geometry.n_detector[0] <= STRIP:
+        numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
+
+
 def simulate_views(
     plan: Plan, phantom: Phantom, scanner: Scanner, first_view: int = 0, scatter: Scattered | None = None
 ) -> Iterator[tuple[int, dict[str, NDArray]]]:
@@ -302,7 +318,9 @@ def simulate_views(
     for k in range(max(0, first_view - simulator.frames), first_view):
         simulator.view(k)  # light of earlier views comes in later ones
     for k in range(first_view, scanner.geometry.n_views):
-        yield k, simulator.view(k)
+        with threads_of_view(scanner.geometry):
+            images = simulator.view(k)
+        yield k, images
 
 
 def flat_image(plan: Plan, scanner: Scanner) -> Image:
@@ -333,11 +351,19 @@ def truth_volumes(plan: Plan, phantom: Phantom, scanner: Scanner) -> Iterator[tu
     at_50 = _reference_mu(plan.materials, np.array([REFERENCE_KEV]), np.ones(1))
     body = compact(phantom, plan.materials)
     scans = [("", body)] + ([("metal_free/", body.without_metal())] if plan.runs("metal-free twin") else [])
-    yield "metal", metal_mask(body, geometry)
+    covers = [cover_of(content, geometry) for _, content in scans]
+    yield "metal", metal_mask(body, geometry, covers[0])
+    # the body is the same with and without metal
+    mine = body_labels(undivided(body, plan), geometry)
     for prefix, content in scans:
-        yield prefix + "labels", label_volume(undivided(content, plan), geometry)
-        yield prefix + "reference_effective", attenuation_volume(content, geometry, effective)
-        yield prefix + "reference_50kev", attenuation_volume(content, geometry, at_50)
+        told = undivided(content, plan)
+        cover = covers[prefix != ""] if told is content else None
+        yield prefix + "labels", label_volume(told, geometry, cover, mine.copy())
+    for name, mu in (("reference_effective", effective), ("reference_50kev", at_50)):
+        volume = body_attenuation(body, geometry, mu)
+        for (prefix, content), cover in zip(scans, covers, strict=True):
+            last = content is scans[-1][1]
+            yield prefix + name, painted(volume if last else volume.copy(), content, mu, cover)
 
 
 def _reference_mu(materials: tuple[str, ...], energies: NDArray, omega: NDArray) -> Mapping[str, float]:

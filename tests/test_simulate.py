@@ -3,6 +3,7 @@
 import dataclasses
 
 import msgspec
+import numba
 import numpy as np
 import pytest
 import torch
@@ -17,8 +18,9 @@ from ctsim.plan import make_plan, present_materials
 from ctsim.reconstruct.fdk import fdk
 from ctsim.scatter import Scatter
 from ctsim.settings import Simulation, Truth
-from ctsim.simulate import compact, flat_image, scan_info, simulate_views, truth_volumes
+from ctsim.simulate import Simulator, compact, flat_image, scan_info, simulate_views, truth_volumes
 from ctsim.solids import FRUSTUM, Primitive, Solid
+from ctsim.tracer import voxelise
 from ctsim.types import Phantom, Scanner
 
 GEOMETRY = Geometry(
@@ -290,3 +292,30 @@ def test_extreme_scans_stay_finite(case):
     _, out = run(thick, scanner(**case), truth=Truth(noise_free=True))
     assert all(np.isfinite(images).all() for images in out.values())
     assert out["noise_free"].max() > 8
+
+
+def test_volumes_of_scan_and_twin_share_a_body_but_no_metal():
+    body, machine = phantom(solids=(rod(), rod("Ti", x=-9.0, metal=False))), scanner()
+    plan = make_plan(body, machine, Simulation(), Truth(), "scene")
+    volumes = {name: volume.copy() for name, volume in truth_volumes(plan, body, machine)}
+    mine = compact(body, plan.materials)
+    for prefix, content in (("", mine), ("metal_free/", mine.without_metal())):
+        assert np.array_equal(volumes[f"{prefix}labels"], voxelise.label_volume(content, GEOMETRY))
+        mu = {m: float(attenuation(m, np.array([50.0]))[0]) for m in plan.materials[1:]}
+        alone = voxelise.attenuation_volume(content, GEOMETRY, mu)
+        # both are float32 of the same float64 tables, up to the rounding of a sum over one energy
+        np.testing.assert_allclose(volumes[f"{prefix}reference_50kev"], alone, rtol=2**-22)
+    iron = plan.materials.index("Fe")
+    assert (volumes["labels"] == iron).any() and not (volumes["metal_free/labels"] == iron).any()
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread")  # pyright: ignore[reportAttributeAccessIssue]
+def test_a_view_of_a_few_rows_takes_one_thread_and_gives_the_others_back(monkeypatch):
+    seen, before = [], numba.get_num_threads()
+    real = Simulator.view
+    monkeypatch.setattr(Simulator, "view", lambda self, k: (seen.append(numba.get_num_threads()), real(self, k))[1])
+    for rows in (8, 9):
+        machine = scanner(geometry=msgspec.structs.replace(GEOMETRY, n_detector=(rows, 30), n_views=1))
+        run(phantom(), machine)
+        assert numba.get_num_threads() == before
+    assert seen == [1, before]

@@ -205,6 +205,22 @@ def test_other_grids_average_by_overlap():
     np.testing.assert_allclose(sum(shifted.values()), 1, atol=1e-5)
 
 
+@pytest.mark.parametrize("pitch", [(1.0, 1.0, 1.0), (0.37, 0.91, 0.7), (1.5, 1.5, 1.5)])
+def test_labels_are_what_fills_most_of_a_voxel_with_and_without_solids(pitch):
+    """The pass over the body that serves all materials finds what one over each material finds, ties included."""
+    labels = np.random.default_rng(2).integers(0, 4, (10, 14, 22)).astype(np.uint8)
+    labels[:4] = 1
+    parts = solid(ELLIPSOID, (1.8, 1.2, 2.2)), solid(BOX, (1.0, 2.0, 0.5), "Ti", metal=False, centre=(2.0, 0.3, -1.0))
+    grid = geometry((8, 9, 13), pitch, (0.4, -0.3, 0.2))
+    for solids in ((), parts):
+        body = phantom(*solids, labels=labels, pitch=(0.5, 0.5, 0.5))
+        want = np.stack(list(voxelise.fractions(body, grid).values())).argmax(0)  # the first of equals
+        assert len(np.unique(want)) == 4
+        np.testing.assert_array_equal(voxelise.label_volume(body, grid), want)
+        shared = voxelise.label_volume(body, grid, voxelise.cover_of(body, grid), voxelise.body_labels(body, grid))
+        np.testing.assert_array_equal(shared, want)
+
+
 def test_later_solids_cover_earlier_ones():
     outer, inner = solid(ELLIPSOID, (3.0, 3, 3)), solid(ELLIPSOID, (2.0, 2, 2), "Ti")
     grid = geometry((20, 20, 20), (0.4, 0.4, 0.4))

@@ -21,6 +21,7 @@ from ctsim.tracer.bricks import Bricks, make_bricks
 from ctsim.tracer.columns import Columns, DensityColumns, make_columns, make_density_columns
 from ctsim.tracer.kernels import bricks_cpu, columns_cpu, density_cpu, raytrace_cpu
 from ctsim.tracer.kernels.footprint_cpu import LANES
+from ctsim.tracer.layers import layers_seen
 from ctsim.types import Phantom
 
 # Over a pixel in which the thickness changes linearly by R the intensity mean differs from the central
@@ -41,8 +42,15 @@ class Tracer:
     skip: bool = True
 
     @staticmethod
-    def of(phantom: Phantom, *, skip: bool = True, extra: str | None = None) -> "Tracer":
-        """Prepare a phantom; with `extra`, that material is appended for a layer that every ray crosses."""
+    def of(
+        phantom: Phantom, *, skip: bool = True, extra: str | None = None, geometry: Geometry | None = None
+    ) -> "Tracer":
+        """Prepare a phantom; with `extra`, that material is appended for a layer that every ray crosses.
+
+        Where the `geometry` of all rays is known, only the layers that they can cross are prepared.
+        """
+        if skip and geometry is not None:
+            phantom = layers_seen(phantom, geometry)
         return Tracer(
             bricks=make_bricks(phantom),
             columns=make_columns(phantom) or make_density_columns(phantom),

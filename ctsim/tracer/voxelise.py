@@ -10,6 +10,7 @@ the body itself changes within a voxel that a solid crosses, the uncovered part 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ _MAX_CELLS = 24
 
 
 @dataclass(frozen=True, slots=True)
-class _Cover:
+class Cover:
     """Share of the voxels `index` (flat) that each (material index, metal) is seen in, [k, channel]."""
 
     channels: tuple[tuple[int, bool], ...]
@@ -46,7 +47,7 @@ def fractions(phantom: Phantom, geometry: Geometry) -> dict[str, NDArray[np.floa
     Shares of the body are multiplied by its relative density where it has one (not air's, which is
     the plain volume share); solids have density 1.
     """
-    cover = _cover(phantom, geometry)
+    cover = cover_of(phantom, geometry)
     return {name: _fraction(phantom, geometry, cover, k, phantom.density) for k, name in enumerate(phantom.materials)}
 
 
@@ -55,31 +56,58 @@ def attenuation_volume(phantom: Phantom, geometry: Geometry, mu: Mapping[str, fl
 
     `mu` gives 1/mm by material name; air counts as 0. Raises InputError when a material is missing.
     """
+    return painted(body_attenuation(phantom, geometry, mu), phantom, mu, cover_of(phantom, geometry))
+
+
+def body_attenuation(phantom: Phantom, geometry: Geometry, mu: Mapping[str, float]) -> NDArray[np.float32]:
+    """Return what `attenuation_volume` does of the phantom without its solids."""
+    return _body(phantom, geometry, _values(phantom, mu), phantom.density)
+
+
+def painted(body: NDArray[np.float32], phantom: Phantom, mu: Mapping[str, float], cover: Cover) -> NDArray[np.float32]:
+    """Paint the phantom's solids over a volume of `body_attenuation`, in place, and return it."""
+    cover.paint(body, _values(phantom, mu))
+    return body
+
+
+def _values(phantom: Phantom, mu: Mapping[str, float]) -> NDArray[np.float64]:
     missing = [name for name in phantom.materials[1:] if name not in mu]
     if missing:
         raise InputError(f"mu must name every material of the phantom; missing: {', '.join(missing)}")
-    values = np.array([0.0, *(mu[name] for name in phantom.materials[1:])])
-    volume = _body(phantom, geometry, values, phantom.density)
-    _cover(phantom, geometry).paint(volume, values)
-    return volume
+    return np.array([0.0, *(mu[name] for name in phantom.materials[1:])])
 
 
-def label_volume(phantom: Phantom, geometry: Geometry) -> NDArray[np.uint8]:
-    """Return the index in `phantom.materials` that fills most of each voxel (the lowest of equals), uint8."""
-    cover = _cover(phantom, geometry)
-    best = _fraction(phantom, geometry, cover, 0, None)
-    labels = np.zeros(best.shape, np.uint8)
-    for k in range(1, len(phantom.materials)):
-        share = _fraction(phantom, geometry, cover, k, None)
-        more = share > best
-        labels[more] = k
-        np.maximum(best, share, out=best)
+def label_volume(
+    phantom: Phantom, geometry: Geometry, cover: Cover | None = None, body: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
+    """Return the index in `phantom.materials` that fills most of each voxel (the lowest of equals), uint8.
+
+    `cover` is that of `cover_of` and `body` what `body_labels` returned, where they are known; `body` is overwritten.
+    """
+    cover = cover or cover_of(phantom, geometry)
+    labels = body_labels(phantom, geometry) if body is None else body
+    shares = np.zeros((len(cover.index), len(phantom.materials)), np.float32)
+    voxelise_cpu.shares_at(phantom.labels, *_overlaps(phantom, geometry), geometry.n_voxel, cover.index, shares)
+    shares *= np.maximum(1 - cover.share.sum(1, dtype=np.float32), 0)[:, None]
+    for channel, (material, _) in enumerate(cover.channels):
+        shares[:, material] += cover.share[:, channel]
+    labels.reshape(-1)[cover.index] = shares.argmax(1)
     return labels
 
 
-def metal_mask(phantom: Phantom, geometry: Geometry) -> NDArray[np.uint8]:
-    """Return 1 where solids marked as metal fill at least half of the voxel, else 0; uint8 [z, y, x]."""
-    cover = _cover(phantom, geometry)
+def body_labels(phantom: Phantom, geometry: Geometry) -> NDArray[np.uint8]:
+    """Return what `label_volume` does of the phantom without its solids."""
+    labels = np.empty(geometry.n_voxel, np.uint8)
+    voxelise_cpu.dominant(phantom.labels, len(phantom.materials), *_overlaps(phantom, geometry), labels)
+    return labels
+
+
+def metal_mask(phantom: Phantom, geometry: Geometry, cover: Cover | None = None) -> NDArray[np.uint8]:
+    """Return 1 where solids marked as metal fill at least half of the voxel, else 0; uint8 [z, y, x].
+
+    `cover` is that of `cover_of`, where it is known.
+    """
+    cover = cover or cover_of(phantom, geometry)
     mask = np.zeros(geometry.n_voxel, np.uint8)
     metal = [metal for _, metal in cover.channels]
     mask.reshape(-1)[cover.index] = cover.share[:, metal].sum(1) >= 0.5 - 1e-5
@@ -87,7 +115,7 @@ def metal_mask(phantom: Phantom, geometry: Geometry) -> NDArray[np.uint8]:
 
 
 def _fraction(
-    phantom: Phantom, geometry: Geometry, cover: _Cover, material: int, density: NDArray[np.float32] | None
+    phantom: Phantom, geometry: Geometry, cover: Cover, material: int, density: NDArray[np.float32] | None
 ) -> NDArray[np.float32]:
     one = np.zeros(len(phantom.materials))
     one[material] = 1
@@ -105,12 +133,16 @@ def _body(
     phantom: Phantom, geometry: Geometry, values: NDArray[np.float64], density: NDArray[np.float32] | None
 ) -> NDArray[np.float32]:
     """Mean of values[label]·density over each voxel of the grid; 0 outside the phantom."""
-    axes = [_overlap(phantom, geometry, axis) for axis in range(3)]
-    first, weights, counts = (tuple(part) for part in zip(*axes, strict=True))
     out = np.empty(geometry.n_voxel, np.float32)
     relative = np.empty((0, 0, 0), np.float32) if density is None else density
-    voxelise_cpu.average(phantom.labels, relative, values, first, weights, counts, out)
+    voxelise_cpu.average(phantom.labels, relative, values, *_overlaps(phantom, geometry), out)
     return out
+
+
+def _overlaps(phantom: Phantom, geometry: Geometry) -> tuple[Any, Any, Any]:
+    """Return what `_overlap` does for the three axes: first voxels, shares and numbers."""
+    first, weights, counts = zip(*(_overlap(phantom, geometry, axis) for axis in range(3)), strict=True)
+    return first, weights, counts
 
 
 def _overlap(
@@ -131,8 +163,8 @@ def _overlap(
     return first, np.maximum(weights, 0) * (d_in / d), counts
 
 
-def _cover(phantom: Phantom, geometry: Geometry) -> _Cover:
-    """Sample all solids on the grid."""
+def cover_of(phantom: Phantom, geometry: Geometry) -> Cover:
+    """Sample all solids on the grid; serves every volume of the same phantom and grid."""
     channels = sorted({(phantom.materials.index(s.material), s.metal) for s in phantom.solids})
     rows, of = [np.zeros((0, PRIMITIVE_COLUMNS))], [np.zeros(0, np.int64)]
     for solid in phantom.solids:
@@ -145,7 +177,7 @@ def _cover(phantom: Phantom, geometry: Geometry) -> _Cover:
     start, pitch = np.array([c[0] for c in geometry.voxel_centres()]), np.array(geometry.d_voxel, np.float64)
     nz, ny, nx = geometry.n_voxel
     if len(prims) == 0:
-        return _Cover(tuple(channels), np.zeros(0, np.int64), np.zeros((0, len(channels)), np.float32))
+        return Cover(tuple(channels), np.zeros(0, np.int64), np.zeros((0, len(channels)), np.float32))
     touched = np.zeros(geometry.n_voxel, np.uint8)
     voxelise_cpu.mark(prims, start, pitch, touched)
     index = np.flatnonzero(touched)
@@ -155,4 +187,4 @@ def _cover(phantom: Phantom, geometry: Geometry) -> _Cover:
     z, y, x = (min(max(round(_CELLS * d / mean), 1), _MAX_CELLS) for d in geometry.d_voxel)
     share = np.zeros((len(index), len(channels)), np.float32)
     voxelise_cpu.cover(prims, channel_of, start, pitch, (z, y, x), (nz, ny, nx), index, first, share)
-    return _Cover(tuple(channels), index, share)
+    return Cover(tuple(channels), index, share)

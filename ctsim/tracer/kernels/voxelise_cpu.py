@@ -34,6 +34,58 @@ def average(labels, density, table, first, weights, counts, out):
                 out[z, y, x] = total
 
 
+@njit(inline="always")
+def _shares(labels, first, weights, counts, at, share):
+    """Set `share` [material] to how much of target voxel `at` (z, y, x) each label's material fills; return the body's.
+
+    Both are those that `average` makes of a table of zeros with a one, and of ones with a zero for air.
+    """
+    z, y, x = at
+    share[:] = 0.0
+    body = 0.0
+    for k in range(counts[0][z]):
+        for j in range(counts[1][y]):
+            plane = weights[0][z, k] * weights[1][y, j]
+            for i in range(counts[2][x]):
+                label = labels[first[0][z] + k, first[1][y] + j, first[2][x] + i]
+                value = plane * weights[2][x, i]
+                share[label] += value
+                if label:
+                    body += value
+    return body
+
+
+@njit(parallel=True, cache=True)
+def dominant(labels, n_materials, first, weights, counts, out):
+    """Set `out` [z, y, x] uint8 to the label that fills most of each target voxel, the lowest of equals.
+
+    The overlaps are those of `average`. Air is what the others leave. Shares are compared in float32.
+    """
+    for z in prange(out.shape[0]):
+        share = np.empty(n_materials)
+        for y in range(out.shape[1]):
+            for x in range(out.shape[2]):
+                body = _shares(labels, first, weights, counts, (z, y, x), share)
+                most = min(max(np.float32(1) - np.float32(body), np.float32(0)), np.float32(1))
+                best = 0
+                for m in range(1, n_materials):
+                    if np.float32(share[m]) > most:
+                        best, most = m, np.float32(share[m])
+                out[z, y, x] = best
+
+
+@njit(parallel=True, cache=True)
+def shares_at(labels, first, weights, counts, shape, index, out):
+    """Fill `out` [k, material] float32 with the share of each material in the target voxels `index` (flat)."""
+    for k in prange(index.size):
+        share = np.empty(out.shape[1])
+        at = (index[k] // (shape[1] * shape[2]), index[k] // shape[2] % shape[1], index[k] % shape[2])
+        body = _shares(labels, first, weights, counts, at, share)
+        out[k, 0] = min(max(np.float32(1) - np.float32(body), np.float32(0)), np.float32(1))
+        for m in range(1, out.shape[1]):
+            out[k, m] = share[m]
+
+
 @njit(cache=True, error_model="numpy")
 def _local(prim, x, y, z):
     px, py, pz = x - prim[18], y - prim[19], z - prim[20]
