@@ -35,6 +35,7 @@ class Command(NamedTuple):
 OTHERS = {
     "methods": Command("ctsim.benchmarks.methods", "list the methods, what they need, and their parameters"),
     "report": Command("ctsim.reports.report", "write results as one HTML page with the slices of every volume"),
+    "score": Command("ctsim.benchmarks.submit.work", "score a volume made elsewhere as a row of the tables", False),
     "inspect": Command("ctsim.benchmarks.studies.inspect.study", "score a volume by other conventions of PSNR, SSIM"),
     "pareto": Command("ctsim.benchmarks.studies.pareto.study", "error against run time, simulator and methods"),
     "detect": Command("ctsim.benchmarks.studies.detect.study", "detection of lesions near metal by a model observer"),

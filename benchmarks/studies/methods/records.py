@@ -20,15 +20,17 @@ from ctsim.dataset.folder import mixture
 STUDY, FILE, WHAT = "methods", "records", "a record of run-benchmark"
 NAME = f"{FILE}.jsonl"
 METAL, TWIN = "metal", "metal_free"
+SUBMITTED, STATED = "submitted", "stated"
+"""The method of a volume that was made elsewhere, and the device of seconds that somebody stated."""
 
 
 class Cost(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The cost of a run: seconds without warm-up, bytes, views used times passes."""
+    """The cost of a run: seconds without warm-up, bytes, views used times passes; None where it is not known."""
 
     wall: float
-    cpu: float
-    peak_bytes: int
-    view_updates: int
+    cpu: float | None = None
+    peak_bytes: int | None = None
+    view_updates: int | None = None
     device: str
     warm_up: float = 0.0
     isolated: bool = False
@@ -38,7 +40,7 @@ class Run(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """A scene's seed and recipe, and a method ("module:function") with its parameters.
 
     `variant` is "metal" for the scan itself and "metal_free" for its twin; `mask` names the source of a metal mask
-    ("none", "oracle", "auto").
+    ("none", "oracle", "auto"). The method of a volume that was made elsewhere is "submitted".
     """
 
     scene: str
@@ -212,4 +214,10 @@ def remarks(records: Sequence[RunRecord]) -> list[str]:
     known = {r.task.data: r.data_code for r in shown if r.data_code}
     made = {f"{r.run.scene} (seed {r.run.seed})": known.get(r.task.data, "") for r in shown}
     grids = {f"{r.label} on {r.run.scene}": r.details for r in shown}
-    return [text for text in (outdated(records), mixture(made.items()), shared_text(grids)) if text]
+    return [text for text in (outdated(records), mixture(made.items()), shared_text(grids), _stated(shown)) if text]
+
+
+def _stated(shown: Sequence[RunRecord]) -> str:
+    """Say whose seconds were not measured here; "" where all were."""
+    labels = dict.fromkeys(r.label for r in shown if r.cost is not None and r.cost.device == STATED)
+    return f"not measured but stated: the seconds of {', '.join(labels)}" if labels else ""

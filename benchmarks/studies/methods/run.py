@@ -70,18 +70,27 @@ class Runner:
 
     def run(self, job: Job) -> Result:
         """Run and score a job, and keep its volume."""
-        if self._judge is None or self._judge[0] != job.stored.content_hash:
-            self._judge = self._twin = None  # frees the last scan's masks first
-            self._judge = (job.stored.content_hash, self._judge_of(job.stored))
-        outcome = self._outcome(job)
+        self._judge_for(job.stored)
+        return self.finish(job, self._outcome(job))
+
+    def finish(self, job: Job, outcome: Outcome) -> Result:
+        """Score the outcome of a job, and keep its volume; a scan's after its twin's."""
+        judge = self._judge_for(job.stored)
         if job.variant == METAL:
             pair = self._pair(job)
             self._twin = None
         else:
             pair, self._twin = Twin(), (job, outcome)
-        result = self._scored(job, outcome, self._judge[1], pair)
+        result = self._scored(job, outcome, judge, pair)
         outcome.at_50kev = None  # a twin is kept for its scan's run, which needs its main volume only
         return result
+
+    def _judge_for(self, stored: StoredScan) -> Judge:
+        """Return what a scan's volumes are scored with; that of the last scan is remembered."""
+        if self._judge is None or self._judge[0] != stored.content_hash:
+            self._judge = self._twin = None  # frees the last scan's masks first
+            self._judge = (stored.content_hash, self._judge_of(stored))
+        return self._judge[1]
 
     def _judge_of(self, stored: StoredScan) -> Judge:
         """Load what a scan's volumes are scored with; methods come round by round, so its views are kept."""

@@ -75,8 +75,8 @@ def numbers(shown: Sequence[RunRecord]) -> Numbers:
                     compared.append(SeedValue(who[0], run.seed, *who[1:], protocol, metric, value, *said))
         cost = record.cost
         for metric in COLUMNS["cost"] if cost is not None else ():
-            value = record.kerma if metric == KERMA else float(getattr(cost, metric))
-            add((*who, "cost", metric), value, status)
+            value = record.kerma if metric == KERMA else getattr(cost, metric)
+            add((*who, "cost", metric), None if value is None else float(value), status)
         if cost is None and not any(score.values for score in record.scores.values()):
             add((*who, "", ""), None, status)
     for row in derived(compared):

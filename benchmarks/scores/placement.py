@@ -1,0 +1,155 @@
+"""Whether a volume made elsewhere has the scan's axes and unit: it is compared with the reference, turned every way.
+
+Volumes are [z, y, x]. The reference is clipped at the 99.9 percentile of the tissue, as the data range of `tissue` is,
+so that metal, which no method gets right, does not decide.
+"""
+
+import itertools
+import math
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.benchmarks.scores.protocol import Truth, tissue_range
+from ctsim.errors import InputError
+
+Unit = Literal["1/mm", "1/cm", "hu"]
+NAMES: dict[Unit, str] = {"1/mm": "1/mm", "1/cm": "1/cm", "hu": "HU"}
+AXES = "zyx"
+MOST = 2_000_000
+"""Voxels that are compared; of a larger volume every second, third … along each axis."""
+UNRELATED = 0.1
+"""Share of a volume's error that may look like the difference between the reference and its mirror image by chance."""
+
+
+class Turn(NamedTuple):
+    """Axis k of the scan is axis order[k] of the volume, and runs the other way where `flipped`."""
+
+    order: tuple[int, int, int]
+    flipped: tuple[bool, bool, bool]
+
+    def apply(self, volume: NDArray[Any]) -> NDArray[Any]:
+        """Return the volume turned, a view."""
+        back = tuple(slice(None, None, -1 if flip else 1) for flip in self.flipped)
+        return np.transpose(volume, self.order)[back]
+
+    @property
+    def text(self) -> str:
+        """What a volume looks like that this turns back."""
+        parts = []
+        if self.order != (0, 1, 2):
+            theirs = ", ".join(AXES[self.order.index(axis)] for axis in range(3))
+            parts.append(f"transposed (its axes seem to be {theirs}, expected z, y, x)")
+        if any(self.flipped):
+            parts.append("flipped along " + " and ".join(a for a, flip in zip(AXES, self.flipped, strict=True) if flip))
+        return " and ".join(parts)
+
+
+TURNS = tuple(
+    Turn((a, b, c), (i, j, k))
+    for a, b, c in itertools.permutations(range(3))
+    for i, j, k in itertools.product((False, True), repeat=3)
+)
+"""All 48; the first leaves a volume as it is."""
+
+
+def to_attenuation(values: NDArray[Any], unit: Unit, water: float | None) -> NDArray[np.float32]:
+    """Convert values to 1/mm, float32; `water` is the μ of 0 HU in 1/mm. Raises InputError for HU without it."""
+    if unit == "1/mm":
+        return np.asarray(values, np.float32)
+    if unit == "1/cm":
+        return np.asarray(values, np.float64).astype(np.float32) / np.float32(10)
+    if water is None:
+        raise InputError("--unit hu needs the attenuation of water, and the scan has no spectrum.csv: expected 1/mm")
+    return (water * (1 + np.asarray(values, np.float64) / 1000)).astype(np.float32)
+
+
+def check(name: str, values: NDArray[Any], truth: Truth, unit: Unit = "1/mm", water: float | None = None) -> None:
+    """Raise InputError, a sentence that begins with `name`, for a volume of another shape, unit or orientation.
+
+    `values` are as stored, in `unit`. A unit is refused where another one brings both mean and standard deviation
+    nearer to the reference's. Numbers that are not finite are refused.
+    """
+    shape = truth.metal.shape
+    if sorted(values.shape) != sorted(shape):
+        raise InputError(f"{name} has shape {values.shape}, expected {shape} (z, y, x)")
+    if not (finite := np.isfinite(values)).all():
+        raise InputError(f"{name} has {int((~finite).sum())} of {values.size} voxels that are not finite")
+    reference = np.minimum(truth.references["effective"], np.float32(tissue_range(truth, "effective")))
+    _check_unit(name, values, reference, unit, water)
+    _check_turn(name, to_attenuation(values, unit, water), reference)
+
+
+def _check_unit(
+    name: str, values: NDArray[Any], reference: NDArray[np.float32], unit: Unit, water: float | None
+) -> None:
+    """Compare mean and spread, which no turn changes, with the reference's."""
+    mean, spread = float(reference.mean(dtype=np.float64)), float(reference.std(dtype=np.float64))
+    own_mean, own_spread = float(values.mean(dtype=np.float64)), float(values.std(dtype=np.float64))
+    if own_spread == 0 or spread == 0:
+        return  # a constant has no scale
+    off: dict[Unit, tuple[float, float]] = {}
+    for other in NAMES:
+        if other == "hu" and water is None:
+            continue
+        scale = {"1/mm": 1.0, "1/cm": 0.1, "hu": (water or 0) / 1000}[other]
+        shifted = own_mean * scale + (water or 0) * (other == "hu")
+        off[other] = abs(math.log(own_spread * scale / spread)), _distance(shifted, mean)
+    better = [other for other in off if all(a < b for a, b in zip(off[other], off[unit], strict=True))]
+    if better:
+        found = min(better, key=lambda other: sum(off[other]))
+        raise InputError(
+            f"{name} looks like {NAMES[found]}: its mean is {own_mean:.3g}, the reference's {mean:.3g} 1/mm; "
+            f"expected {NAMES[unit]}, or --unit {found}"
+        )
+
+
+def _distance(one: float, other: float) -> float:
+    """Return the distance of two means as a logarithm; infinite where one is not positive."""
+    return abs(math.log(one / other)) if one > 0 and other > 0 else math.inf
+
+
+def _check_turn(name: str, values: NDArray[np.float32], reference: NDArray[np.float32]) -> None:
+    """Refuse a volume that fits better when it is turned.
+
+    With r the reference, d its difference from its own turned copy and ρ their correlation, a volume r + t·d + e has
+    correlations that differ by (1 − ρ)·c·(2t − 1) for small d: −(1 − ρ)·c where it is right (t = 0), +(1 − ρ)·c where
+    it is turned (t = 1). It is refused from t = ¾ on. A copy that differs from the reference by less than a tenth of
+    the volume's own error says nothing, since errors look like it by chance.
+    """
+    clipped = np.clip(values, 0, float(reference.max()))
+    step = math.ceil((reference.size / MOST) ** (1 / 3))
+    few = (slice(None, None, step),) * 3
+    target = _standard(reference[few])
+    fits = [turn for turn in TURNS if turn.apply(clipped).shape == reference.shape]
+    if target is None or not fits:
+        return
+    found = {turn: _correlation(turn.apply(clipped)[few], target) for turn in fits}
+    best = max(found, key=lambda turn: found[turn])
+    own, other = found.get(TURNS[0]), found[best]
+    if own is None:  # only turned does it have the shape
+        raise InputError(f"{name} has shape {values.shape}, expected {reference.shape} (z, y, x): it is {best.text}")
+    if best == TURNS[0] or other <= 0:
+        return
+    back = best.apply(reference)
+    alike = _correlation(back[few], target)
+    error = 1 / other**2 - 1  # square of the volume's error, in units of the reference's variance
+    if 2 * (1 - alike) < UNRELATED**2 * error:
+        return
+    if other - own > other * (1 - alike) / 2:
+        raise InputError(f"{name} looks {best.text}: correlation with the reference {own:.2f}, turned back {other:.2f}")
+
+
+def _standard(values: NDArray[Any]) -> NDArray[np.float64] | None:
+    """Return values with mean 0 and norm 1; None for a constant."""
+    flat = np.array(values, np.float64)
+    flat -= flat.mean()
+    norm = float(np.linalg.norm(flat))
+    return flat / norm if norm > 0 else None
+
+
+def _correlation(values: NDArray[Any], target: NDArray[np.float64]) -> float:
+    """Return Pearson's correlation with a standardised array; 0 for a constant."""
+    own = _standard(values)
+    return 0.0 if own is None else float(np.vdot(own, target))

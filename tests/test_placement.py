@@ -1,0 +1,99 @@
+"""A volume that is turned, or in another unit, is refused by name; a bad one in its place is not."""
+
+import numpy as np
+import pytest
+
+from ctsim.benchmarks.scores import placement
+from ctsim.benchmarks.scores.protocol import Truth
+from ctsim.errors import InputError
+
+WATER = 0.02
+
+
+def body(shape=(12, 14, 16)):
+    """Return a lopsided body of water with a bone and a cavity, in 1/mm."""
+    z, y, x = np.meshgrid(*((np.arange(n) + 0.5) / n - 0.5 for n in shape), indexing="ij")
+    values = WATER * (np.hypot(y / 0.4, x / 0.3) < 1) * (z > -0.3)
+    values[(np.abs(z - 0.2) < 0.1) & (np.abs(y - 0.2) < 0.1) & (np.abs(x + 0.1) < 0.08)] = 2 * WATER
+    values[(np.abs(z + 0.1) < 0.1) & (np.abs(y) < 0.1) & (np.abs(x - 0.12) < 0.08)] = 0
+    return values.astype(np.float32)
+
+
+def truth_of(reference):
+    none = np.zeros(reference.shape, bool)
+    return Truth(
+        references={"effective": reference, "50kev": reference},
+        metal=none, body=~none, tissue=~none, judged=~none, near_metal=none, d_voxel=(1.0, 1.0, 1.0), l0=10.0,
+    )  # fmt: skip
+
+
+def noisy(values, size=0.5, seed=0):
+    return values + np.random.default_rng(seed).normal(0, size * WATER, values.shape).astype(np.float32)
+
+
+def in_hu(values):
+    return 1000 * (values / WATER - 1)
+
+
+@pytest.mark.parametrize("turn", placement.TURNS[1:])
+def test_each_turn_is_refused_by_name(turn):
+    """A body that no turn leaves as it is, so that each of the 47 has a name of its own."""
+    reference = body((14, 14, 14))
+    wrong = placement.Turn((0, 1, 2), turn.flipped).apply(noisy(reference))
+    wrong = np.transpose(wrong, np.argsort(turn.order))
+    assert np.array_equal(turn.apply(wrong), noisy(reference))
+    with pytest.raises(InputError, match=r"^mine looks (transposed|flipped)") as caught:
+        placement.check("mine", wrong, truth_of(reference))
+    assert f"looks {turn.text}: correlation" in str(caught.value)
+
+
+def test_a_transposed_shape_says_its_axes():
+    reference = body()
+    with pytest.raises(InputError, match=r"shape \(16, 14, 12\), expected \(12, 14, 16\).*seem to be x, y, z"):
+        placement.check("mine", reference.T, truth_of(reference))
+    with pytest.raises(InputError, match=r"shape \(12, 14, 15\), expected \(12, 14, 16\)"):
+        placement.check("mine", reference[:, :, 1:], truth_of(reference))
+
+
+@pytest.mark.parametrize("unit", placement.NAMES)
+@pytest.mark.parametrize("stated", placement.NAMES)
+def test_another_unit_is_refused_by_name(unit, stated):
+    reference = body()
+    values = {"1/mm": lambda v: v, "1/cm": lambda v: 10 * v, "hu": in_hu}[unit](noisy(reference))
+    if unit == stated:
+        placement.check("mine", values, truth_of(reference), stated, WATER)
+        # one rounding of float32 at 1000 HU, 2⁻²⁴ of 0.02 1/mm, and one of each conversion
+        found = placement.to_attenuation(values, stated, WATER)
+        np.testing.assert_allclose(found, noisy(reference), rtol=0, atol=4 * WATER * 3 * 2**-23)
+        return
+    with pytest.raises(InputError, match=f"looks like {placement.NAMES[unit]}: .* or --unit {unit}$"):
+        placement.check("mine", values, truth_of(reference), stated, WATER)
+
+
+@pytest.mark.parametrize("size", [0.0, 1.0, 4.0])
+def test_a_bad_volume_in_its_place_is_scored(size):
+    """Noise of four times water's attenuation is no other unit and no mirror image."""
+    reference = body()
+    for seed in range(20):
+        placement.check("mine", noisy(reference, size, seed), truth_of(reference))
+
+
+def test_a_volume_without_content_is_scored():
+    reference = body()
+    placement.check("mine", np.zeros_like(reference), truth_of(reference))
+    placement.check("mine", np.full_like(reference, WATER), truth_of(reference))
+
+
+def test_a_symmetric_body_has_no_orientation():
+    reference = np.maximum(body(), body()[::-1])
+    for seed in range(20):
+        placement.check("mine", noisy(reference, 0.5, seed), truth_of(reference))
+    with pytest.raises(InputError, match=r"flipped along y:|flipped along z and y:"):
+        placement.check("mine", noisy(reference)[:, ::-1], truth_of(reference))
+
+
+def test_numbers_that_are_not_finite_are_counted():
+    values = body()
+    values[0, 0, :3] = np.nan
+    with pytest.raises(InputError, match=r"^mine has 3 of 2688 voxels that are not finite"):
+        placement.check("mine", values, truth_of(body()))
