@@ -4,13 +4,14 @@ A method of ours states its parameters as a struct of settings (`ctsim.reconstru
 my_lab.net:reconstruct` names a function of your own: its keyword parameters are its settings, converted to the types
 that they are annotated with; one called `device` is always "cpu". Its module may define `skip(scan) -> str | None`
 (a reason, or None to run) and `INPUTS`, which says what the method needs in addition to the counts. Methods are ranked
-within one class of inputs.
+within one class of inputs. `--method "cmd:./mine {scan} {out}"` runs a program (`ctsim.benchmarks.program`).
 """
 
 import ast
 import difflib
 import functools
 import hashlib
+import importlib
 import importlib.util
 import inspect
 import os
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
     from ctsim.types import Scan, Volume
 
 OURS = ("ctsim",)
+PROGRAM = "cmd:"
+"""A method's name that begins so is the command of a program."""
+RUNS_PROGRAM = "ctsim.benchmarks.program"
 COUNTS_ONLY, METAL_MASK, SPECTRUM = "counts only", "metal mask", "spectrum"
 ASSUMED = "assumed spectrum"
 """Told no spectrum, but built on the tube, filter and scintillator that the simulator has by default."""
@@ -84,7 +88,12 @@ class Method:
     def label(self) -> str:
         """The name with the parameters that differ from the defaults, as tables show it."""
         given = ", ".join(f"{k}={v}" for k, v in sorted(self.overrides.items()))
-        return f"{self.name}[{given}]" if given else self.name
+        return f"{self.name}[{given}]" if given and not self.program else self.name
+
+    @property
+    def program(self) -> bool:
+        """Whether it is a program: its name is its command, and all of its parameters."""
+        return self.name.startswith(PROGRAM)
 
     @property
     def control(self) -> bool:
@@ -139,6 +148,8 @@ def find(name: str, overrides: dict[str, Any] | None = None) -> Method:
 
     Raises InputError naming near matches for an unknown method or parameter.
     """
+    if name.startswith(PROGRAM):
+        return _program(name, overrides or {})
     if name in TABLE:
         target, inputs = TABLE[name]
     elif ":" in name:
@@ -161,6 +172,26 @@ def find(name: str, overrides: dict[str, Any] | None = None) -> Method:
         params=params,
         overrides=changed,
         code=code_version(function.__module__),
+    )
+
+
+def _program(name: str, overrides: dict[str, Any]) -> Method:
+    """Return a program as a method: what is a parameter of others stands in its command.
+
+    Raises InputError where the command lacks a place for scan or volume, or its program is not there.
+    """
+    program = importlib.import_module(RUNS_PROGRAM)  # loads torch
+    command = name.removeprefix(PROGRAM)
+    told = {"command": command, "mask": "oracle" if program.asks_for_mask(command) else "none"}
+    if other := overrides.keys() - told.keys():
+        raise InputError(f"{name}.{min(other)}: a program has no parameters, expected its options in the command")
+    return Method(
+        name=name,
+        target=f"{RUNS_PROGRAM}:reconstruct",
+        inputs=METAL_MASK if told["mask"] == "oracle" else COUNTS_ONLY,
+        params=told,
+        overrides=told,
+        code=f"{code_version(RUNS_PROGRAM)[:8]}{program.code_of(command)[:8]}",
     )
 
 

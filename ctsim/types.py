@@ -112,7 +112,8 @@ class Scan:
     `counts` [view, v, u] is what the detector wrote (uint16 where there is an ADC, else float32);
     `flat` [v, u] float32 is the open-field image and `dark` the pedestal, both in counts. `e_max` is
     the highest photon energy (keV); `i0` the photons per open pixel and view. `metal` [z, y, x], not 0 in metal,
-    is the true mask, there only for methods that declare to be given it.
+    is the true mask, there only for methods that declare to be given it. `name` is that of the scene, "" where it has
+    none; that of a metal-free twin ends in "/metal_free".
 
     Raises
     ------
@@ -128,6 +129,7 @@ class Scan:
     i0: float = 1e5
     e_max: float = 90.0
     metal: "torch.Tensor | None" = None
+    name: str = ""
 
     def __post_init__(self) -> None:
         check_readings(self.dark, self.i0, self.e_max)

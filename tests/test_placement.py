@@ -27,6 +27,10 @@ def truth_of(reference):
     )  # fmt: skip
 
 
+def check(values, reference, unit="1/mm"):
+    placement.check("mine", values, truth_of(reference), unit, WATER, "--unit")
+
+
 def noisy(values, size=0.5, seed=0):
     return values + np.random.default_rng(seed).normal(0, size * WATER, values.shape).astype(np.float32)
 
@@ -43,16 +47,16 @@ def test_each_turn_is_refused_by_name(turn):
     wrong = np.transpose(wrong, np.argsort(turn.order))
     assert np.array_equal(turn.apply(wrong), noisy(reference))
     with pytest.raises(InputError, match=r"^mine looks (transposed|flipped)") as caught:
-        placement.check("mine", wrong, truth_of(reference))
+        check(wrong, reference)
     assert f"looks {turn.text}: correlation" in str(caught.value)
 
 
 def test_a_transposed_shape_says_its_axes():
     reference = body()
     with pytest.raises(InputError, match=r"shape \(16, 14, 12\), expected \(12, 14, 16\).*seem to be x, y, z"):
-        placement.check("mine", reference.T, truth_of(reference))
+        check(reference.T, reference)
     with pytest.raises(InputError, match=r"shape \(12, 14, 15\), expected \(12, 14, 16\)"):
-        placement.check("mine", reference[:, :, 1:], truth_of(reference))
+        check(reference[:, :, 1:], reference)
 
 
 @pytest.mark.parametrize("unit", placement.NAMES)
@@ -61,13 +65,13 @@ def test_another_unit_is_refused_by_name(unit, stated):
     reference = body()
     values = {"1/mm": lambda v: v, "1/cm": lambda v: 10 * v, "hu": in_hu}[unit](noisy(reference))
     if unit == stated:
-        placement.check("mine", values, truth_of(reference), stated, WATER)
+        check(values, reference, stated)
         # one rounding of float32 at 1000 HU, 2⁻²⁴ of 0.02 1/mm, and one of each conversion
         found = placement.to_attenuation(values, stated, WATER)
         np.testing.assert_allclose(found, noisy(reference), rtol=0, atol=4 * WATER * 3 * 2**-23)
         return
     with pytest.raises(InputError, match=f"looks like {placement.NAMES[unit]}: .* or --unit {unit}$"):
-        placement.check("mine", values, truth_of(reference), stated, WATER)
+        check(values, reference, stated)
 
 
 @pytest.mark.parametrize("size", [0.0, 1.0, 4.0])
@@ -75,25 +79,25 @@ def test_a_bad_volume_in_its_place_is_scored(size):
     """Noise of four times water's attenuation is no other unit and no mirror image."""
     reference = body()
     for seed in range(20):
-        placement.check("mine", noisy(reference, size, seed), truth_of(reference))
+        check(noisy(reference, size, seed), reference)
 
 
 def test_a_volume_without_content_is_scored():
     reference = body()
-    placement.check("mine", np.zeros_like(reference), truth_of(reference))
-    placement.check("mine", np.full_like(reference, WATER), truth_of(reference))
+    check(np.zeros_like(reference), reference)
+    check(np.full_like(reference, WATER), reference)
 
 
 def test_a_symmetric_body_has_no_orientation():
     reference = np.maximum(body(), body()[::-1])
     for seed in range(20):
-        placement.check("mine", noisy(reference, 0.5, seed), truth_of(reference))
+        check(noisy(reference, 0.5, seed), reference)
     with pytest.raises(InputError, match=r"flipped along y:|flipped along z and y:"):
-        placement.check("mine", noisy(reference)[:, ::-1], truth_of(reference))
+        check(noisy(reference)[:, ::-1], reference)
 
 
 def test_numbers_that_are_not_finite_are_counted():
     values = body()
     values[0, 0, :3] = np.nan
     with pytest.raises(InputError, match=r"^mine has 3 of 2688 voxels that are not finite"):
-        placement.check("mine", values, truth_of(body()))
+        check(values, body())

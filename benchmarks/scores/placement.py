@@ -65,11 +65,11 @@ def to_attenuation(values: NDArray[Any], unit: Unit, water: float | None) -> NDA
     return (water * (1 + np.asarray(values, np.float64) / 1000)).astype(np.float32)
 
 
-def check(name: str, values: NDArray[Any], truth: Truth, unit: Unit = "1/mm", water: float | None = None) -> None:
+def check(name: str, values: NDArray[Any], truth: Truth, unit: Unit, water: float | None, option: str = "") -> None:
     """Raise InputError, a sentence that begins with `name`, for a volume of another shape, unit or orientation.
 
     `values` are as stored, in `unit`. A unit is refused where another one brings both mean and standard deviation
-    nearer to the reference's. Numbers that are not finite are refused.
+    nearer to the reference's; `option` names the flag that states it. Numbers that are not finite are refused.
     """
     shape = truth.metal.shape
     if sorted(values.shape) != sorted(shape):
@@ -77,18 +77,22 @@ def check(name: str, values: NDArray[Any], truth: Truth, unit: Unit = "1/mm", wa
     if not (finite := np.isfinite(values)).all():
         raise InputError(f"{name} has {int((~finite).sum())} of {values.size} voxels that are not finite")
     reference = np.minimum(truth.references["effective"], np.float32(tissue_range(truth, "effective")))
-    _check_unit(name, values, reference, unit, water)
+    if (found := _better_unit(values, reference, unit, water)) is not None:
+        mean, own = float(reference.mean()), float(values.mean())
+        instead = f", or {option} {found}" if option else ""
+        raise InputError(
+            f"{name} looks like {NAMES[found]}: its mean is {own:.3g}, the reference's {mean:.3g} 1/mm; "
+            f"expected {NAMES[unit]}{instead}"
+        )
     _check_turn(name, to_attenuation(values, unit, water), reference)
 
 
-def _check_unit(
-    name: str, values: NDArray[Any], reference: NDArray[np.float32], unit: Unit, water: float | None
-) -> None:
-    """Compare mean and spread, which no turn changes, with the reference's."""
+def _better_unit(values: NDArray[Any], reference: NDArray[np.float32], unit: Unit, water: float | None) -> Unit | None:
+    """Return a unit in which mean and spread, which no turn changes, are nearer to the reference's; None without."""
     mean, spread = float(reference.mean(dtype=np.float64)), float(reference.std(dtype=np.float64))
     own_mean, own_spread = float(values.mean(dtype=np.float64)), float(values.std(dtype=np.float64))
     if own_spread == 0 or spread == 0:
-        return  # a constant has no scale
+        return None  # a constant has no scale
     off: dict[Unit, tuple[float, float]] = {}
     for other in NAMES:
         if other == "hu" and water is None:
@@ -97,12 +101,7 @@ def _check_unit(
         shifted = own_mean * scale + (water or 0) * (other == "hu")
         off[other] = abs(math.log(own_spread * scale / spread)), _distance(shifted, mean)
     better = [other for other in off if all(a < b for a, b in zip(off[other], off[unit], strict=True))]
-    if better:
-        found = min(better, key=lambda other: sum(off[other]))
-        raise InputError(
-            f"{name} looks like {NAMES[found]}: its mean is {own_mean:.3g}, the reference's {mean:.3g} 1/mm; "
-            f"expected {NAMES[unit]}, or --unit {found}"
-        )
+    return min(better, key=lambda other: sum(off[other]), default=None)
 
 
 def _distance(one: float, other: float) -> float:

@@ -95,7 +95,7 @@ def _checked(files: dict[str, VolumeFile], stored: StoredScan, given: Flags) -> 
         values = file.values()
         if file.rescale is not None:
             values = values * np.float64(file.rescale[0]) + file.rescale[1]
-        placement.check(str(file.path), values, truth, given.unit, water)
+        placement.check(str(file.path), values, truth, given.unit, water, "--unit")
         found[variant] = placement.to_attenuation(values, given.unit, water)
     return found
 

@@ -62,9 +62,17 @@ class StoredScan:
         from ctsim.types import Scan
 
         counts, flat = (torch.from_numpy(_map(self.folder, self.files, name)) for name in _readings(self.prefix))
-        info = self.info
+        info, name = self.info, f"{self.name}/{self.prefix}".rstrip("/")
         try:
-            return Scan(geometry=info.geometry, counts=counts, flat=flat, dark=info.dark, i0=info.i0, e_max=info.e_max)
+            return Scan(
+                geometry=info.geometry,
+                counts=counts,
+                flat=flat,
+                dark=info.dark,
+                i0=info.i0,
+                e_max=info.e_max,
+                name=name,
+            )
         except InputError as error:
             raise InputError(f"{self.folder}: {error}") from None
 

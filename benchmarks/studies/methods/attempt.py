@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from ctsim.benchmarks.engine.host import measured
 from ctsim.benchmarks.methods import Method
+from ctsim.benchmarks.program import USAGE, ProgramError
 from ctsim.benchmarks.scores.score import NO_TWIN
 from ctsim.benchmarks.studies.methods.records import METAL, Cost
 from ctsim.benchmarks.studies.methods.volumes import Intermediates, attached, recordable
@@ -119,13 +120,16 @@ def describe(error: BaseException) -> str:
 
 def attempt(method: Method, scan: Scan, warm_up_seconds: float) -> Outcome:
     """Run a method in this process and return its outcome; of all exceptions only Ctrl-C is passed on."""
-    outcome, usage, view_updates = Outcome(status="error"), None, 0
+    outcome, usage, view_updates = Outcome(status="error"), None, None if method.program else 0
     try:
         with restored():
             with measured() as usage:
                 volume = method.reconstruct(scan)
             _check(volume)
-            view_updates = int(volume.details.get("view_updates", scan.geometry.n_views))
+            if method.program:  # without the time for its copy of the scan
+                usage = volume.details[USAGE]
+            else:
+                view_updates = int(volume.details.get("view_updates", scan.geometry.n_views))
             outcome.status, outcome.reason = str(volume.status), volume.reason
             outcome.values = _array(volume.values)
             outcome.intermediates = attached(volume.details, scan.geometry)
@@ -185,7 +189,7 @@ def _failure(error: BaseException) -> Outcome:
     """Return the outcome of a run that raised `error`."""
     # torch has its own error for devices
     out_of_memory = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
-    reason = str(error) if isinstance(error, _NoVolume) else describe(error)
+    reason = str(error) if isinstance(error, _NoVolume | ProgramError) else describe(error)
     return Outcome(status="out_of_memory" if out_of_memory else "error", reason=reason)
 
 
@@ -211,8 +215,11 @@ def warm_up(method: Method, scan: Scan) -> float:
     """Run the method on a tiny scan of the same kind, so that compiling is not timed; return its seconds.
 
     A method with a time limit runs for one second, repeatedly until it no longer compiles: code that it did not reach
-    would be compiled in the timed run. It writes no checkpoints. An error on the tiny scan is only logged.
+    would be compiled in the timed run. It writes no checkpoints. An error on the tiny scan is only logged. A program,
+    which starts afresh each time, has no warm-up.
     """
+    if method.program:
+        return 0.0
     told = {"seconds": WARM} if "seconds" in method.params else {}
     others = {name: value for name, value in method.overrides.items() if name != "checkpoints"}
     method = dataclasses.replace(method, overrides=others | told)

@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import math
 import signal
+import tempfile
 import time
 
 import msgspec
@@ -17,6 +18,8 @@ import torch
 from ctsim.benchmarks.engine.process import Process, Stopped
 from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.methods import Method
+from ctsim.benchmarks.scores import placement
+from ctsim.benchmarks.scores.artefact import effective_attenuation
 from ctsim.benchmarks.scores.judge import Judge, Twin
 from ctsim.benchmarks.scores.projection import HeldOut
 from ctsim.benchmarks.scores.score import NO_TWIN, NOT_ASKED, TWIN_ENDED
@@ -34,6 +37,7 @@ from ctsim.benchmarks.studies.methods.volumes import (
     write_intermediates,
 )
 from ctsim.dataset.store import StoredScan
+from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.splat.course import PASSES, affordable
@@ -138,6 +142,12 @@ class Runner:
     def _scored(self, job: Job, outcome: Outcome, judge: Judge, pair: Twin) -> Result:
         """Score an outcome and write its volume."""
         scores, files, task = {}, {}, job.task
+        if job.method.program and outcome.values is not None and outcome.status in SCORED:
+            try:
+                water = effective_attenuation(job.stored)
+                placement.check("the program's volume", outcome.values, judge.truth, "1/mm", water)
+            except InputError as error:
+                outcome.fail("error", str(error))
         if outcome.values is not None and outcome.status in SCORED:
             try:
                 scores = judge.scores(outcome.values, job.variant, pair, outcome.at_50kev)
@@ -165,8 +175,14 @@ class Runner:
 
 
 def _isolated(job: Job, seconds: float | None) -> Outcome:
-    """Run a job in a new process and wait at most `seconds` for it, its start and compilation included."""
-    with Process() as process:
+    """Run a job in a new process and wait at most `seconds` for it, its start and compilation included.
+
+    What it leaves in its folder for temporary files is removed.
+    """
+    with (
+        tempfile.TemporaryDirectory(prefix="ctsim-", ignore_cleanup_errors=True) as folder,
+        Process({"TMPDIR": folder}) as process,
+    ):
         try:
             return process.run(_alone, job.task, seconds=seconds)
         except Stopped as end:

@@ -5,6 +5,7 @@ prior) to its volume, `Volume(..., details={"intermediates": {"view": 15, "trace
 are kept next to the volume as NAME.npz. The other details go into the record.
 """
 
+import hashlib
 import json
 import os
 import struct
@@ -31,6 +32,7 @@ KEY = "intermediates"
 _RUN = "run"
 Intermediates = dict[str, NDArray[Any]]
 
+LONGEST_NAME = 100  # characters of a method's label in the name of a file
 LONGEST = 10_000  # bytes of JSON; a record drops longer entries
 ELSEWHERE = ("view_updates", KEY)  # details that a run keeps in its cost and in a file
 
@@ -38,6 +40,8 @@ ELSEWHERE = ("view_updates", KEY)  # details that a run keeps in its cost and in
 def volume_name(task: RunTask) -> str:
     """Return the path of a kept volume in the results folder: scene and method in allowed characters."""
     label = "".join(c if c.isalnum() or c in "-.=" else "_" for c in task.subject)
+    if len(label) > LONGEST_NAME:  # such as a program's command
+        label = f"{label[:LONGEST_NAME]}-{hashlib.sha256(task.subject.encode()).hexdigest()[:8]}"
     twin = "" if task.part == METAL else "__metal_free"
     return f"volumes/{task.hints['name']}{twin}__{label}.tif"
 
