@@ -50,7 +50,7 @@ OTHERS = {
     "ablation": Command("ctsim.benchmarks.studies.ablation", "run the paper's ablations of its splat method"),
 }
 OF_DATASETS = {
-    "export": Command("ctsim.benchmarks.export.work", "write a volume as NIfTI, MetaImage or DICOM", resumes=False),
+    "export": Command("ctsim.benchmarks.export.work", "write a volume or a scan for other programs", resumes=False),
     "shards": Command("ctsim.benchmarks.shards.work", "write scans into HDF5 files for training"),
 }
 EXIT_USER, EXIT_INTERRUPTED = 2, 130

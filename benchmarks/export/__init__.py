@@ -1,4 +1,4 @@
-"""`make-dataset export`: volumes of a scan's grid in the formats of medical imaging. The flags of the command."""
+"""`make-dataset export`: scans and volumes in the formats of other programs. The flags of the command."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,17 +9,19 @@ import tyro
 
 @dataclass(frozen=True, kw_only=True)
 class Flags:
-    """Write a volume on a scan's grid as NIfTI, MetaImage or DICOM, with its spacing and its place.
+    """Write a volume on a scan's grid as NIfTI, MetaImage or DICOM, or the scan in the layout of another library.
 
-    NIfTI and MetaImage keep the values in 1/mm, or HU with --hu. DICOM slices are HU in 16 bits.
+    NIfTI and MetaImage keep the values in 1/mm, or HU with --hu. DICOM slices are HU in 16 bits. All three state
+    spacing and place. The layouts of TIGRE, RTK, ASTRA, LEAP, R2-Gaussian (r2) and NAF hold line integrals, geometry
+    and grid.
     """
 
     scan: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCAN")]
     """Folder of a scan, data/SCENE."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    """New file (.nii, .nii.gz or .mha), or new folder of DICOM slices."""
-    to: Literal["nifti", "mha", "dicom"]
-    """Format."""
+    """New file (.nii, .nii.gz, .mha or .pickle), or new folder (DICOM slices, and the layouts of libraries)."""
+    to: Literal["nifti", "mha", "dicom", "tigre", "rtk", "astra", "leap", "r2", "naf"]
+    """Format of a volume, or library."""
     volume: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "reference_effective"
     """A volume of the scan (reference_effective, reference_50kev, labels, metal, metal_free/…), or a TIFF stack or .npy
     array on the scan's grid, such as a reconstruction in results/volumes."""

@@ -1,4 +1,4 @@
-"""What `make-dataset export` does: take a volume [z, y, x] on a scan's grid, turn it into HU where asked, write it."""
+"""What `make-dataset export` does: write a scan for a library, or a volume [z, y, x] on its grid, in HU where asked."""
 
 import sys
 from pathlib import Path
@@ -9,6 +9,7 @@ import tyro
 from numpy.typing import NDArray
 
 from ctsim.benchmarks.export import Flags
+from ctsim.benchmarks.export.scans import LAYOUTS, Measured, write_scan
 from ctsim.benchmarks.scores.artefact import effective_attenuation
 from ctsim.dataset.arrayfile import read_array
 from ctsim.dataset.store import StoredScan, open_scan
@@ -16,6 +17,7 @@ from ctsim.errors import InputError
 from ctsim.io.formats import FORMATS, load
 from ctsim.io.placed import Placed
 from ctsim.materials import attenuation
+from ctsim.reconstruct.log import line_integrals
 
 REFERENCE_50KEV = "reference_50kev"
 
@@ -28,13 +30,16 @@ def main(argv: list[str]) -> int:
 
 
 def export(given: Flags) -> None:
-    """Write the volume that the flags ask for, and say what was written.
+    """Write the scan or the volume that the flags ask for, and say what was written.
 
     Raises InputError where the scan or the volume cannot be read or has no HU, and where OUT is there or is named as
     another format.
     """
     _check_out(given.out, given.to)
     stored = open_scan(given.scan)
+    if given.to in LAYOUTS:
+        _export_scan(given, stored)
+        return
     values = _volume(stored, given.volume)
     unit = "1/mm" if values.dtype.kind == "f" else str(values.dtype)
     if given.hu or given.to == "dicom":
@@ -56,10 +61,21 @@ def export(given: Flags) -> None:
     sys.stdout.write(f"{given.out}: {shape} voxels of {size} mm (z × y × x) in {unit}\n")
 
 
+def _export_scan(given: Flags, stored: StoredScan) -> None:
+    plain = Flags(scan=given.scan, out=given.out, to=given.to)
+    if given != plain:
+        raise InputError(f"--to {given.to} writes the scan: expected neither --volume, --hu nor --kev")
+    p, _ = line_integrals(stored.scan, slice(None))
+    truth = np.asarray(stored.reference("effective"), np.float32)
+    write_scan(given.out, given.to, Measured(geometry=stored.geometry, p=p.numpy(), reference=truth))
+    shape = " × ".join(str(n) for n in stored.geometry.shape)
+    sys.stdout.write(f"{given.out}: {shape} line integrals (view × v × u) for {given.to}\n")
+
+
 def _check_out(out: Path, to: str) -> None:
     if out.exists():
         raise InputError(f"OUT: {out} is there already, expected a new name")
-    ends = FORMATS[to].ends
+    ends = (LAYOUTS[to].file,) if to in LAYOUTS else FORMATS[to].ends
     if not out.name.endswith(ends):
         raise InputError(f"OUT: {out} is to be {to}, expected a name that ends in {' or '.join(ends)}")
     if to == "dicom" and out.suffix in (".dcm", ".nii", ".mha"):

@@ -1,0 +1,273 @@
+"""Scans in the layouts of other libraries: line integrals, geometry and grid, as their readers expect them.
+
+Lengths are mm. `docs/reference/conventions.md` says how the frames lie in each other.
+"""
+
+import json
+import pickle
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.dataset.durable import replacing
+from ctsim.dataset.interop import Library, angles_to, astra_vectors, projections_to, volume_to
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+from ctsim.io import metaimage
+from ctsim.io.placed import Placed
+
+EVERY = 10
+"""R2-Gaussian and NAF want views for tests: every tenth, which is among those for training, too."""
+PER_METRE = 1000  # NAF's lengths are metres
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measured:
+    """What is exported: line integrals [view, v, u] and the true attenuation [z, y, x] in 1/mm, both float32.
+
+    R2-Gaussian and NAF do not start without a true volume, which they compare their own with.
+    """
+
+    geometry: Geometry
+    p: NDArray[np.float32]
+    reference: NDArray[np.float32]
+
+
+def write_scan(out: Path, to: str, scan: Measured) -> None:
+    """Write a scan in a library's layout, whole or not at all.
+
+    Raises InputError for a geometry that the layout cannot hold.
+    """
+    layout = LAYOUTS[to]
+    geometry = scan.geometry
+    if geometry.poses is not None and not layout.poses:
+        raise InputError(f"--to {to}: holds a circular orbit only, but the scan's geometry is given by poses")
+    if not layout.off_detector and any(geometry.off_detector):
+        raise InputError(
+            f"--to {to}: its rays know no offset of the detector, but off_detector is {geometry.off_detector} mm"
+        )
+    if not layout.off_origin and any(geometry.off_origin):
+        raise InputError(f"--to {to}: its volume is centred on the axis, but off_origin is {geometry.off_origin} mm")
+    if layout.square and geometry.d_voxel[1] != geometry.d_voxel[2]:
+        raise InputError(f"--to {to}: its voxels are square in x and y, but d_voxel is {geometry.d_voxel} mm (z, y, x)")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if layout.file:
+        with replacing(out) as new:
+            layout.write(new, scan)
+        return
+    partial = out.with_name(f".{out.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+    layout.write(partial, scan)
+    partial.rename(out)
+
+
+def _json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def _save(path: Path, values: NDArray[Any]) -> None:
+    np.save(path, np.ascontiguousarray(values))
+
+
+def _tigre(folder: Path, scan: Measured) -> None:
+    """Write the attributes of TIGRE's geometry by their names, its angles, and its projections."""
+    g = scan.geometry
+    geometry = {
+        "mode": "cone",
+        "DSD": g.dsd,
+        "DSO": g.dso,
+        "nDetector": g.n_detector,
+        "dDetector": g.d_detector,
+        "sDetector": g.s_detector,
+        "offDetector": g.off_detector,
+        "nVoxel": g.n_voxel,
+        "dVoxel": g.d_voxel,
+        "sVoxel": g.s_voxel,
+        "offOrigin": g.off_origin,
+        "accuracy": 0.5,
+        "COR": 0.0,
+        "rotDetector": (0.0, 0.0, 0.0),
+    }
+    _json(folder / "geometry.json", geometry)
+    _save(folder / "angles.npy", angles_to(Library.TIGRE, g.angles))
+    _save(folder / "projections.npy", projections_to(Library.TIGRE, scan.p))
+
+
+def _rtk(folder: Path, scan: Measured) -> None:
+    """Write RTK's geometry file, the projections with the detector's place, and an empty volume on the grid."""
+    g = scan.geometry
+    (v, u), (d_v, d_u) = g.off_detector, g.d_detector
+    middle = (g.n_views - 1) / 2  # of the stack of views, which begins at 0
+    stack = Placed(values=scan.p, spacing=(1.0, d_v, d_u), centre=(middle, v, u))
+    metaimage.write_volume(folder / "projections.mha", stack)
+    z, y, x = (0, 1, 2)
+    order = (x, z, y)  # RTK's z, y, x
+    grid = Placed(
+        values=volume_to(Library.RTK, np.zeros(g.n_voxel, np.float32)),
+        spacing=(g.d_voxel[order[0]], g.d_voxel[order[1]], g.d_voxel[order[2]]),
+        centre=(g.off_origin[order[0]], g.off_origin[order[1]], g.off_origin[order[2]]),
+    )
+    metaimage.write_volume(folder / "grid.mha", grid)
+    views = "".join(
+        f"  <Projection>\n    <GantryAngle>{float(angle)!r}</GantryAngle>\n  </Projection>\n"
+        for angle in angles_to(Library.RTK, g.angles)
+    )
+    (folder / "geometry.xml").write_text(
+        '<?xml version="1.0"?>\n<!DOCTYPE RTKGEOMETRY>\n<RTKThreeDCircularGeometry version="3">\n'
+        f"  <SourceToIsocenterDistance>{g.dso!r}</SourceToIsocenterDistance>\n"
+        f"  <SourceToDetectorDistance>{g.dsd!r}</SourceToDetectorDistance>\n"
+        f"{views}</RTKThreeDCircularGeometry>\n",
+        encoding="utf-8",
+    )
+
+
+def _astra(folder: Path, scan: Measured) -> None:
+    """Write ASTRA's two dictionaries, the first without its vectors, which are an array; and its projections."""
+    g = scan.geometry
+    n_z, n_y, n_x = g.n_voxel
+    window = {
+        f"Window{end}{axis}": middle + sign * side / 2
+        for axis, middle, side in zip("ZYX", g.off_origin, g.s_voxel, strict=True)
+        for end, sign in (("Min", -1), ("Max", 1))
+    }
+    volume = {"GridRowCount": n_y, "GridColCount": n_x, "GridSliceCount": n_z, "option": window}
+    rays = {"type": "cone_vec", "DetectorRowCount": g.n_detector[0], "DetectorColCount": g.n_detector[1]}
+    _json(folder / "geometry.json", {"proj_geom": rays, "vol_geom": volume})
+    _save(folder / "vectors.npy", astra_vectors(g))
+    _save(folder / "projections.npy", projections_to(Library.ASTRA, scan.p))
+
+
+def _leap(folder: Path, scan: Measured) -> None:
+    """Write LEAP's parameter file and its projections."""
+    g = scan.geometry
+    (n_v, n_u), (d_v, d_u), (v, u) = g.n_detector, g.d_detector, g.off_detector
+    parameters: dict[str, Any] = {
+        "numX": g.n_voxel[2],
+        "numY": g.n_voxel[1],
+        "numZ": g.n_voxel[0],
+        "voxelWidth": g.d_voxel[2],
+        "voxelHeight": g.d_voxel[0],
+        "offsetX": g.off_origin[2],
+        "offsetY": g.off_origin[1],
+        "offsetZ": g.off_origin[0],
+        "geometry": "cone",
+        "detectorType": "flat",
+        "numAngles": g.n_views,
+        "numRows": n_v,
+        "numCols": n_u,
+        "pixelHeight": d_v,
+        "pixelWidth": d_u,
+        "centerRow": (n_v - 1) / 2 - v / d_v,
+        "centerCol": (n_u - 1) / 2 - u / d_u,
+        "sod": g.dso,
+        "sdd": g.dsd,
+        "tau": 0.0,
+        "helicalPitch": 0.0,
+        "phis": ", ".join(repr(float(angle)) for angle in angles_to(Library.LEAP, g.angles)),
+    }
+    text = "".join(f"{key} = {value}\n" for key, value in parameters.items())
+    (folder / "parameters.cfg").write_text(text, encoding="utf-8")
+    _save(folder / "projections.npy", projections_to(Library.LEAP, scan.p))
+
+
+def _turn(geometry: Geometry) -> dict[str, float]:
+    """Return the first angle and the arc in degrees; both libraries only print them."""
+    first, *rest = np.degrees(geometry.angles).tolist()
+    even = abs(geometry.arc_deg) if geometry.angles_deg is None else abs((rest or [first])[-1] - first)
+    return {"startAngle": first, "totalAngle": even}
+
+
+def _r2(folder: Path, scan: Measured) -> None:
+    """Write R2-Gaussian's folder: a file for each view, the true volume, and meta_data.json."""
+    g = scan.geometry
+    views, angles = projections_to(Library.R2_GAUSSIAN, scan.p), angles_to(Library.R2_GAUSSIAN, g.angles)
+    told: dict[str, list[dict[str, Any]]] = {}
+    for split, chosen in (("proj_train", range(g.n_views)), ("proj_test", range(0, g.n_views, EVERY))):
+        (folder / split).mkdir()
+        told[split] = []
+        for number, view in enumerate(chosen):
+            name = f"{split}/{split}_{number:04d}.npy"
+            _save(folder / name, views[view])
+            told[split].append({"file_path": name, "angle": float(angles[view])})
+    _save(folder / "vol_gt.npy", volume_to(Library.R2_GAUSSIAN, scan.reference))
+    low, high = ([o + sign * s / 2 for o, s in zip(g.off_origin, g.s_voxel, strict=True)][::-1] for sign in (-1, 1))
+    scanner = {
+        "mode": "cone",
+        "filter": None,
+        "DSD": g.dsd,
+        "DSO": g.dso,
+        "nDetector": g.n_detector,
+        "sDetector": g.s_detector,
+        "offDetector": g.off_detector,
+        "nVoxel": g.n_voxel[::-1],
+        "sVoxel": g.s_voxel[::-1],
+        "offOrigin": g.off_origin[::-1],
+        "accuracy": 0.5,
+        "noise": False,
+        **_turn(g),
+    }
+    _json(folder / "meta_data.json", {"scanner": scanner, "vol": "vol_gt.npy", "bbox": [low, high], **told})
+
+
+def _naf(path: Path, scan: Measured) -> None:
+    """Write NAF's pickle, a dict of arrays, numbers and names. Its rays take the detector as (u, v), v downwards."""
+    g = scan.geometry
+    views = np.ascontiguousarray(projections_to(Library.R2_GAUSSIAN, scan.p))
+    image = volume_to(Library.R2_GAUSSIAN, scan.reference) * np.float32(PER_METRE)
+    few = slice(0, None, EVERY)
+    v, u = g.off_detector
+    content = {
+        "mode": "cone",
+        "filter": None,
+        "DSD": g.dsd,
+        "DSO": g.dso,
+        "nDetector": np.array(g.n_detector[::-1]),
+        "dDetector": np.array(g.d_detector[::-1]),
+        "offDetector": np.array([u, -v]),
+        "nVoxel": np.array(g.n_voxel[::-1]),
+        "dVoxel": np.array(g.d_voxel[::-1]),
+        "offOrigin": np.array(g.off_origin[::-1]),
+        "accuracy": 0.5,
+        "randomAngle": False,
+        "convert": False,
+        "noise": 0,
+        **_turn(g),
+        "numTrain": g.n_views,
+        "numVal": len(range(0, g.n_views, EVERY)),
+        "image": np.ascontiguousarray(image),
+        "train": {"angles": g.angles, "projections": views},
+        "val": {"angles": g.angles[few], "projections": views[few]},
+    }
+    with path.open("wb") as file:
+        pickle.dump(content, file, protocol=4)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """A library's layout: how it is written, and which geometries it can hold.
+
+    `file` is how its name ends where it is one file, "" for a folder.
+    """
+
+    write: Callable[[Path, Measured], None]
+    file: str = ""
+    poses: bool = False
+    off_detector: bool = True
+    off_origin: bool = True
+    square: bool = False
+
+
+LAYOUTS = {
+    "tigre": Layout(write=_tigre),
+    "rtk": Layout(write=_rtk),
+    "astra": Layout(write=_astra, poses=True),
+    "leap": Layout(write=_leap, square=True),
+    "r2": Layout(write=_r2, off_detector=False),
+    "naf": Layout(write=_naf, file=".pickle", off_origin=False),
+}
