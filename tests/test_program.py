@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import tifffile
 import torch
+from run_records import run_methods
 
 from ctsim.benchmarks import methods, program
 from ctsim.benchmarks.studies.methods.attempt import attempt
+from ctsim.dataset.store import open_scan
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.types import Scan
@@ -140,3 +142,19 @@ def test_its_code_is_that_of_the_files_it_names(tmp_path):
     script.write_text("pass  # another")
     assert methods.find(name).code != first.code
     assert first.label == name
+
+
+@pytest.mark.slow
+def test_a_program_is_run_scored_and_checked(smallest, tmp_path):
+    """The reference itself is scored as such; turned, or in HU, it is an error that says so."""
+    stored = open_scan(smallest / "smallest")
+    np.save(tmp_path / "v.npy", stored.reference("effective"))
+    code = "import sys, numpy as np; v = np.load(sys.argv[3]); np.save(sys.argv[2], eval(sys.argv[4]))"
+    changes = ("v", "v[:, ::-1]", "v * 5e4 - 1000")
+    chosen = [python(code, str(tmp_path / "v.npy"), change) for change in changes]
+    right, turned, scaled = run_methods([stored], chosen, tmp_path, anchor=False)
+    assert right.status == "ok" and right.scores["tissue"].identical and right.inputs == "counts only"
+    assert right.cost.cpu > 0 and right.cost.warm_up == 0
+    assert turned.status == "error" and turned.reason.startswith("the program's volume looks flipped along y")
+    assert scaled.status == "error" and scaled.reason.startswith("the program's volume looks like HU")
+    assert not turned.scores and turned.volume is None

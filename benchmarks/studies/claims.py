@@ -151,7 +151,7 @@ def _passes(runs: Runs) -> Claim:
     if not mine:
         return Claim(text=text, found="no run", holds=None)
     costs = [r.cost for r in mine if r.cost is not None]
-    updates = ", ".join(map(str, sorted({cost.view_updates for cost in costs})))
+    updates = ", ".join(map(str, sorted({cost.view_updates or 0 for cost in costs})))
     took = f"{spread([cost.wall for cost in costs])} s" if costs else "no time"
     holds = all(r.status == OK for r in mine)
     return Claim(text=text, found=f"{took} for {updates} view updates", holds=holds)
