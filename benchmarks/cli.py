@@ -50,6 +50,7 @@ OTHERS = {
     "ablation": Command("ctsim.benchmarks.studies.ablation", "run the paper's ablations of its splat method"),
 }
 OF_DATASETS = {
+    "import": Command("ctsim.benchmarks.importing.work", "copy a measured scan into a data folder"),
     "export": Command("ctsim.benchmarks.export.work", "write a volume or a scan for other programs", resumes=False),
     "shards": Command("ctsim.benchmarks.shards.work", "write scans into HDF5 files for training"),
 }

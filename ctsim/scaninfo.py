@@ -28,7 +28,8 @@ class ScanInfo(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     are the air kerma (mGy) at the isocentre, without the object, of a view and of the scan (None: an older scan).
     `materials` name the labels, `metal` those of them that are inserts. `notes` say what a user of the scan should
     know, such as that no view shows the metal. `seed` is that of a scan without scene.toml. `label_grid` is where the
-    phantom's voxels lie (None: a phantom of exact solids, or an older scan).
+    phantom's voxels lie (None: a phantom of exact solids, or an older scan). `held` are the views of held.tif, which a
+    measured scan keeps from the methods.
     """
 
     geometry: Geometry
@@ -46,6 +47,7 @@ class ScanInfo(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     notes: tuple[str, ...] = ()
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0
     label_grid: LabelGrid | None = None
+    held: Geometry | None = None
 
     def __post_init__(self) -> None:
         check_readings(self.dark, self.i0, self.e_max)

@@ -76,6 +76,8 @@ def case_of(stored: Stored, records: Sequence[RunRecord], results: Path) -> Case
 def first_cases(data: Path, records: Sequence[RunRecord], results: Path) -> Iterator[Case]:
     """Yield one case per scene: the first repetition with a kept volume; scenes without one are left out.
 
+    So are measured scans, which have no truth to show errors of.
+
     Raises InputError where `data` holds none of the scans that `results` measured.
     """
     folders = list_scans(data)
@@ -84,7 +86,7 @@ def first_cases(data: Path, records: Sequence[RunRecord], results: Path) -> Iter
     met = False
     for stored in map(open_scan, folders):
         met |= stored.content_hash in known
-        if stored.content_hash not in known or repetition(stored)[0] in seen:
+        if stored.content_hash not in known or repetition(stored)[0] in seen or not stored.has_truth:
             continue
         case = case_of(stored, records, results)
         if case.kept:
@@ -103,7 +105,9 @@ def open_case(data: Path, results: Path, scene: str | None = None) -> Case:
     names = []
     for stored in map(open_scan, list_scans(data)):
         names.append(stored.name)
-        if scene in (None, stored.name) and (case := case_of(stored, records, results)).kept:
+        if scene == stored.name and not stored.has_truth:
+            raise InputError(f"{data}: {scene} is a measured scan without truth, which is not shown here")
+        if stored.has_truth and scene in (None, stored.name) and (case := case_of(stored, records, results)).kept:
             return case
     if scene is not None and scene not in names:
         raise InputError(f"{data}: there is no scan {scene!r}; expected {', '.join(names) or 'a dataset with scans'}")

@@ -72,6 +72,8 @@ class Metric:
     scale: float = 1.0
 
 
+NO_REFERENCE = "no_reference"
+"""The protocol of measured scans, which have no truth."""
 KERMA = "kerma"  # a scan's air kerma, not a run's cost, but tables show it there
 _IMAGE = {"psnr3d": Metric("PSNR3D (dB)", 2, "max"), "ssim3d": Metric("SSIM3D", 3, "max")}
 
@@ -130,6 +132,13 @@ COLUMNS: dict[str, dict[str, Metric]] = {
         "50kev/outside": Metric("RMSE 50 keV, outside trace", 4, "min"),
         "50kev/trace": Metric("RMSE 50 keV, in trace", 3, "min"),
     },
+    NO_REFERENCE: {
+        "air_streak": Metric("streaks in air (HU)", 1, "min"),
+        "air_entropy": Metric("entropy of air (bits)", 2, "min"),
+        "artefact_index": Metric("artefact index (HU)", 1, "min"),
+        "held/outside": Metric("RMSE P, held out, outside trace", 4, "min"),
+        "held/trace": Metric("RMSE P, held out, in trace", 3, "min"),
+    },
     "metal_cost": {
         "own_db": Metric("against its own twin (dB)", 2, "min"),
         "fdk_db": Metric("against FDK without metal (dB)", 2, "min"),
@@ -159,6 +168,9 @@ COLUMNS: dict[str, dict[str, Metric]] = {
 }
 """The metrics that tables show of each protocol, in order."""
 
+NEED_TRUTH = tuple(protocol for protocol in COLUMNS if protocol not in (NO_REFERENCE, "cost"))
+"""The protocols that a scan without truth is not scored under."""
+
 MAIN: dict[tuple[str, str], Metric] = {
     ("tissue", "psnr3d"): _IMAGE["psnr3d"],
     ("tissue", "ssim3d"): _IMAGE["ssim3d"],
@@ -181,6 +193,12 @@ MAIN_ACROSS: dict[tuple[str, str], Metric] = {
     ("cost", "wall"): MAIN["cost", "wall"],
 }
 """The same where scanners are compared: HU first, since the range that dB are taken of moves with the spectrum."""
+
+MAIN_MEASURED: dict[tuple[str, str], Metric] = {
+    **{(NO_REFERENCE, metric): how for metric, how in COLUMNS[NO_REFERENCE].items()},
+    ("cost", "wall"): MAIN["cost", "wall"],
+}
+"""The same where no scan has a truth."""
 
 FDK, NMAR = "fdk", "nmar"
 FDK_ROWS = (FDK, "fdk-ramp")

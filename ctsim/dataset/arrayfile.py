@@ -44,6 +44,17 @@ def describe_array(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
     return (nz, ny, nx), dtype
 
 
+def read_image(path: Path, shape: tuple[int, int]) -> NDArray[Any]:
+    """Read a TIFF file of one grey image [row, column] of this shape, row 0 first; raises as `read_array`."""
+    with decoding(path, "TIFF image"), _opened_tiff(path) as file:
+        series = file.series[0]
+        found, dtype = tuple(series.shape), np.dtype(series.dtype)
+        if found != shape or dtype.kind not in "iuf":
+            raise InputError(f"{path} holds {dtype} of shape {found}, expected numbers of shape {shape}")
+        check_size(path, math.prod(found) * dtype.itemsize, path.stat().st_size)
+        return np.asarray(series.asarray())
+
+
 @contextlib.contextmanager
 def decoding(path: Path, kind: str) -> Iterator[None]:
     """Turn whatever a decoder raises for a file that is not its kind into an InputError that begins with the path."""

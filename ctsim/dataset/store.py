@@ -100,6 +100,11 @@ class StoredScan:
         )
 
     @property
+    def has_truth(self) -> bool:
+        """Whether there is a truth to judge volumes by, as of every simulated scan and of no measured one."""
+        return any(f"{name}.tif" in self.files for name in ("labels", "metal", "reference_effective"))
+
+    @property
     def labels(self) -> NDArray[np.uint8]:
         """Return the label volume, uint8 [z, y, x]."""
         return self.array("labels")

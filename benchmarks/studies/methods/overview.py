@@ -15,8 +15,8 @@ from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.table import one_line, ranked
 from ctsim.benchmarks.engine.terminal import WIDEST, rendered, width
 from ctsim.benchmarks.methods import CONTROLS
-from ctsim.benchmarks.scores.score import MAIN, MAIN_ACROSS, Metric
-from ctsim.benchmarks.studies.methods.captions import across_scanners
+from ctsim.benchmarks.scores.score import MAIN, MAIN_ACROSS, MAIN_MEASURED, NEED_TRUTH, NO_REFERENCE, Metric
+from ctsim.benchmarks.studies.methods.captions import across_scanners, measured
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest, remarks
 from ctsim.benchmarks.studies.methods.tables import Numbers, numbers
 
@@ -47,6 +47,14 @@ ACROSS = (
     _SECONDS,
 )
 """The numbers where scanners are compared, whose dB do not compare."""
+MEASURED = (
+    Number("streak", NO_REFERENCE, "air_streak", 6, "RMS in HU of the smoothed air around the body"),
+    Number("entropy", NO_REFERENCE, "air_entropy", 7, "bits of the histogram of that air"),
+    Number("index", NO_REFERENCE, "artefact_index", 6, "artefact index in HU of the body near metal"),
+    Number("held out", NO_REFERENCE, "held/outside", 8, "RMSE of P in views that no method saw, outside the trace"),
+    _SECONDS,
+)
+"""The numbers where no scan has a truth."""
 Row = tuple[str, str]
 """Inputs and method."""
 Values = dict[tuple[str, Row], list[float | None]]
@@ -63,6 +71,7 @@ def text(records: Sequence[RunRecord], results: Path, data: Path) -> str:
     lines = [
         *textwrap.wrap(". ".join(f"{number.title}: {number.about}" for number in _numbers(shown)) + ".", WIDEST),
         *_failures(shown),
+        *_skipped(shown),
         *remarks(records),
         f"All protocols: {results}/table.md, .csv, .tex; records: {results}/records.jsonl",
     ]
@@ -74,6 +83,13 @@ def text(records: Sequence[RunRecord], results: Path, data: Path) -> str:
         "      run-benchmark methods   (all methods and their parameters, for --method and --set)",
     ]
     return overview(shown) + "\n" + "\n".join(map(one_line, lines)) + "\n"
+
+
+def _skipped(shown: Sequence[RunRecord]) -> list[str]:
+    """Name the protocols that scans without truth are not scored under."""
+    scans = list(dict.fromkeys(r.run.scene for r in shown if NO_REFERENCE in r.scores))
+    text = f"{', '.join(scans)}: measured, without truth; skipped are the protocols {', '.join(NEED_TRUTH)}"
+    return textwrap.wrap(text, WIDEST) if scans else []
 
 
 def _failures(shown: Sequence[RunRecord]) -> list[str]:
@@ -105,6 +121,8 @@ def overview(shown: Sequence[RunRecord]) -> str:
 
 
 def _numbers(shown: Sequence[RunRecord]) -> tuple[Number, ...]:
+    if measured(shown):
+        return MEASURED
     return ACROSS if across_scanners(shown) else SHOWN
 
 
@@ -163,7 +181,7 @@ def _best(rows: Sequence[Row], column: str, k: int, values: Values, number: Numb
 
 
 def _column(number: Number) -> Metric:
-    return (MAIN | MAIN_ACROSS)[number.protocol, number.metric]
+    return (MAIN | MAIN_ACROSS | MAIN_MEASURED)[number.protocol, number.metric]
 
 
 def _cell(what: Sequence[Number], values: Sequence[float | None], failed: str, best: Sequence[bool]) -> Text:

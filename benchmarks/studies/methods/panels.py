@@ -25,6 +25,8 @@ from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.table import pictured
 from ctsim.benchmarks.scores.artefact import effective_attenuation
 from ctsim.benchmarks.scores.protocol import Truth, truth_of
+from ctsim.benchmarks.scores.score import NO_REFERENCE
+from ctsim.benchmarks.studies.methods.bare import draw_bare
 from ctsim.benchmarks.studies.methods.records import RunRecord, latest
 from ctsim.benchmarks.studies.methods.volumes import (
     Intermediates,
@@ -81,7 +83,7 @@ def write_panels(records: Sequence[RunRecord], scans: list[StoredScan], results:
     """
     mine: dict[str, list[RunRecord]] = {}
     for record in latest(records):
-        if record.volume and "tissue" in record.scores and record.run.variant == "metal":
+        if record.volume and record.scores.keys() & {"tissue", NO_REFERENCE} and record.run.variant == "metal":
             mine.setdefault(record.task.data, []).append(record)
     written = []
     for stored in scans:
@@ -90,7 +92,11 @@ def write_panels(records: Sequence[RunRecord], scans: list[StoredScan], results:
         picture, digest = results / "panels" / f"{stored.name}.png", _digest(stored, kept)
         if kept and _held(picture) != digest:
             picture.parent.mkdir(parents=True, exist_ok=True)
-            figure = draw(stored, truth_of(stored), [_row(*pair) for pair in kept])
+            rows = [_row(*pair) for pair in kept]
+            if stored.has_truth:
+                figure = draw(stored, truth_of(stored), rows)
+            else:
+                figure = draw_bare(stored.name, stored.geometry, [(row.caption, row.volume) for row in rows])
             with replacing(picture) as new:
                 figure.savefig(new, format="png", dpi=DPI, metadata={KEY: digest})
                 sync(new)  # a picture with its digest counts as whole
@@ -135,9 +141,11 @@ def _held(picture: Path) -> str | None:
 
 def _caption(record: RunRecord) -> str:
     """Name the method and its scores under `tissue`, as they stand in the tables."""
+    lines = textwrap.wrap(record.label, 22, break_long_words=False)
+    if "tissue" not in record.scores:
+        return "\n".join(lines + ([record.status] if record.status != OK else []))
     values = record.scores["tissue"].values
     psnr, ssim = values["psnr3d"], values["ssim3d"]
-    lines = textwrap.wrap(record.label, 22, break_long_words=False)
     lines += ["identical" if psnr is None else f"PSNR3D {psnr:.2f} dB", f"SSIM3D {ssim:.3f}"]
     return "\n".join(lines + ([record.status] if record.status != OK else []))
 

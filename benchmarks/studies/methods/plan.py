@@ -88,10 +88,25 @@ def jobs_on(
     """List the runs of methods, each with its place, on the given variants of a scan."""
     scene, seed = repetition(stored)
     return [
-        Job(stored=stored, variant=variant, method=method, scene=scene, seed=seed, place=place, open=open)
+        Job(
+            stored=stored,
+            variant=variant,
+            method=fitted(method, stored),
+            scene=scene,
+            seed=seed,
+            place=place,
+            open=open,
+        )
         for method, place in placed
         for variant in variants
     ]
+
+
+def fitted(method: Method, stored: StoredScan) -> Method:
+    """Return the method as it runs on a scan: where no true mask is stored it finds the metal itself."""
+    if stored.has_truth or method.mask != "oracle":
+        return method
+    return methods.find(method.name, {**method.overrides, "mask": "auto"})
 
 
 def job_of(task: RunTask) -> Job:

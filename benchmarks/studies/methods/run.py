@@ -23,6 +23,7 @@ from ctsim.benchmarks.scores.artefact import effective_attenuation
 from ctsim.benchmarks.scores.judge import Judge, Twin
 from ctsim.benchmarks.scores.projection import HeldOut
 from ctsim.benchmarks.scores.score import NO_TWIN, NOT_ASKED, TWIN_ENDED
+from ctsim.benchmarks.scores.unreferenced import HeldViews, Unreferenced
 from ctsim.benchmarks.studies.methods.attempt import SCORED, Outcome, describe, run_here, scan_for, skip, warm_up
 from ctsim.benchmarks.studies.methods.grids import with_grid
 from ctsim.benchmarks.studies.methods.plan import Job, job_of
@@ -68,8 +69,8 @@ class Runner:
     def __init__(self, given: Flags) -> None:
         self._given, self._results = given, given.results
         self._warm: dict[tuple[str, str], float] = {}
-        self._judge: tuple[str, Judge] | None = None
-        self._views: dict[str, HeldOut | str] = {}
+        self._judge: tuple[str, Judge | Unreferenced] | None = None
+        self._views: dict[str, HeldOut | HeldViews | str] = {}
         self._twin: tuple[Job, Outcome] | None = None
 
     def run(self, job: Job) -> Result:
@@ -89,16 +90,17 @@ class Runner:
         outcome.at_50kev = None  # a twin is kept for its scan's run, which needs its main volume only
         return result
 
-    def _judge_for(self, stored: StoredScan) -> Judge:
+    def _judge_for(self, stored: StoredScan) -> Judge | Unreferenced:
         """Return what a scan's volumes are scored with; that of the last scan is remembered."""
         if self._judge is None or self._judge[0] != stored.content_hash:
             self._judge = self._twin = None  # frees the last scan's masks first
             self._judge = (stored.content_hash, self._judge_of(stored))
         return self._judge[1]
 
-    def _judge_of(self, stored: StoredScan) -> Judge:
+    def _judge_of(self, stored: StoredScan) -> Judge | Unreferenced:
         """Load what a scan's volumes are scored with; methods come round by round, so its views are kept."""
-        judge = Judge.of(stored, self._views.pop(stored.content_hash, None))
+        known = self._views.pop(stored.content_hash, None)
+        judge = _judge(stored, known)
         self._views[stored.content_hash] = judge.views
         if len(self._views) > MOST_VIEWS:
             del self._views[next(iter(self._views))]
@@ -139,15 +141,11 @@ class Runner:
             return Twin(values=read_volume(self._results / volume_name(twin.task)))
         return Twin(reason=NOT_ASKED)
 
-    def _scored(self, job: Job, outcome: Outcome, judge: Judge, pair: Twin) -> Result:
+    def _scored(self, job: Job, outcome: Outcome, judge: Judge | Unreferenced, pair: Twin) -> Result:
         """Score an outcome and write its volume."""
         scores, files, task = {}, {}, job.task
-        if job.method.program and outcome.values is not None and outcome.status in SCORED:
-            try:
-                water = effective_attenuation(job.stored)
-                placement.check("the program's volume", outcome.values, judge.truth, "1/mm", water)
-            except InputError as error:
-                outcome.fail("error", str(error))
+        if isinstance(judge, Judge) and job.method.program:
+            _refuse_misplaced(outcome, judge, job.stored)
         if outcome.values is not None and outcome.status in SCORED:
             try:
                 scores = judge.scores(outcome.values, job.variant, pair, outcome.at_50kev)
@@ -172,6 +170,24 @@ class Runner:
             kerma=job.stored.kerma,
             phantom=job.stored.phantom,
         )
+
+
+def _refuse_misplaced(outcome: Outcome, judge: Judge, stored: StoredScan) -> None:
+    """Let a program's run fail whose volume has another unit or is turned."""
+    if outcome.values is not None and outcome.status in SCORED:
+        try:
+            water = effective_attenuation(stored)
+            placement.check("the program's volume", outcome.values, judge.truth, "1/mm", water)
+        except InputError as error:
+            outcome.fail("error", str(error))
+
+
+def _judge(stored: StoredScan, views: HeldOut | HeldViews | str | None) -> Judge | Unreferenced:
+    """Load what a scan's volumes are scored with; `views` are those of an earlier judge of the scan."""
+    if stored.has_truth:
+        assert not isinstance(views, HeldViews)
+        return Judge.of(stored, views)
+    return Unreferenced.of(stored, views)
 
 
 def _isolated(job: Job, seconds: float | None) -> Outcome:

@@ -1,0 +1,185 @@
+"""The protocol `no_reference`: what can be said of a volume of a measured scan, which has no truth.
+
+Air attenuates nothing, so what a volume shows around the body is artefact and noise. Line integrals of the volume are
+compared with measured views that no method saw. Volumes are [z, y, x] in 1/mm, projections [view, v, u].
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ctsim.baselines.metal import auto_mask, water_value
+from ctsim.benchmarks.scores.artefact import NEAR, effective_attenuation
+from ctsim.benchmarks.scores.judge import Twin
+from ctsim.benchmarks.scores.metrics import Mask, dilate
+from ctsim.benchmarks.scores.protocol import METAL_MARGIN, field_of_view
+from ctsim.benchmarks.scores.score import COLUMNS, NEED_TRUTH, NO_REFERENCE, Score
+from ctsim.dataset.store import StoredScan
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reconstruct.log import LineIntegrals
+from ctsim.reconstruct.projector import forward_columns
+from ctsim.types import Scan
+
+AIR_MARGIN = 3  # voxels between the body and the air that is judged
+BODY = 0.5  # of water's value in FDK, above which a voxel is the body's
+COARSE = 1.5  # voxels: standard deviation of the filter that leaves streaks and takes noise
+BIN, MOST_BINS = 20.0, 2000  # HU of a bin of the histogram of air; what is beyond ± 20 000 HU counts as that
+MIN_VOXELS = 64
+TRACE_MARGIN = 2  # pixels
+REGION = (
+    "air at least 3 voxels outside the body, the body within 5 mm of the metal and beyond, and rays of views held out; "
+    "body and metal are those of FDK without correction"
+)
+REFERENCE = "none; 0 in air, and measured views that no method saw"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeldViews:
+    """Measured views that methods do not get: their line integrals and which rays count, by region, [view, v, u]."""
+
+    geometry: Geometry
+    p: NDArray[np.float32]
+    regions: dict[str, NDArray[np.bool_]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Unreferenced:
+    """What volumes of one measured scan are scored with; `views` as `Judge` has them, for the caller to keep.
+
+    `water` is the attenuation (1/mm) that HU are scaled by.
+    """
+
+    air: Mask
+    near: Mask
+    far: Mask
+    water: float
+    views: HeldViews | str
+    note: str
+
+    @classmethod
+    def of(cls, stored: StoredScan, views: object = None) -> "Unreferenced":
+        """Find body, metal and air of a measured scan, and read its views held out."""
+        scan = stored.scan
+        body, metal, scale, said = _regions(scan)
+        field = field_of_view(stored.geometry)
+        near_metal = dilate(metal, METAL_MARGIN) if metal.any() else metal
+        inside = body & ~near_metal & field
+        distance = ndimage.distance_transform_edt(~metal, sampling=stored.geometry.d_voxel) if metal.any() else None
+        near = inside & (distance <= NEAR) if distance is not None else np.zeros_like(inside)
+        water = effective_attenuation(stored) or scale
+        found = views if isinstance(views, HeldViews | str) else held_views(stored, metal)
+        notes = [
+            f"without a truth these protocols are skipped: {', '.join(NEED_TRUTH)}",
+            said,
+            f"water {water:.5g} 1/mm{'' if effective_attenuation(stored) else ', as FDK shows it'}",
+            found if isinstance(found, str) else f"{found.geometry.n_views} views held out",
+        ]
+        return cls(
+            air=field & ~dilate(body | metal, AIR_MARGIN),
+            near=near,
+            far=inside & ~near,
+            water=water,
+            views=found,
+            note="; ".join([*notes, *stored.info.notes]),
+        )
+
+    def scores(
+        self, values: NDArray[Any], variant: str, twin: Twin, at_50kev: NDArray[Any] | None = None
+    ) -> dict[str, Score]:
+        """Score a volume. There is one protocol and no twin."""
+        found: dict[str, float | None] = dict.fromkeys(COLUMNS[NO_REFERENCE])
+        found |= self._air(values) | {"artefact_index": self._artefact_index(values)}
+        if isinstance(self.views, HeldViews):
+            found |= consistency(values, self.views)
+        return {
+            NO_REFERENCE: Score(
+                region=REGION,
+                reference=REFERENCE,
+                alignment="none",
+                data_range=None,
+                n_voxels=int(self.air.sum()),
+                values=found,
+                note=self.note,
+            )
+        }
+
+    def _air(self, values: NDArray[Any]) -> dict[str, float | None]:
+        """Return the RMS of smoothed air, and the entropy of its histogram in bits."""
+        if self.air.sum() < MIN_VOXELS or not self.water > 0:
+            return {}
+        scale = 1000 / self.water
+        weight = ndimage.gaussian_filter(self.air.astype(np.float32), COARSE)
+        # of air alone: what the body spreads beyond its edge is no streak
+        smooth = ndimage.gaussian_filter(np.where(self.air, values, 0).astype(np.float32), COARSE)
+        streak = smooth[self.air] / np.maximum(weight[self.air], 1e-3) * scale
+        bins = np.clip(np.rint(values[self.air] * (scale / BIN)), -MOST_BINS, MOST_BINS).astype(np.int64)
+        share = np.unique(bins, return_counts=True)[1] / bins.size
+        entropy = -float((share * np.log2(share)).sum())
+        return {
+            "air_streak": math.sqrt(float(np.mean(np.square(streak, dtype=np.float64)))),
+            "air_entropy": abs(entropy),
+        }
+
+    def _artefact_index(self, values: NDArray[Any]) -> float | None:
+        """Return √(σ² near the metal − σ² far from it) in HU, 0 where it is not noisier near the metal."""
+        if self.near.sum() < MIN_VOXELS or self.far.sum() < MIN_VOXELS or not self.water > 0:
+            return None
+        near, far = (float(values[mask].astype(np.float64).var()) for mask in (self.near, self.far))
+        return math.sqrt(max(near - far, 0.0)) * 1000 / self.water
+
+
+def _regions(scan: Scan) -> tuple[Mask, Mask, float, str]:
+    """Return the body and the metal of FDK's volume, water's value in it, and what is to be said of them."""
+    try:
+        values = np.nan_to_num(fdk(scan).values.numpy())
+    except InputError as error:
+        nothing = np.zeros(scan.geometry.n_voxel, np.bool_)
+        return nothing, nothing, 0.0, f"body and metal were not found: {error}"
+    metal = auto_mask(values)
+    water = water_value(values)
+    body = ndimage.binary_opening(values > BODY * water) if water > 0 else np.zeros(values.shape, np.bool_)
+    if not metal.mask.any() or metal.doubt:
+        return body, np.zeros_like(body), water, f"no metal was found: {metal.doubt or 'nothing stands out'}"
+    return body, metal.mask, water, f"{int(metal.mask.sum())} voxels of metal were found"
+
+
+def held_views(stored: StoredScan, metal: Mask) -> HeldViews | str:
+    """Read the views that were held out when the scan was imported, or say why there are none."""
+    geometry = stored.info.held
+    if geometry is None or "held.tif" not in stored.files:
+        return "no views were held out"
+    counts = stored.array("held")
+    if counts.shape != geometry.shape:
+        raise InputError(f"{stored.folder}/held.tif: shape {counts.shape}, scan.json says {geometry.shape}")
+    scan = stored.scan
+    views = Scan(
+        geometry=geometry,
+        counts=torch.from_numpy(counts),
+        flat=scan.flat,
+        dark=scan.dark,
+        i0=scan.i0,
+        e_max=scan.e_max,
+    )
+    p, unseen = LineIntegrals(views).of(slice(0, geometry.n_views))
+    columns = np.ascontiguousarray(metal.transpose(1, 2, 0), np.float32)
+    trace = forward_columns(columns, geometry) > 0
+    size = (1, 2 * TRACE_MARGIN + 1, 2 * TRACE_MARGIN + 1)
+    near = ndimage.maximum_filter(trace.astype(np.uint8), size, mode="constant", cval=0) > 0
+    return HeldViews(geometry=geometry, p=p, regions={"outside": ~near & ~unseen, "trace": trace & ~unseen})
+
+
+def consistency(values: NDArray[Any], held: HeldViews) -> dict[str, float | None]:
+    """Return the RMSE of a volume's line integrals against measured ones, "held/outside" and "held/trace"."""
+    found = forward_columns(np.ascontiguousarray(values.transpose(1, 2, 0), np.float32), held.geometry)
+    squared = np.square(found - held.p, dtype=np.float64)
+    return {
+        f"held/{name}": float(np.sqrt(squared[mask].mean())) if mask.any() else None
+        for name, mask in held.regions.items()
+    }

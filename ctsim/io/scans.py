@@ -1,0 +1,58 @@
+"""The table of formats of measured scans. Their modules are imported when they are needed."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
+
+from ctsim.dataset.arrayfile import decoding
+from ctsim.errors import InputError
+from ctsim.io.formats import load
+from ctsim.io.scanfile import ScanFile
+
+
+class Format(NamedTuple):
+    """A format: its name in sentences, its module with `open_scan`, and whether a path looks like one."""
+
+    kind: str
+    module: str
+    fits: Callable[[Path], bool]
+
+
+def _has(*ends: str) -> Callable[[Path], bool]:
+    """Return whether a path is a file of such an end, or a folder that holds one."""
+
+    def fits(path: Path) -> bool:
+        names = [p.name for p in path.iterdir()] if path.is_dir() else [path.name]
+        return any(name.lower().endswith(ends) for name in names)
+
+    return fits
+
+
+SCANS = {
+    "skyscan": Format("SkyScan scan", "ctsim.io.skyscan", _has(".log")),
+}
+"""name -> format; the first that fits is taken."""
+
+
+def open_scan(path: Path, name: str = "auto") -> ScanFile:
+    """Read the headers of a scan in a format of `SCANS`, found by the files' names unless it is named.
+
+    Raises InputError, a sentence that begins with the path, for what cannot be read or is no such scan.
+    """
+    if not path.exists():
+        raise InputError(f"{path} cannot be read (No such file or directory); expected a scan")
+    chosen = SCANS[name] if name in SCANS else next((f for f in SCANS.values() if f.fits(path)), None)
+    if chosen is None:
+        raise InputError(f"{path} is no scan of a known format ({', '.join(f.kind for f in SCANS.values())})")
+    reader = load(chosen.module, path)
+    with decoding(path, chosen.kind):
+        scan: ScanFile = reader.open_scan(path)
+
+    def read(view: int) -> NDArray[Any]:
+        with decoding(path, chosen.kind):
+            return scan.read(view)
+
+    return dataclasses.replace(scan, read=read)
