@@ -19,7 +19,7 @@ class Flags:
     """Folder or header of the scan."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Data folder."""
-    format: Literal["auto", "skyscan"] = "auto"
+    format: Literal["auto", "skyscan", "walnut", "hdf5", "r2", "naf"] = "auto"
     """Format of the scan."""
     name: str | None = None
     """Name of the scene (default: that of SCAN)."""
@@ -33,6 +33,12 @@ class Flags:
     """Size of the cubic voxels in mm (default: so that the field of view fits)."""
     clockwise: bool | None = None
     """Which way the source turns about the object as seen from above, if the format says otherwise than it is."""
+    dso: float | None = None
+    """Distance from the source to the axis in mm, if the format does not state it."""
+    dsd: float | None = None
+    """Distance from the source to the detector in mm, if the format does not state it."""
+    pixel: float | None = None
+    """Size of a detector's pixel in mm, if the format does not state it."""
     kv: float | None = None
     """Tube voltage, if the format does not state it."""
     filter: str | None = None

@@ -86,7 +86,7 @@ def settle(scan: ScanFile, given: Flags) -> Settled:
     geometry = msgspec.structs.replace(
         geometry, off_detector=(geometry.off_detector[0], -axis * geometry.d_detector[1])
     )
-    kept, held = _split(geometry, axis, given, notes)
+    kept, held = _split(scan, geometry, axis, given, notes)
     tube, kvp = _tube(scan, given, notes)
     p = _shadows(scan, flat, level)
     return Settled(
@@ -209,10 +209,12 @@ def _middle_rows(scan: ScanFile, geometry: Geometry, flat: NDArray[np.float32], 
 
 
 def _split(
-    geometry: Geometry, axis: float, given: Flags, notes: list[str]
+    scan: ScanFile, geometry: Geometry, axis: float, given: Flags, notes: list[str]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the views that methods get and those held out, evenly chosen."""
     n = geometry.n_views
+    if scan.held and given.hold is None:
+        return np.setdiff1d(np.arange(n), scan.held), np.array(scan.held, np.int64)
     wanted = min(n // HOLD_ONE_OF, MOST_HELD) if given.hold is None else given.hold
     if not 0 <= wanted <= n // 4:
         raise InputError(f"--hold must be within 0 to {n // 4}, a quarter of the views, got {wanted}")

@@ -15,7 +15,9 @@ from ctsim.benchmarks.engine.terminal import Bar
 from ctsim.benchmarks.importing import Flags
 from ctsim.benchmarks.importing.settle import Settled, settle
 from ctsim.dataset.writer import SceneWriter, Stack, is_complete
-from ctsim.io.scanfile import ScanFile
+from ctsim.errors import InputError
+from ctsim.geometry import FARTHEST
+from ctsim.io.scanfile import ScanFile, Stated
 from ctsim.io.scans import open_scan
 from ctsim.phantoms.dataset import spectrum_csv
 from ctsim.scaninfo import ScanInfo
@@ -34,7 +36,7 @@ def bring(given: Flags) -> Path:
 
     Raises InputError where the scan cannot be read, lacks what no flag gives, or another scene has its name.
     """
-    scan = open_scan(given.scan, given.format)
+    scan = open_scan(given.scan, given.format, _stated(given))
     name = given.name or _name(scan.path)
     identity = _identity(scan, given)
     if not given.force and is_complete(given.out, name, identity):
@@ -47,6 +49,14 @@ def bring(given: Flags) -> Path:
         sys.stdout.write(f"  {note}\n")
     sys.stdout.write(f"Next: run-benchmark {given.out} results --method fdk --method nmar --method splat\n")
     return folder
+
+
+def _stated(given: Flags) -> Stated:
+    for name in ("dso", "dsd", "pixel"):
+        value = getattr(given, name)
+        if value is not None and not 0 < value < FARTHEST:
+            raise InputError(f"--{name} must be within 0 to {FARTHEST:.0e} mm, got {value}")
+    return Stated(dso=given.dso, dsd=given.dsd, pixel=given.pixel)
 
 
 def _name(path: Path) -> str:

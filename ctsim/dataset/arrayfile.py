@@ -55,6 +55,15 @@ def read_image(path: Path, shape: tuple[int, int]) -> NDArray[Any]:
         return np.asarray(series.asarray())
 
 
+def image_shape(path: Path) -> tuple[int, int]:
+    """Return the shape [row, column] of a TIFF file of one grey image, decoding nothing; raises as `read_array`."""
+    with decoding(path, "TIFF image"), _opened_tiff(path) as file:
+        found = tuple(file.series[0].shape)
+    if len(found) != 2 or not 1 <= min(found) <= max(found) <= MOST:
+        raise InputError(f"{path} holds an array of shape {found}, expected one image")
+    return found[0], found[1]
+
+
 @contextlib.contextmanager
 def decoding(path: Path, kind: str) -> Iterator[None]:
     """Turn whatever a decoder raises for a file that is not its kind into an InputError that begins with the path."""

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ class ScanFile:
     `geometry` has a grid that fits the field of view. Views are readings above a pedestal `dark`, to be compared with
     the open field `flat` [v, u]; without one the air beside the object is measured. With `integrals` views are −ln of
     transmissions. `axis_known` says that the file states where the axis is; `filters` is None where they are unknown.
-    `shifted` is the format's own resampling of a view: degrees, and rows and columns by view.
+    `held` numbers the views that the format sets apart for testing.
     """
 
     path: Path
@@ -41,7 +41,33 @@ class ScanFile:
     axis_known: bool = True
     kvp: float | None = None
     filters: tuple[Filter, ...] | None = None
-    notes: tuple[str, ...] = field(default=())
+    held: tuple[int, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stated:
+    """Lengths in mm that the user gives for a scan whose headers lack them."""
+
+    dso: float | None = None
+    dsd: float | None = None
+    pixel: float | None = None
+
+    def needed(self, path: Path, name: str, found: float | None) -> float:
+        """Return the user's length, else that of the file. Raises InputError where there is neither."""
+        own: float | None = getattr(self, name)
+        if own is not None:
+            return own
+        if found is None:
+            raise InputError(f"{path} does not say {_LENGTHS[name]}; expected --{name} MM")
+        return found
+
+
+_LENGTHS = {
+    "dso": "how far the source is from the axis",
+    "dsd": "how far the source is from the detector",
+    "pixel": "how large a pixel is",
+}
 
 
 def grid_of(

@@ -10,15 +10,20 @@ from numpy.typing import NDArray
 from ctsim.dataset.arrayfile import decoding
 from ctsim.errors import InputError
 from ctsim.io.formats import load
-from ctsim.io.scanfile import ScanFile
+from ctsim.io.scanfile import ScanFile, Stated
 
 
 class Format(NamedTuple):
-    """A format: its name in sentences, its module with `open_scan`, and whether a path looks like one."""
+    """A format: its name in sentences, its module and the function there, and whether a path looks like one.
+
+    `lengths` says that the user may state lengths.
+    """
 
     kind: str
     module: str
+    function: str
     fits: Callable[[Path], bool]
+    lengths: bool = False
 
 
 def _has(*ends: str) -> Callable[[Path], bool]:
@@ -32,12 +37,18 @@ def _has(*ends: str) -> Callable[[Path], bool]:
 
 
 SCANS = {
-    "skyscan": Format("SkyScan scan", "ctsim.io.skyscan", _has(".log")),
+    "walnut": Format("scan in the layout of CWI's walnuts", "ctsim.io.walnut", "open_scan", _has(".geom")),
+    "r2": Format("folder of R2-Gaussian", "ctsim.io.neural", "open_r2", _has("meta_data.json")),
+    "skyscan": Format("SkyScan scan", "ctsim.io.skyscan", "open_scan", _has(".log"), lengths=True),
+    "hdf5": Format(
+        "scan in HDF5", "ctsim.io.exchange", "open_scan", _has(".h5", ".hdf5", ".hdf", ".nxs", ".nx"), lengths=True
+    ),
+    "naf": Format("pickle of NAF", "ctsim.io.neural", "open_naf", _has(".pickle", ".pkl")),
 }
 """name -> format; the first that fits is taken."""
 
 
-def open_scan(path: Path, name: str = "auto") -> ScanFile:
+def open_scan(path: Path, name: str = "auto", stated: Stated | None = None) -> ScanFile:
     """Read the headers of a scan in a format of `SCANS`, found by the files' names unless it is named.
 
     Raises InputError, a sentence that begins with the path, for what cannot be read or is no such scan.
@@ -47,9 +58,14 @@ def open_scan(path: Path, name: str = "auto") -> ScanFile:
     chosen = SCANS[name] if name in SCANS else next((f for f in SCANS.values() if f.fits(path)), None)
     if chosen is None:
         raise InputError(f"{path} is no scan of a known format ({', '.join(f.kind for f in SCANS.values())})")
-    reader = load(chosen.module, path)
+    stated = stated or Stated()
+    if stated != Stated() and not chosen.lengths:
+        raise InputError(
+            f"{path} is a {chosen.kind}, which states its lengths; expected neither --dso, --dsd nor --pixel"
+        )
+    reader = getattr(load(chosen.module, path), chosen.function)
     with decoding(path, chosen.kind):
-        scan: ScanFile = reader.open_scan(path)
+        scan: ScanFile = reader(path, stated)
 
     def read(view: int) -> NDArray[Any]:
         with decoding(path, chosen.kind):

@@ -19,7 +19,7 @@ from ctsim.dataset.arrayfile import read_image
 from ctsim.errors import InputError
 from ctsim.geometry import MOST_PIXELS, MOST_VIEWS, Geometry
 from ctsim.io.payload import beside, quoted
-from ctsim.io.scanfile import ScanFile, filters_of, grid_of, number, read_text, turn, whole
+from ctsim.io.scanfile import ScanFile, Stated, filters_of, grid_of, number, read_text, turn, whole
 
 STEP = 0.0005  # degrees by which a log's Rotation Step is rounded
 TURN = 0.005  # degrees of the camera whose correction moves no pixel of 5000 columns by half of it
@@ -27,7 +27,7 @@ DIRECTIONS = {"CC": -1.0, "CCW": -1.0, "CW": 1.0}
 Fields = dict[str, str]
 
 
-def open_scan(path: Path) -> ScanFile:
+def open_scan(path: Path, stated: Stated) -> ScanFile:
     """Read the log of a scan (the file, or its folder) and list the images."""
     log = path if path.is_file() else _log_in(path)
     found = _fields(log)
@@ -37,7 +37,7 @@ def open_scan(path: Path) -> ScanFile:
     images = _images(log, found)
     if len(images) < declared:
         raise InputError(f"{log} declares {declared} images, there are {len(images)} of its prefix beside it")
-    geometry = _geometry(log, found, (n_v, n_u), len(images))
+    geometry = _geometry(log, found, (n_v, n_u), len(images), stated)
     angle = number(log, found, "image rotation", default=0.0)
     shifts = _shifts(log, len(images))
     kvp = number(log, found, "source voltage (kv)", "source voltage (kvp)", default=0.0)
@@ -102,12 +102,12 @@ def _images(log: Path, found: Fields) -> list[Path]:
     return [images[k] for k in sorted(images)]
 
 
-def _geometry(log: Path, found: Fields, n_detector: tuple[int, int], n_views: int) -> Geometry:
-    dso = number(log, found, "object to source (mm)", "object to source")
-    dsd = number(log, found, "camera to source (mm)", "camera to source")
+def _geometry(log: Path, found: Fields, n_detector: tuple[int, int], n_views: int, stated: Stated) -> Geometry:
+    dso = stated.dso or number(log, found, "object to source (mm)", "object to source")
+    dsd = stated.dsd or number(log, found, "camera to source (mm)", "camera to source")
     if not 0 < dso < dsd:
         raise InputError(f"{log} has the source {dso:g} mm from the object and {dsd:g} mm from the camera")
-    pixel = number(log, found, "image pixel size (um)") / 1000 * dsd / dso
+    pixel = stated.pixel or number(log, found, "image pixel size (um)") / 1000 * dsd / dso
     if not 0 < pixel < dsd:
         raise InputError(f"{log} has pixels of {pixel:g} mm, expected a positive size")
     word = found.get("rotation direction", "CC").upper()
