@@ -120,9 +120,9 @@ def test_walnuts_off_the_circle_keep_their_poses(tmp_path):
     assert np.array_equal(scan.read(3), SIGNAL[3])
     assert "on no circle" in scan.notes[0]
     poses = GEOMETRY.pose_array()
-    poses[5, 2] += 0.3  # a fifth of a pixel at the detector
+    poses[5, 2] += 0.3  # all of it but the mean's share of 1/24 is seen at the detector: 0.2875 of 1.6 mm
     scan = scans.open_scan(scan_files.walnut(tmp_path / "nut", COUNTS, poses, FLAT, DARK))
-    assert scan.geometry.poses is None and "stray at most 0.19" in scan.notes[0]
+    assert scan.geometry.poses is None and "stray at most 0.18" in scan.notes[0]
 
 
 @pytest.mark.parametrize("write", [scan_files.r2, scan_files.naf])

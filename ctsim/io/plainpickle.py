@@ -69,6 +69,11 @@ def _latin(text: Any, coding: Any) -> bytes:
     return text.encode("latin-1")
 
 
+def _no_bytes() -> bytes:
+    """Return what protocol 2 writes as a call without arguments."""
+    return b""
+
+
 def _dtype(text: Any, *_: Any) -> np.dtype[Any]:
     """Return a type of numbers: a copy, whose byte order may be set."""
     found = np.dtype(text, False, True) if isinstance(text, str) else np.dtype(object)
@@ -98,6 +103,7 @@ _NAMES: dict[tuple[str, str], Any] = {
     ("numpy._core.multiarray", "scalar"): _scalar,
     ("numpy._core.numeric", "_frombuffer"): _from_buffer,
     ("_codecs", "encode"): _latin,
+    ("__builtin__", "bytes"): _no_bytes,
     ("numpy", "dtype"): _dtype,
     ("numpy", "ndarray"): "the class of an array, of which no use is made",
 }

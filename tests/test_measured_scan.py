@@ -1,0 +1,82 @@
+"""A measured scan through run-benchmark: masks are found, protocols skipped by name, and what needs no truth scored."""
+
+import msgspec
+import numpy as np
+import pytest
+import scan_files
+from closed_scans import BODY, GEOMETRY, METAL, counts_of, line_integrals
+
+from ctsim.benchmarks.importing import Flags
+from ctsim.benchmarks.importing.work import bring
+from ctsim.benchmarks.scores.judge import Twin
+from ctsim.benchmarks.scores.score import NEED_TRUTH, NO_REFERENCE
+from ctsim.benchmarks.scores.unreferenced import HeldViews, Unreferenced, consistency
+from ctsim.benchmarks.studies.methods import records
+from ctsim.benchmarks.studies.methods.study import main
+from ctsim.dataset.store import open_scan
+from ctsim.reconstruct.fdk import reconstruct as fdk
+
+TRUE = msgspec.structs.replace(GEOMETRY, n_views=96, off_detector=(0.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("measured")
+    counts = counts_of(line_integrals(TRUE, (*BODY, *METAL)))
+    log = scan_files.skyscan(folder / "scan", counts, TRUE)
+    bring(Flags(scan=log, out=folder / "data", n_voxel=32, hold=6))
+    return folder / "data"
+
+
+def test_a_run_and_its_table(data, tmp_path, capsys):
+    results = tmp_path / "results"
+    assert main([str(data), str(results), "--method", "fdk", "--method", "nmar", "--method", "twin-fdk"]) == 0
+    found = {r.label: r for r in records.read(results)}
+    assert [*found] == ["fdk", "twin-fdk", "nmar[mask=auto]"]
+    assert found["nmar[mask=auto]"].details["mask_status"] == "ok"
+    assert found["twin-fdk"].status == "skipped"
+    for label in ("fdk", "nmar[mask=auto]"):
+        assert [*found[label].scores] == [NO_REFERENCE]
+        assert all(v is not None for v in found[label].scores[NO_REFERENCE].values.values())
+    screen, page = capsys.readouterr().out, (results / "table.md").read_text()
+    for protocol in NEED_TRUTH:
+        assert protocol in page and protocol in screen
+        assert f"## {protocol}" not in page.splitlines()
+    assert "measured, without truth" in screen and "nmar[mask=auto]" in screen
+    assert (results / "panels/rods.png").stat().st_size > 10_000
+
+
+def test_scores_see_what_they_are_for(data):
+    """Streaks and noise in air, noise near metal, and another object each raise their own number."""
+    stored = open_scan(data / "rods")
+    judge = Unreferenced.of(stored)
+    values = fdk(stored.scan).values.numpy()
+
+    def scored(volume):
+        return judge.scores(volume, "metal", Twin())[NO_REFERENCE].values
+
+    base, rng = scored(values), np.random.default_rng(0)
+    streaked = values + judge.water * 0.2 * np.sin(np.arange(32) / 3).astype(np.float32)
+    assert scored(streaked)["air_streak"] > 2 * base["air_streak"]
+    noisy = values + rng.normal(0, 0.2 * judge.water, values.shape).astype(np.float32)
+    assert scored(noisy)["air_entropy"] > base["air_entropy"] + 0.5
+    near = np.where(judge.near, noisy, values)
+    assert scored(near)["artefact_index"] > base["artefact_index"]
+    assert scored(np.zeros_like(values))["held/outside"] > 3 * base["held/outside"]
+    assert scored(np.zeros_like(values))["air_entropy"] == 0
+
+
+def test_consistency_is_that_of_closed_form(data):
+    """Of a volume of 0, the RMSE is the RMS of P."""
+    stored = open_scan(data / "rods")
+    views = Unreferenced.of(stored).views
+    assert isinstance(views, HeldViews)
+    found = consistency(np.zeros(stored.geometry.n_voxel, np.float32), views)
+    for name, mask in views.regions.items():
+        assert found[f"held/{name}"] == pytest.approx(float(np.sqrt(np.mean(views.p[mask].astype(float) ** 2))))
+    held = stored.info.held
+    assert held is not None
+    steps = np.rint((TRUE.start_deg - np.degrees(held.angles)) / (360 / TRUE.n_views)).astype(int)
+    true = line_integrals(TRUE, (*BODY, *METAL))[steps % TRUE.n_views]
+    clear = true < 2  # photons 2e5·exp(−2): noise of 0.6 %, six of which is 0.04
+    assert np.abs(views.p - true)[clear].max() < 0.04
