@@ -49,13 +49,13 @@ def _turn(geometry: Geometry) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the views of a turn in the order of their angles, each angle once, and these in radians."""
     if geometry.poses is not None:
         raise InputError("--center auto needs a circular orbit, the views of this scan are poses")
-    angles = np.round(np.mod(geometry.angles, 2 * np.pi), 9)
+    angles = np.round(np.mod(geometry.angles, 2 * np.pi), 9).astype(np.float64)
     angles[angles >= round(2 * np.pi, 9)] = 0.0
     distinct, order = np.unique(angles, return_index=True)
     gaps = np.diff(distinct, append=distinct[0] + 2 * np.pi)
     if len(distinct) < 4 or gaps.max() > UNEVEN * gaps.min():
         raise InputError("--center auto needs even views over a full turn; expected --center PIXELS for this scan")
-    return order, distinct
+    return order, np.asarray(distinct, np.float64)
 
 
 def _middle(scan: Scan, order: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -65,6 +65,16 @@ def test_directions_arcs_and_starts(tmp_path, arc, start):
     assert np.allclose(found.angles, true.angles, atol=np.radians(24 * 0.0005) if abs(arc) < 360 else 1e-12)
 
 
+def test_the_way_of_turning_can_be_said(tmp_path):
+    log = scan_files.skyscan(tmp_path / "scan", COUNTS, GEOMETRY)
+    other = msgspec.structs.replace(GEOMETRY, arc_deg=360.0)
+    same_orbit(brought(tmp_path, log, turn="counter-clockwise").geometry, other)
+    same_orbit(brought(tmp_path, log, turn="clockwise", name="same").geometry, GEOMETRY)
+    stepped = scan_files.skyscan(tmp_path / "more", np.concatenate([COUNTS, COUNTS[:1]]), GEOMETRY, step=15.0)
+    found = brought(tmp_path, stepped, turn="counter-clockwise", name="more").geometry
+    assert np.allclose(found.angles[:-1], other.angles)
+
+
 def test_a_last_image_that_repeats_the_first_is_kept(tmp_path):
     again = np.concatenate([COUNTS, COUNTS[:1]])
     log = scan_files.skyscan(tmp_path / "scan", again, GEOMETRY, step=15.0)

@@ -31,8 +31,8 @@ class Flags:
     """Voxels of the volume along x and y; z follows (default: a detector's columns, at most 512)."""
     voxel: float | None = None
     """Size of the cubic voxels in mm (default: so that the field of view fits)."""
-    clockwise: bool | None = None
-    """Which way the source turns about the object as seen from above, if the format says otherwise than it is."""
+    turn: Literal["file", "clockwise", "counter-clockwise"] = "file"
+    """Which way the source turns about the object as seen from above, if it is not as the file is understood."""
     dso: float | None = None
     """Distance from the source to the axis in mm, if the format does not state it."""
     dsd: float | None = None

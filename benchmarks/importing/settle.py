@@ -125,18 +125,18 @@ def _gridded(geometry: Geometry, given: Flags) -> Geometry:
 
 
 def _turned(geometry: Geometry, given: Flags) -> Geometry:
-    """Return the geometry with the way of turning that --clockwise says."""
-    if given.clockwise is None:
+    """Return the geometry with the way of turning that --turn says."""
+    if given.turn == "file":
         return geometry
     if geometry.poses is not None:
-        raise InputError("--clockwise: the scan's views are poses, which say how the source turns")
-    if geometry.angles_deg is not None:
-        angles = geometry.angles_deg
-        turns_clockwise = angles[-1] < angles[0]
-        flipped = tuple(2 * angles[0] - a for a in angles)
-        return msgspec.structs.replace(geometry, angles_deg=angles if turns_clockwise == given.clockwise else flipped)
-    arc = abs(geometry.arc_deg)
-    return msgspec.structs.replace(geometry, arc_deg=-arc if given.clockwise else arc)
+        raise InputError("--turn: the scan's views are poses, which say how the source turns")
+    sign = -1.0 if given.turn == "clockwise" else 1.0
+    angles = geometry.angles_deg
+    if angles is None:
+        return msgspec.structs.replace(geometry, arc_deg=sign * abs(geometry.arc_deg))
+    if sign * (angles[-1] - angles[0]) >= 0:
+        return geometry
+    return msgspec.structs.replace(geometry, angles_deg=tuple(2 * angles[0] - a for a in angles))
 
 
 def _opened(

@@ -67,7 +67,7 @@ def _name(path: Path) -> str:
 def _identity(scan: ScanFile, given: Flags) -> str:
     """Hash the scan's headers, its place, and the flags that change what is written."""
     header = scan.path.read_bytes() if scan.path.is_file() and scan.path.stat().st_size < 2**24 else b""
-    flags = [given.center, given.n_voxel, given.voxel, given.clockwise, given.kv, given.filter, given.i0, given.hold]
+    flags = [given.center, given.n_voxel, given.voxel, given.turn, given.kv, given.filter, given.i0, given.hold]
     shown = repr((str(scan.path.resolve()), scan.geometry, flags)).encode()
     return hashlib.sha256(header + shown).hexdigest()[:12]
 

@@ -71,8 +71,10 @@ class Unreferenced:
         field = field_of_view(stored.geometry)
         near_metal = dilate(metal, METAL_MARGIN) if metal.any() else metal
         inside = body & ~near_metal & field
-        distance = ndimage.distance_transform_edt(~metal, sampling=stored.geometry.d_voxel) if metal.any() else None
-        near = inside & (distance <= NEAR) if distance is not None else np.zeros_like(inside)
+        near = np.zeros_like(inside)
+        if metal.any():
+            distance = np.asarray(ndimage.distance_transform_edt(~metal, sampling=stored.geometry.d_voxel))
+            near = inside & (distance <= NEAR)
         water = effective_attenuation(stored) or scale
         found = views if isinstance(views, HeldViews | str) else held_views(stored, metal)
         notes = [
@@ -144,7 +146,8 @@ def _regions(scan: Scan) -> tuple[Mask, Mask, float, str]:
         return nothing, nothing, 0.0, f"body and metal were not found: {error}"
     metal = auto_mask(values)
     water = water_value(values)
-    body = ndimage.binary_opening(values > BODY * water) if water > 0 else np.zeros(values.shape, np.bool_)
+    dense = values > BODY * water if water > 0 else np.zeros(values.shape, np.bool_)
+    body: Mask = np.asarray(ndimage.binary_opening(dense), np.bool_)
     if not metal.mask.any() or metal.doubt:
         return body, np.zeros_like(body), water, f"no metal was found: {metal.doubt or 'nothing stands out'}"
     return body, metal.mask, water, f"{int(metal.mask.sum())} voxels of metal were found"

@@ -62,7 +62,7 @@ def _get(file: h5py.File, name: str) -> Any:
 
 def _followed(file: h5py.File, group: h5py.Group, link: Any) -> Any:
     """Return what a soft link names, which must be a hard one."""
-    target = link.path if link.path.startswith("/") else f"{group.name.rstrip('/')}/{link.path}"
+    target = link.path if link.path.startswith("/") else f"{group.name}/{link.path}"
     at: Any = file
     for part in filter(None, target.split("/")):
         if not isinstance(at, h5py.Group) or not isinstance(at.get(part, getlink=True), h5py.HardLink):

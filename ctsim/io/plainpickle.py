@@ -24,7 +24,10 @@ def load_plain(path: Path) -> Any:
         raise InputError(f"{path} is no pickle: {' '.join(str(error).split())[:200] or type(error).__name__}") from None
 
 
-class _Reader(pickle._Unpickler):  # pyright: ignore[reportAttributeAccessIssue]
+_Base: Any = getattr(pickle, "_Unpickler")  # noqa: B009
+
+
+class _Reader(_Base):
     """Python's own reader in Python: that in C makes room for what a damaged file declares."""
 
     def __init__(self, data: bytes, name: str) -> None:
@@ -56,7 +59,7 @@ class _Reader(pickle._Unpickler):  # pyright: ignore[reportAttributeAccessIssue]
         self.append(bytearray(data))
 
     dispatch: ClassVar[dict[int, Any]] = {
-        **pickle._Unpickler.dispatch,  # pyright: ignore[reportAttributeAccessIssue]
+        **_Base.dispatch,
         pickle.BUILD[0]: load_build,
         pickle.BYTEARRAY8[0]: load_bytearray8,
     }

@@ -1,7 +1,8 @@
 """The table of formats of measured scans. Their modules are imported when they are needed."""
 
+import contextlib
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,6 +49,16 @@ SCANS = {
 """name -> format; the first that fits is taken."""
 
 
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Begin what is wrong with a scan with its path, where it does not name a file: what a geometry refuses."""
+    try:
+        yield
+    except InputError as error:
+        known = str(error).startswith(str(path)) or str(error).startswith(str(path.parent))
+        raise InputError(str(error) if known else f"{path}: {error}") from None
+
+
 def open_scan(path: Path, name: str = "auto", stated: Stated | None = None) -> ScanFile:
     """Read the headers of a scan in a format of `SCANS`, found by the files' names unless it is named.
 
@@ -64,7 +75,7 @@ def open_scan(path: Path, name: str = "auto", stated: Stated | None = None) -> S
             f"{path} is a {chosen.kind}, which states its lengths; expected neither --dso, --dsd nor --pixel"
         )
     reader = getattr(load(chosen.module, path), chosen.function)
-    with decoding(path, chosen.kind):
+    with decoding(path, chosen.kind), _naming(path):
         scan: ScanFile = reader(path, stated)
 
     def read(view: int) -> NDArray[Any]:

@@ -170,7 +170,7 @@ def _reader(
         image = read_image(images[view], shape)
         if angle or shifts is not None:
             moved = np.zeros(2) if shifts is None else shifts[view, ::-1]
-            offset = centre + moved - turned @ centre
+            offset: Any = centre + moved - turned @ centre
             image = ndimage.affine_transform(image.astype(np.float32), turned, offset, order=1, mode="nearest")
         return image[::-1]
 

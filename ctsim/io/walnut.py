@@ -49,10 +49,10 @@ def open_scan(path: Path, stated: Stated) -> ScanFile:
 def _poses(header: Path) -> NDArray[np.float64]:
     lines = [line.split() for line in read_text(header).splitlines() if line.strip()]
     try:
-        poses = np.array([[float(word) for word in line] for line in lines])
+        poses = np.array([[float(word) for word in line] for line in lines], np.float64)
     except ValueError:
         poses = np.zeros(0)
-    if poses.ndim != 2 or poses.shape[1] != 12 or not 1 <= len(poses) <= MOST_VIEWS or not np.isfinite(poses).all():
+    if poses.ndim != 2 or poses.shape[-1] != 12 or not 1 <= len(poses) <= MOST_VIEWS or not np.isfinite(poses).all():
         raise InputError(f"{header} is no table of 12 finite numbers a line")
     return poses
 
