@@ -1,4 +1,4 @@
-"""Datasets: one scene simulated into a folder, with its truth, so that a stopped run goes on where it was."""
+"""One scene simulated with its truth: into a folder, so that a stopped run goes on where it was, or in memory."""
 
 import contextlib
 import functools
@@ -13,6 +13,7 @@ import numpy as np
 
 from ctsim.beam.spectrum import spectrum
 from ctsim.dataset.manifest import About
+from ctsim.dataset.memory import MemoryWriter, SimulatedScan
 from ctsim.dataset.writer import SceneWriter, Stack
 from ctsim.detector.response import response
 from ctsim.errors import InputError
@@ -26,6 +27,9 @@ from ctsim.types import Phantom, Scanner
 FEW_TISSUES = 7  # air among them: what recipes have, mostly
 Watch = Callable[[Iterable[Any], int, int], Iterable[Any]]
 """Passes on views while it shows how far they are: (views, number of the first, number of all) -> the same views."""
+
+Writer = SceneWriter | MemoryWriter
+"""Takes a scene view by view, then its truth."""
 
 
 def plan_scene(scene: Scene) -> Plan:
@@ -61,24 +65,15 @@ def make_scene(
         plan = _plan(scene, phantom, scanner)
         for note in plan.notes:
             tell(note)
-        stacks = tuple(
-            Stack(
-                name=o.name,
-                shape=(scanner.geometry.n_views, *o.shape),
-                dtype=o.dtype,
-                pixel=scanner.geometry.d_detector,
-            )
-            for o in plan.outputs
-        )
         with SceneWriter(
-            out, scene.name, scene_id=scene_id(scene), plan_hash=plan_hash(plan), stacks=stacks, force=force
+            out,
+            scene.name,
+            scene_id=scene_id(scene),
+            plan_hash=plan_hash(plan),
+            stacks=_stacks(plan, scanner),
+            force=force,
         ) as writer:
-            scatter = scatter_of(plan, phantom, scanner)
-            views = simulate_views(plan, phantom, scanner, first_view=writer.first_view, scatter=scatter)
-            for view, arrays in watch(views, writer.first_view, scanner.geometry.n_views):
-                writer.put(view, arrays)
-            _write_truth(writer, plan, phantom, scanner, scatter)
-            writer.write_text("scene.toml", scene_to_toml(scene))
+            _simulate(writer, scene, plan, phantom, scanner, watch)
             return writer.finish(about(scene, phantom, scanner) if scene.drawn else None)
 
 
@@ -99,7 +94,38 @@ def disk_bytes(scene: Scene) -> int:
     return disk_estimate(scene.resolve(), scene.truth, metal=metal, n_tissues=FEW_TISSUES)
 
 
-def _write_truth(writer: SceneWriter, plan: Plan, phantom: Phantom, scanner: Scanner, scatter: Scattered) -> None:
+def simulate_scene(scene: Scene) -> SimulatedScan:
+    """Simulate a scene in memory: the same numbers as `make_scene` writes, and no file.
+
+    Raises InputError where memory is short.
+    """
+    with _memory(scene.name):
+        phantom, scanner = build(scene), scene.resolve()
+        plan = _plan(scene, phantom, scanner)
+        writer = MemoryWriter(scene.name, scene_id=scene_id(scene), stacks=_stacks(plan, scanner))
+        _simulate(writer, scene, plan, phantom, scanner)
+        return writer.finish()
+
+
+def _stacks(plan: Plan, scanner: Scanner) -> tuple[Stack, ...]:
+    """Return the stacks of views that a plan asks for."""
+    views, pixel = scanner.geometry.n_views, scanner.geometry.d_detector
+    return tuple(Stack(name=o.name, shape=(views, *o.shape), dtype=o.dtype, pixel=pixel) for o in plan.outputs)
+
+
+def _simulate(
+    writer: Writer, scene: Scene, plan: Plan, phantom: Phantom, scanner: Scanner, watch: Watch = lambda views, *_: views
+) -> None:
+    """Simulate the views that the writer lacks, and the truth."""
+    scatter = scatter_of(plan, phantom, scanner)
+    views = simulate_views(plan, phantom, scanner, first_view=writer.first_view, scatter=scatter)
+    for view, arrays in watch(views, writer.first_view, scanner.geometry.n_views):
+        writer.put(view, arrays)
+    _write_truth(writer, plan, phantom, scanner, scatter)
+    writer.write_text("scene.toml", scene_to_toml(scene))
+
+
+def _write_truth(writer: Writer, plan: Plan, phantom: Phantom, scanner: Scanner, scatter: Scattered) -> None:
     """Write what a scan has once: the flat, the true volumes, and how both were made."""
     info = dict(scan_info(plan, phantom, scanner, scatter))
     writer.write_image("flat", info.pop("flat"), scanner.geometry.d_detector)

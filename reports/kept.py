@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.benchmarks.scores.artefact import effective_attenuation
-from ctsim.benchmarks.scores.protocol import Stored, Truth, truth_of
+from ctsim.benchmarks.scores.protocol import Truth, truth_of
 from ctsim.benchmarks.studies.methods.panels import Look, cut, look_of
 from ctsim.benchmarks.studies.methods.plan import repetition
 from ctsim.benchmarks.studies.methods.records import RunRecord, latest, read
 from ctsim.benchmarks.studies.methods.volumes import identity_of, map_volume, own_at_50kev
-from ctsim.dataset.store import list_scans, open_scan
+from ctsim.dataset.store import StoredScan, list_scans, open_scan
 from ctsim.errors import InputError
 
 
@@ -34,7 +34,7 @@ class Kept:
 class Case:
     """A scan and the methods' volumes of it. `look` holds the window's top and the error scale in 1/mm."""
 
-    stored: Stored
+    stored: StoredScan
     scene: str
     seed: int
     truth: Truth
@@ -57,7 +57,7 @@ class Case:
         return None if water is None else 1000 * (value / water - 1)
 
 
-def case_of(stored: Stored, records: Sequence[RunRecord], results: Path) -> Case:
+def case_of(stored: StoredScan, records: Sequence[RunRecord], results: Path) -> Case:
     """Collect what `results` keeps of a scan; volumes of other data, parameters or code are left out."""
     kept = []
     for record in latest(records):

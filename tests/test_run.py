@@ -55,6 +55,14 @@ class Double:
     phantom: str = "box"
 
     @property
+    def place(self):
+        return str(self.folder)
+
+    def text(self, name):
+        path = self.folder / name
+        return path.read_text(encoding="utf-8") if path.is_file() else None
+
+    @property
     def info(self):
         return ScanInfo(geometry=GEOMETRY, dark=0.0, i0=1e5, e_max=90.0, l0=self.l0, seed=3, metal=("Fe",))
 

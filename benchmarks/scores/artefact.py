@@ -5,6 +5,7 @@ energy scale), so it needs no reference. Volumes are [z, y, x] in 1/mm, distance
 """
 
 import csv
+import io
 import itertools
 import math
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from scipy import ndimage
 from ctsim.benchmarks.scores.metrics import Mask, box_around
 from ctsim.benchmarks.scores.protocol import Truth
 from ctsim.benchmarks.scores.score import COLUMNS, NO_TWIN, Score
-from ctsim.dataset.store import StoredScan
+from ctsim.dataset.truth import ScanWithTruth
 from ctsim.errors import InputError
 from ctsim.materials import attenuation
 
@@ -67,29 +68,31 @@ class Layout:
     note: str
 
 
-def effective_attenuation(stored: StoredScan, material: str = "water") -> float | None:
+def effective_attenuation(stored: ScanWithTruth, material: str = "water") -> float | None:
     """Return μ of a material in 1/mm under the scan's effective spectrum; None where its spectrum is not stored.
 
     ω(E) ∝ signal(E)·exp(−μ_water(E)·L0), the weights of the effective-spectrum reference. Raises
     InputError where spectrum.csv is damaged.
     """
-    path = stored.folder / "spectrum.csv"
-    if not path.is_file():
+    text = stored.text("spectrum.csv")
+    if text is None:
         return None
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            table = [(float(row["energy_kev"]), float(row["signal_fraction"])) for row in csv.DictReader(file)]
+        rows = csv.DictReader(io.StringIO(text, newline=""))
+        table = [(float(row["energy_kev"]), float(row["signal_fraction"])) for row in rows]
     except (KeyError, TypeError, ValueError):
         table = []
     if not table:
-        raise InputError(f"{path}: expected the columns energy_kev and signal_fraction with numbers")
+        raise InputError(
+            f"{stored.place}: spectrum.csv: expected the columns energy_kev and signal_fraction with numbers"
+        )
     energies, signal = np.array(table).T
     mu = attenuation("water", energies)
     weights = signal * np.exp((mu.min() - mu) * stored.l0)
     return float(np.average(attenuation(material, energies), weights=weights))
 
 
-def layout_of(stored: StoredScan, truth: Truth) -> Layout:
+def layout_of(stored: ScanWithTruth, truth: Truth) -> Layout:
     """Choose the ROIs and lines of a scan from its labels and its metal; nothing depends on a method."""
     rois, small = homogeneous(np.asarray(stored.labels), truth, stored.info.materials)
     lines, n_pairs, cut = metal_lines(truth)

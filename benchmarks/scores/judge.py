@@ -13,7 +13,7 @@ from ctsim.benchmarks.scores.protocol import Truth, evaluate, truth_of
 from ctsim.benchmarks.scores.score import NO_TWIN, Score
 from ctsim.benchmarks.scores.soft import SoftLayout, soft_layout, soft_score
 from ctsim.benchmarks.scores.structure import StructureLayout, structure_layout, structure_score
-from ctsim.dataset.store import StoredScan
+from ctsim.dataset.truth import ScanWithTruth
 from ctsim.notes import NOT_ON_GRID
 
 
@@ -40,7 +40,7 @@ class Judge:
     absent: str = ""
 
     @classmethod
-    def of(cls, stored: StoredScan, views: HeldOut | str | None = None) -> "Judge":
+    def of(cls, stored: ScanWithTruth, views: HeldOut | str | None = None) -> "Judge":
         """Load a scan's references and choose where its artefacts are measured.
 
         `views` are those of an earlier judge of the scan: to simulate them is most of the work.
@@ -80,7 +80,7 @@ class Judge:
         return scores
 
 
-def _absent(stored: StoredScan, truth: Truth) -> str:
+def _absent(stored: ScanWithTruth, truth: Truth) -> str:
     """Return a scan's notes on its metal; a scan of an older version has none, so its mask decides."""
     if stored.info.notes or truth.metal.any() or not stored.info.metal:
         return "; ".join(stored.info.notes)

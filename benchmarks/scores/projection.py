@@ -16,11 +16,11 @@ from ctsim import settings
 from ctsim.beam.quadrature import effective_weights
 from ctsim.benchmarks.scores.protocol import Truth
 from ctsim.benchmarks.scores.score import AS_RETURNED, Score
-from ctsim.dataset.store import StoredScan
+from ctsim.dataset.truth import ScanWithTruth
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
-from ctsim.phantoms.scene import build, load_suite, stream_id
+from ctsim.phantoms.scene import build, parse_suite, stream_id
 from ctsim.plan import make_plan
 from ctsim.reconstruct.projector import forward_columns
 from ctsim.simulate import REFERENCE_KEV, simulate_views
@@ -70,16 +70,15 @@ def half_way(geometry: Geometry) -> Geometry | str:
     return msgspec.structs.replace(geometry, n_views=len(picked), angles_deg=picked)
 
 
-def held_out(stored: StoredScan) -> HeldOut | str:
+def held_out(stored: ScanWithTruth) -> HeldOut | str:
     """Simulate the held-out views of a scan, or say why there are none."""
     views = half_way(stored.geometry)
     if isinstance(views, str):
         return views
-    path = stored.folder / "scene.toml"
-    if not path.is_file():
-        return "the scan comes without scene.toml, from which held-out views are simulated"
     try:
-        (scene,) = load_suite(path)
+        if (text := stored.text("scene.toml")) is None:
+            return "the scan comes without scene.toml, from which held-out views are simulated"
+        (scene,) = parse_suite(text, f"{stored.place}: scene.toml")
     except ValueError as error:  # InputError, or a file of several scenes
         return f"held-out views cannot be simulated: {' '.join(str(error).split())}"
     if scene.resolve().geometry != stored.geometry:
@@ -92,7 +91,7 @@ def held_out(stored: StoredScan) -> HeldOut | str:
         return "there was not enough memory to simulate held-out views"
 
 
-def _simulated(scene: Any, geometry: Geometry, stored: StoredScan) -> HeldOut:
+def _simulated(scene: Any, geometry: Geometry, stored: ScanWithTruth) -> HeldOut:
     phantom = build(scene)
     scanner = msgspec.structs.replace(scene.resolve(), geometry=geometry)
     asked = settings.Truth(twin=False, noise_free=True, paths=True, trace=True, mono_kev=(REFERENCE_KEV,))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ctsim.benchmarks.scores import metrics
 from ctsim.benchmarks.scores.metrics import Mask
 from ctsim.benchmarks.scores.score import AS_RETURNED, AT_50KEV, Score
-from ctsim.dataset.store import StoredScan as Stored
+from ctsim.dataset.truth import ScanWithTruth
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 
@@ -45,7 +45,7 @@ class Truth:
     cut: bool = False
 
 
-def truth_of(stored: Stored) -> Truth:
+def truth_of(stored: ScanWithTruth) -> Truth:
     """Load the references of a stored scan and derive the regions from its masks."""
     metal, body = np.asarray(stored.metal) > 0, np.asarray(stored.labels) > 0
     near_metal = metrics.dilate(metal, METAL_MARGIN) if metal.any() else metal

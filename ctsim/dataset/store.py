@@ -6,31 +6,25 @@ A scene's folder holds counts.tif [view, v, u], flat.tif, the references, labels
 """
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.dataset import manifest as mf
 from ctsim.dataset.manifest import list_scans, verify
 from ctsim.dataset.tiffstack import map_array
+from ctsim.dataset.truth import TWIN, ScanWithTruth, readings
 from ctsim.dataset.writer import SceneWriter, Stack, is_complete
 from ctsim.errors import InputError
-from ctsim.geometry import Geometry
 from ctsim.scaninfo import ScanInfo, read_info
-
-if TYPE_CHECKING:
-    from ctsim.types import Scan
 
 __all__ = ["SceneWriter", "Stack", "StoredScan", "is_complete", "list_scans", "open_scan", "verify"]
 
-_TWIN = "metal_free/"
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StoredScan:
+class StoredScan(ScanWithTruth):
     """A finished scan on disk. `scan` is what a method gets; the rest is ground truth for judging it.
 
     It holds no open file: arrays are memory-mapped when they are asked for, each time again and copy-on-write, so that
@@ -39,57 +33,14 @@ class StoredScan:
     """
 
     folder: Path
-    name: str
-    scene_id: str
     content_hash: str
     code: str
-    info: ScanInfo
-    files: dict[str, mf.FileEntry]
-    prefix: str = ""
-    metal_free: "StoredScan | None" = None
+    files: dict[str, mf.FileEntry] = field(hash=False)
 
     @property
-    def scan(self) -> "Scan":
-        """Map the scan again: what is written into it stays with the one who asked.
-
-        Raises
-        ------
-        InputError
-            When a file cannot be mapped, and when the open field has no usable pixel.
-        """
-        import torch  # seconds that listing and verifying do without
-
-        from ctsim.types import Scan
-
-        counts, flat = (torch.from_numpy(_map(self.folder, self.files, name)) for name in _readings(self.prefix))
-        info, name = self.info, f"{self.name}/{self.prefix}".rstrip("/")
-        try:
-            return Scan(
-                geometry=info.geometry,
-                counts=counts,
-                flat=flat,
-                dark=info.dark,
-                i0=info.i0,
-                e_max=info.e_max,
-                name=name,
-            )
-        except InputError as error:
-            raise InputError(f"{self.folder}: {error}") from None
-
-    @property
-    def geometry(self) -> Geometry:
-        """Return the scan's geometry."""
-        return self.info.geometry
-
-    @property
-    def l0(self) -> float:
-        """Return the scene's median water-equivalent path in mm."""
-        return self.info.l0
-
-    @property
-    def kerma(self) -> float | None:
-        """Return the scan's air kerma (mGy) at the isocentre; None where scan.json of an older scan lacks it."""
-        return self.info.scan_kerma
+    def place(self) -> str:
+        """Return the folder."""
+        return str(self.folder)
 
     @property
     def phantom(self) -> str:
@@ -104,29 +55,19 @@ class StoredScan:
         """Whether there is a truth to judge volumes by, as of every simulated scan and of no measured one."""
         return any(f"{name}.tif" in self.files for name in ("labels", "metal", "reference_effective"))
 
-    @property
-    def labels(self) -> NDArray[np.uint8]:
-        """Return the label volume, uint8 [z, y, x]."""
-        return self.array("labels")
+    def file(self, name: str) -> NDArray[Any]:
+        """Map an array of the folder by its name without .tif."""
+        return _map(self.folder, self.files, name)
 
-    @property
-    def metal(self) -> NDArray[np.uint8]:
-        """Return the metal mask, uint8 [z, y, x]."""
-        return self.array("metal")
-
-    def reference(self, which: str) -> NDArray[np.float32]:
-        """Return the true attenuation, "effective" (effective spectrum) or "50kev": float32 [z, y, x] in 1/mm."""
-        return self.array(f"reference_{which}")
-
-    def array(self, name: str) -> NDArray[Any]:
-        """Map one stored array, such as "noise_free".
-
-        Raises
-        ------
-        InputError
-            When the scan was written without it.
-        """
-        return _map(self.folder, self.files, self.prefix + name)
+    def text(self, name: str) -> str | None:
+        """Read a text file of the folder; None where there is none."""
+        path = self.folder / name
+        if not path.is_file():
+            return None
+        try:
+            return path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: cannot be read ({error})") from error
 
 
 def open_scan(folder: str | Path) -> StoredScan:
@@ -144,12 +85,12 @@ def open_scan(folder: str | Path) -> StoredScan:
     if problems:
         raise InputError(f"damaged dataset: {problems[0]}" + (f" (and {len(problems) - 1} more)" * (len(problems) > 1)))
     info = read_info(folder / "scan.json")
-    twin = _open(folder, manifest, info, _TWIN, None) if f"{_TWIN}counts.tif" in manifest.files else None
+    twin = _open(folder, manifest, info, TWIN, None) if f"{TWIN}counts.tif" in manifest.files else None
     return _open(folder, manifest, info, "", twin)
 
 
 def _open(folder: Path, manifest: mf.Manifest, info: ScanInfo, prefix: str, twin: StoredScan | None) -> StoredScan:
-    for name, shape in zip(_readings(prefix), (info.geometry.shape, info.geometry.n_detector), strict=True):
+    for name, shape in zip(readings(prefix), (info.geometry.shape, info.geometry.n_detector), strict=True):
         found, _, _ = _place(folder, manifest.files, name)
         if found != shape:
             raise InputError(f"{folder / name}.tif: shape {found}, the geometry of scan.json says {shape}")
@@ -164,11 +105,6 @@ def _open(folder: Path, manifest: mf.Manifest, info: ScanInfo, prefix: str, twin
         prefix=prefix,
         metal_free=twin,
     )
-
-
-def _readings(prefix: str) -> tuple[str, str]:
-    """Return the names of a scan's counts and of its open field, which a twin shares."""
-    return f"{prefix}counts", "flat"
 
 
 def _place(folder: Path, files: dict[str, mf.FileEntry], name: str) -> tuple[tuple[int, ...], str, int]:

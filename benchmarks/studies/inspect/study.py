@@ -21,13 +21,13 @@ from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.table import Table, simple
 from ctsim.benchmarks.scores import metrics
 from ctsim.benchmarks.scores.metrics import ssim_along_axes
-from ctsim.benchmarks.scores.protocol import TISSUE, Stored, Truth, tissue_range, truth_of
+from ctsim.benchmarks.scores.protocol import TISSUE, Truth, tissue_range, truth_of
 from ctsim.benchmarks.studies.inspect import Flags
 from ctsim.benchmarks.studies.methods import records
 from ctsim.benchmarks.studies.methods.attempt import attempt, scan_for
 from ctsim.benchmarks.studies.methods.records import METAL
 from ctsim.benchmarks.studies.methods.volumes import identity_of, own_at_50kev, read_volume
-from ctsim.dataset.store import list_scans, open_scan
+from ctsim.dataset.store import StoredScan, list_scans, open_scan
 from ctsim.errors import InputError
 from ctsim.human import human_choice
 
@@ -229,7 +229,7 @@ def _cell(value: float | None, base: float | None, digits: int) -> str:
     return f"{value:.{digits}f}" + ("" if base is None else f" ({value - base:+.{digits}f})")
 
 
-def markdown(found: Inspected, stored: Stored) -> str:
+def markdown(found: Inspected, stored: StoredScan) -> str:
     """Return the table in Markdown with what it shows. Raises InputError for volumes that cannot be scored."""
     truth = truth_of(stored)
     for volume, which in ((found.values, "volume"), (found.at_50kev, "volume at 50 keV")):
@@ -270,7 +270,7 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def _kept(results: Path, name: str | None, stored: Stored) -> Inspected:
+def _kept(results: Path, name: str | None, stored: StoredScan) -> Inspected:
     """Read the volumes that a results folder keeps of a scan and method."""
     shown = (r for r in records.latest(records.read(results)) if r.run.variant == METAL and r.volume)
     kept = {r.label: r for r in shown if r.task.data == stored.content_hash}
@@ -289,7 +289,7 @@ def _kept(results: Path, name: str | None, stored: Stored) -> Inspected:
     return Inspected(label=label, values=values, at_50kev=None if own is None else read_volume(own))
 
 
-def _made(name: str | None, stored: Stored) -> Inspected:
+def _made(name: str | None, stored: StoredScan) -> Inspected:
     """Reconstruct the scan."""
     if name is None:
         raise InputError("expected a results folder or --method NAME")

@@ -31,6 +31,7 @@ from ctsim.benchmarks.scores.score import NO_TWIN
 from ctsim.benchmarks.studies.methods.records import METAL, Cost
 from ctsim.benchmarks.studies.methods.volumes import Intermediates, attached, recordable
 from ctsim.dataset.store import StoredScan
+from ctsim.dataset.truth import ScanWithTruth
 from ctsim.errors import InputError
 from ctsim.simulate import REFERENCE_KEV
 from ctsim.types import Scan, Status, Volume
@@ -62,7 +63,7 @@ class Outcome:
         self.status, self.reason, self.values, self.at_50kev = status, reason, None, None
 
 
-def scan_for(method: Method, stored: StoredScan, variant: str) -> Scan:
+def scan_for(method: Method, stored: ScanWithTruth, variant: str) -> Scan:
     """Return the scan or its metal-free twin, with the true mask for a method of mask "oracle" (the twin's is empty).
 
     A row of the table that is told the twin gets the twin as its scan: nothing else leads a method there. The arrays
@@ -125,13 +126,13 @@ def attempt(method: Method, scan: Scan, warm_up_seconds: float) -> Outcome:
         with restored():
             with measured() as usage:
                 volume = method.reconstruct(scan)
-            _check(volume)
+            check_volume(volume)
             if method.program:  # without the time for its copy of the scan
                 usage = volume.details[USAGE]
             else:
                 view_updates = int(volume.details.get("view_updates", scan.geometry.n_views))
             outcome.status, outcome.reason = str(volume.status), volume.reason
-            outcome.values = _array(volume.values)
+            outcome.values = array_of(volume.values)
             outcome.intermediates = attached(volume.details, scan.geometry)
             outcome.details = recordable(volume.details)
             if outcome.status in SCORED:
@@ -153,7 +154,7 @@ def attempt(method: Method, scan: Scan, warm_up_seconds: float) -> Outcome:
     return checked(outcome, scan.geometry.n_voxel)
 
 
-def _check(volume: Any) -> None:
+def check_volume(volume: Any) -> None:
     """Raise InputError unless a method returned a volume of real numbers with a known status."""
     if not isinstance(volume, Volume):
         raise _NoVolume(f"the method returned a {_kind(volume)}, expected a ctsim.types.Volume")
@@ -177,7 +178,7 @@ def _kind(value: object) -> str:
 def _read_at_50kev(outcome: Outcome, volume: Volume) -> None:
     """Add the volume at 50 keV of a method that knows energies; an error there fails the run."""
     try:
-        outcome.at_50kev = None if volume.at_energy is None else _array(volume.at_energy(REFERENCE_KEV))
+        outcome.at_50kev = None if volume.at_energy is None else array_of(volume.at_energy(REFERENCE_KEV))
     except KeyboardInterrupt:
         raise
     except BaseException as error:
@@ -206,7 +207,7 @@ def checked(outcome: Outcome, shape: tuple[int, int, int]) -> Outcome:
     return outcome
 
 
-def _array(volume: torch.Tensor) -> NDArray[np.float32]:
+def array_of(volume: torch.Tensor) -> NDArray[np.float32]:
     """Return a copy: a method may reuse its memory while the twin's volume is still needed."""
     return np.array(volume.detach().cpu().numpy(), np.float32)
 
