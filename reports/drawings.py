@@ -1,7 +1,8 @@
-"""Draw the two pictures of the documentation: the frame of `docs/reference/conventions.md` and the README's artefact.
+"""Draw pictures of the documentation: the frame of its conventions, the README's artefact, the gallery of phantoms.
 
 `python -m ctsim.reports.drawings geometry docs/images/geometry.svg`
 `python -m ctsim.reports.drawings artefact DATA/SCENE docs/images/artefact.png RESULTS/volumes/SCENE__fdk.tif …`
+`python -m ctsim.reports.drawings phantoms docs/images/phantoms.png`
 """
 
 import sys
@@ -15,10 +16,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from ctsim.benchmarks.scalebar import scale_bar
 from ctsim.benchmarks.scores.protocol import truth_of
 from ctsim.benchmarks.studies.methods.panels import cut
 from ctsim.dataset.store import open_scan
 from ctsim.errors import InputError
+from ctsim.reports.gallery import gallery
 
 DSO, DSD, HALF_U, HALF_V = 5.0, 8.0, 2.6, 2.0
 ANGLE = np.radians(35.0)
@@ -107,6 +110,7 @@ def artefact(scene: Path, volumes: list[Path], path: Path) -> None:
         shown = axes.imshow(image, cmap="gray", vmin=0.0, vmax=top, origin="lower")
         axes.contour(truth.metal[z], levels=[0.5], colors="#ffb000", linewidths=0.7)
         axes.set(title=title, xticks=[], yticks=[])
+    scale_bar(grid[0], reference.shape, truth.d_voxel[2], size=8)
     assert shown is not None
     figure.colorbar(shown, ax=list(grid), fraction=0.02, pad=0.01, label="1/mm")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -120,8 +124,10 @@ def main(arguments: list[str]) -> None:
             geometry(Path(path))
         case ["artefact", scene, path, *volumes] if volumes:
             artefact(Path(scene), [Path(v) for v in volumes], Path(path))
+        case ["phantoms", path]:
+            gallery().savefig(path, dpi=80)
         case _:
-            raise InputError("expected: geometry OUT, or artefact SCENE OUT VOLUME…")
+            raise InputError("expected: geometry OUT, artefact SCENE OUT VOLUME…, or phantoms OUT")
 
 
 if __name__ == "__main__":

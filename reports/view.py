@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ctsim.benchmarks.engine.table import pictured
+from ctsim.benchmarks.scalebar import scale_bar
 from ctsim.errors import InputError
 from ctsim.reports.kept import Case
 
@@ -132,6 +133,7 @@ def figure(case: Case, state: State) -> Figure:
             if image.metal.any() and not image.metal.all() and min(image.metal.shape) > 1:
                 cell.contour(image.metal, levels=[0.5], colors="#ffb000", linewidths=0.7)
             cell.set_title(pictured(image.title), fontsize=8)
+    scale_bar(grid[0, 0], shown[0].values.shape, d_u)
     low, high = state.level - state.width / 2, state.level + state.width / 2
     said = f"window {low:.4g} … {high:.4g} {unit(case)}"
     if state.errors:

@@ -23,6 +23,7 @@ from PIL import Image
 
 from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.table import pictured
+from ctsim.benchmarks.scalebar import scale_bar
 from ctsim.benchmarks.scores.artefact import effective_attenuation
 from ctsim.benchmarks.scores.protocol import Truth, truth_of
 from ctsim.benchmarks.scores.score import NO_REFERENCE
@@ -178,6 +179,8 @@ def draw(stored: StoredScan, truth: Truth, rows: list[PanelRow]) -> Figure:
         grid[i, 0].set_ylabel(pictured(row.caption), rotation=0, ha="right", va="center", fontsize=8)
         if i:
             _errors(grid[i, len(PLANES) :], row.volume, truth, at, look)
+        else:
+            _scale_bars(grid[i], truth)
         if i and worked:
             _worked(grid[i, -2:], row.shown, truth, at, look)
     if view is not None and measured is not None:
@@ -199,6 +202,13 @@ def _measured(stored: StoredScan, view: int) -> tuple[NDArray[np.float32], NDArr
 def _slices(axes: NDArray[Any], volume: NDArray[Any], truth: Truth, at: tuple[int, int, int], look: Look) -> None:
     for k, (axis, _) in enumerate(PLANES):
         _slice(axes[k], np.take(volume, at[axis], axis), truth, axis, at, cmap="gray", vmin=0.0, vmax=look.top)
+
+
+def _scale_bars(axes: NDArray[Any], truth: Truth) -> None:
+    """Draw the scale into the slices of a row; those below have the same."""
+    for k, (axis, _) in enumerate(PLANES):
+        shape = tuple(n for a, n in enumerate(truth.metal.shape) if a != axis)
+        scale_bar(axes[k], shape, truth.d_voxel[2])
 
 
 def _errors(axes: NDArray[Any], volume: NDArray[Any], truth: Truth, at: tuple[int, int, int], look: Look) -> None:
