@@ -2,7 +2,6 @@
 
 import importlib.metadata
 import pkgutil
-import shutil
 import subprocess
 import sys
 import zipfile
@@ -12,6 +11,7 @@ from pathlib import Path
 import grimp
 import pytest
 from setuptools import find_packages
+from wheels import build_wheel
 
 from ctsim.benchmarks.cli import OF_DATASETS, OTHERS
 
@@ -63,14 +63,7 @@ def test_an_installed_ctsim_claims_one_name_on_the_import_path():
 
 
 def test_a_wheel_holds_all_of_ctsim_but_the_tools(tmp_path):
-    left_out = shutil.ignore_patterns(".*", "__pycache__", "build", "*.egg-info", "docs", "tests")
-    shutil.copytree(ROOT, tmp_path / "source", symlinks=True, ignore=left_out)
-    code = f"from setuptools import build_meta; build_meta.build_wheel({str(tmp_path)!r})"
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path / "source", capture_output=True, text=True, timeout=120, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    (wheel,) = tmp_path.glob("*.whl")
+    wheel = build_wheel(tmp_path)
     held = {name for name in zipfile.ZipFile(wheel).namelist() if name.endswith((".py", ".toml", ".html", ".npz"))}
     parts = [path for part in PARTS for path in (ROOT / part).rglob("*")]
     ours = [path for path in [*parts, *(ROOT / "ctsim").rglob("*")] if path.suffix in (".py", ".toml", ".html", ".npz")]
@@ -92,6 +85,13 @@ def test_importing_a_package_loads_nothing_heavy(package):
 @pytest.mark.parametrize("module", ["ctsim.errors", "ctsim.geometry", "ctsim.dataset.manifest", "ctsim.dataset.store"])
 def test_what_lists_and_checks_datasets_loads_nothing_slow(module):
     assert not loaded(f"import {module}") & (DRAWS | SLOW)
+
+
+def test_the_package_loads_nothing_until_a_name_is_used():
+    own = loaded("import ctsim; ctsim.__version__; dir(ctsim)")
+    assert not own & {"numpy", "msgspec", *DRAWS, *SLOW}
+    assert "numpy" in loaded("import ctsim; ctsim.open_scan")
+    assert not loaded("import ctsim; ctsim.open_scan, ctsim.list_scans, ctsim.InputError") & (DRAWS | SLOW)
 
 
 def test_making_data_does_without_torch():

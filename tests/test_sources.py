@@ -10,7 +10,7 @@ from ctsim.dataset.sources import NOT_OF_DATA, TABLES, TEXT, hash_of, source_has
 from ctsim.errors import InputError
 
 ROOT = Path(__file__).parents[1]
-FOR_PEOPLE = {"beam/NOTICE.txt"}
+FOR_PEOPLE = {"beam/NOTICE.txt", "CITATION.cff", "__init__.pyi", "py.typed"}
 
 
 @pytest.fixture

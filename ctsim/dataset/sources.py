@@ -9,7 +9,7 @@ from importlib.resources.abc import Traversable
 from ctsim.errors import InputError
 
 PHANTOMS = "ctsim/phantoms/"
-NOT_OF_DATA = ("baselines", "benchmarks", "reconstruct", "reports")  # subpackages that no scan depends on
+NOT_OF_DATA = ("api.py", "baselines", "benchmarks", "reconstruct", "reports")  # what no scan depends on
 TEXT, TABLES = ".py", ".npz"  # what a package's results depend on; `NOTICE.txt` is for people
 
 
@@ -41,8 +41,9 @@ def hash_of(package: Traversable) -> str:
 def _files(folder: Traversable, where: str, left_out: tuple[str, ...] = ()) -> Iterator[tuple[str, Traversable]]:
     """Yield sources and tables with their names, such as ctsim/kernels/noise_cpu.py."""
     for entry in folder.iterdir():
+        if entry.name in ("__pycache__", *left_out):
+            continue
         if entry.is_dir():
-            if entry.name not in ("__pycache__", *left_out):
-                yield from _files(entry, f"{where}/{entry.name}")
+            yield from _files(entry, f"{where}/{entry.name}")
         elif entry.name.endswith((TEXT, TABLES)):
             yield f"{where}/{entry.name}", entry

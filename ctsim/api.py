@@ -1,0 +1,134 @@
+"""The short interface: from a scene to a corrected volume and its scores, without a file.
+
+Everything here is reachable as `ctsim.NAME`. The commands do the same work with records, tables and pictures; scores
+are the same numbers.
+"""
+
+import dataclasses
+import functools
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ctsim.benchmarks.methods import Method, find
+from ctsim.benchmarks.scores.judge import Judge, Twin
+from ctsim.benchmarks.scores.score import NOT_ASKED, Score
+from ctsim.benchmarks.studies.methods.attempt import Outcome, array_of, check_volume, checked, scan_for
+from ctsim.benchmarks.studies.methods.records import METAL
+from ctsim.benchmarks.suites import load, select
+from ctsim.dataset.truth import ScanWithTruth
+from ctsim.errors import InputError
+from ctsim.human import human_choice
+from ctsim.phantoms.scene import Scene
+from ctsim.phantoms.suites import decode
+from ctsim.simulate import REFERENCE_KEV
+from ctsim.types import Scan, Volume
+
+
+def find_scene(suite: str, name: str, *, seed: int | None = None) -> Scene:
+    """Return a scene of a bundled suite, such as "quick", or of a TOML file.
+
+    With `seed` it is another individual with another noise, named NAME-sSEED as by `make-dataset --seeds`. Raises
+    InputError for an unknown suite or scene.
+    """
+    scenes = load(suite)
+    names = [scene.name for scene in scenes]
+    if name not in names:
+        raise InputError(f"suite {suite!r} has no scene {name!r}, expected one of {human_choice(names, name)}")
+    return select(scenes, (name,), () if seed is None else (seed,))[0]
+
+
+def new_scene(**keys: Any) -> Scene:
+    """Return a scene of your own; the keys are those of a scene file, tables are dicts.
+
+    `new_scene(name="pins", phantom={"recipe": "walnut", "metal": "Fe"}, scanner={"preset": "dental"})`. Raises
+    InputError naming a wrong key or value.
+    """
+    return decode(keys, Scene, "scene")
+
+
+def reconstruct_scan(scan: ScanWithTruth | Scan, method: str = "fdk", **parameters: Any) -> Volume:
+    """Reconstruct a scan by a method's name or "module:function", with its parameters.
+
+    A method with mask "oracle" gets the true metal mask, which a `Scan` without truth must hold in `metal`. Give
+    `scan.metal_free` to reconstruct the twin.
+
+    Raises
+    ------
+    InputError
+        For an unknown method, parameter or value, where the method skips this scan, and where it returns no volume.
+    """
+    found = find(method, parameters)
+    given = _readings(found, scan)
+    if (reason := found.skip(given)) is not None:
+        raise InputError(f"{found.label} skips this scan: {reason}")
+    volume = found.reconstruct(given)
+    check_volume(volume)
+    return volume
+
+
+def _readings(method: Method, scan: ScanWithTruth | Scan) -> Scan:
+    """Return what a method gets of a scan: the truth only as far as it declares to be told."""
+    if isinstance(scan, Scan):
+        if method.told_twin:
+            raise InputError(f"{method.name} is told the metal-free twin: expected a simulated scan, got a Scan")
+        return scan
+    if not scan.is_twin:
+        return scan_for(method, scan, METAL)
+    readings = scan.scan
+    if method.mask != "oracle":
+        return readings
+    return dataclasses.replace(readings, metal=torch.zeros(scan.geometry.n_voxel, dtype=torch.bool))
+
+
+def score_volume(
+    volume: Volume | NDArray[Any],
+    scan: ScanWithTruth,
+    *,
+    twin: Volume | NDArray[Any] | None = None,
+    variant: Literal["metal", "metal_free"] = "metal",
+) -> dict[str, Score]:
+    """Score a volume under every protocol that applies: protocol -> `Score`, the same numbers as `run-benchmark`.
+
+    `twin` is the same method's volume of `scan.metal_free`, which the protocol `artefact` compares with. To score that
+    volume itself, name the `variant` "metal_free". An array is [z, y, x] in 1/mm. The truth of the last scan is kept
+    for the next call.
+
+    Raises
+    ------
+    InputError
+        Where a volume is not finite or not on the scan's grid, and where `scan` is a twin.
+    """
+    if scan.is_twin:
+        raise InputError('expected the scan with metal: score its twin\'s volume with variant="metal_free"')
+    values, at_50kev = _arrays(volume, scan)
+    pair = Twin(reason=NOT_ASKED) if scan.metal_free is not None else Twin()
+    if twin is not None:
+        pair = Twin(values=_arrays(twin, scan)[0])
+    return _judge(scan).scores(values, variant, pair, at_50kev)
+
+
+@functools.lru_cache(maxsize=1)
+def _judge(scan: ScanWithTruth) -> Judge:
+    """Load what a scan's volumes are scored with; simulating its held-out views is most of the work."""
+    return Judge.of(scan)
+
+
+def _arrays(
+    volume: Volume | NDArray[Any], scan: ScanWithTruth
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Return a volume's values, and those at 50 keV of a method that knows energies."""
+    if isinstance(volume, Volume):
+        values, own = array_of(volume.values), volume.at_energy
+        at_50kev = None if own is None else array_of(own(REFERENCE_KEV))
+    else:
+        values, at_50kev = np.asarray(volume), None
+        if values.dtype.kind not in "fiu":
+            raise InputError(f"the volume must be real numbers in 1/mm, got {values.dtype}")
+        values = values.astype(np.float32)
+    outcome = checked(Outcome(status="ok", values=values, at_50kev=at_50kev), scan.geometry.n_voxel)
+    if outcome.status != "ok":
+        raise InputError(outcome.reason)
+    return values, at_50kev
