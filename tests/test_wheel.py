@@ -1,0 +1,101 @@
+"""An installed ctsim: what the wheel holds, and the README's Python in a project with folders named as ours.
+
+The wheel lies on the path before the environment's packages, and `-S` leaves out an editable install. With CTSIM_PYPI=1
+PyPI's package `phantoms` is installed next to it, else a stub of that name.
+"""
+
+import os
+import subprocess
+import sys
+import sysconfig
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+from test_docs import BLOCK
+from wheels import ROOT, build_wheel
+
+import ctsim
+
+README = [text for kind, text in BLOCK.findall((ROOT / "README.md").read_text(encoding="utf-8")) if kind == "python"]
+
+
+def pip(*words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps", *words]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    return build_wheel(tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="module")
+def site(wheel, tmp_path_factory) -> Path:
+    """What pip installs from the wheel, and a package `phantoms` of somebody else after it."""
+    folder = tmp_path_factory.mktemp("site")
+    done = pip("--no-index", "--no-compile", "--target", str(folder), str(wheel))
+    assert done.returncode == 0, done.stderr
+    theirs = ("--only-binary", ":all:", "--target", str(folder), "--upgrade", "phantoms")
+    if os.environ.get("CTSIM_PYPI") != "1" or pip(*theirs).returncode:
+        (folder / "phantoms").mkdir()
+        (folder / "phantoms" / "__init__.py").write_text("THEIRS = True\n", encoding="utf-8")
+    return folder
+
+
+@pytest.fixture
+def project(tmp_path) -> Path:
+    """A user's folder with packages of the names that ours have in the repository."""
+    for name in ("reports", "phantoms"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("OWN = True\n", encoding="utf-8")
+    return tmp_path
+
+
+def run(project: Path, site: Path, code: str) -> str:
+    """Run a script of the project with the installed ctsim, without this repository."""
+    (project / "script.py").write_text(code, encoding="utf-8")
+    path = os.pathsep.join([str(site), sysconfig.get_path("purelib")])
+    done = subprocess.run(
+        [sys.executable, "-S", "script.py"], cwd=project, env={**os.environ, "PYTHONPATH": path},
+        capture_output=True, text=True, timeout=900, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_wheel_says_its_version_its_types_and_how_to_cite_it(wheel):
+    archive = zipfile.ZipFile(wheel)
+    assert {"ctsim/py.typed", "ctsim/__init__.pyi", "ctsim/CITATION.cff"} <= {*archive.namelist()}
+    assert archive.read("ctsim/CITATION.cff") == (ROOT / "CITATION.cff").read_bytes()
+    (metadata,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+    assert f"\nVersion: {ctsim.__version__}\n" in archive.read(metadata).decode()
+    assert f"\nversion: {ctsim.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert "version" not in tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+def test_nothing_but_ctsim_is_installed(wheel):
+    tops = {name.partition("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
+    assert tops == {"ctsim", f"ctsim-{ctsim.__version__}.dist-info"}
+
+
+def test_ours_and_others_of_one_name_are_apart(project, site):
+    code = (
+        "import ctsim, reports, phantoms, ctsim.phantoms.recipes, ctsim.reports\n"
+        "assert reports.OWN and phantoms.OWN and not hasattr(ctsim.phantoms, 'OWN')\n"
+        "print(ctsim.__file__, ctsim.phantoms.__file__, ctsim.reports.__file__, sep='\\n')"
+    )
+    found = [Path(line) for line in run(project, site, code).splitlines()]
+    assert found == [site / "ctsim" / part / "__init__.py" for part in ("", "phantoms", "reports")]
+    assert (site / "phantoms" / "__init__.py").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", README)
+def test_the_python_of_the_readme_runs(text, project, site):
+    run(project, site, f"{text}\nimport sys\nassert sys.modules['ctsim'].__file__.startswith({str(site)!r})\n")
+
+
+def test_the_readme_has_python():
+    assert any("import ctsim" in text for text in README)
