@@ -25,6 +25,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ctsim.beam.quadrature import effective_weights, full_rule
+from ctsim.benchmarks.scalebar import scale_bar
 from ctsim.dataset.store import list_scans, open_scan
 from ctsim.detector.noise import detect
 from ctsim.materials import attenuation
@@ -168,4 +169,5 @@ else:
         high = top if low == 0 else -low
         drawing.colorbar(axes.imshow(image, cmap=colours, origin="lower", vmin=low, vmax=high), ax=axes, fraction=0.046)
         axes.set(title=f"{title}, z = {z}", xticks=[], yticks=[])
+        scale_bar(axes, image.shape, stored.geometry.d_voxel[2])
     show.figure(drawing, "physics-metal")
