@@ -15,7 +15,7 @@ from ctsim.benchmarks.tools.reference import COMMAND, main, pages
 FOLDER = Path(__file__).parents[1] / "docs" / "reference"
 
 
-@pytest.mark.parametrize("name", ["commands.md", "scene-keys.md", "methods.md", "suites.md"])
+@pytest.mark.parametrize("name", ["commands.md", "scene-keys.md", "methods.md", "python.md", "suites.md"])
 def test_a_committed_page_is_up_to_date(name):
     assert (FOLDER / name).read_text(encoding="utf-8") == pages()[name], f"run `{COMMAND}`"
 

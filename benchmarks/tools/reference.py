@@ -1,7 +1,8 @@
 """Reference pages of the documentation, written from the types that they describe.
 
 `python -m ctsim.benchmarks.tools.reference docs/reference` writes the pages of the commands, from the dataclasses that
-tyro parses; of the scene keys, from the structs that read a scene; of the methods; and of the bundled suites.
+tyro parses; of the scene keys, from the structs that read a scene; of the methods; of the short interface; and
+of the bundled suites.
 """
 
 import ast
@@ -21,6 +22,7 @@ from typing import Any, Literal
 import msgspec
 import tyro
 
+import ctsim
 from ctsim.benchmarks.cli import OF_DATASETS, OTHERS, guarded
 from ctsim.benchmarks.methods import TABLE, find, parameters, resolve
 from ctsim.benchmarks.suites import bundled, load
@@ -53,6 +55,11 @@ SUITES = """# Bundled suites
 `make-dataset SUITE data/` simulates a suite. `--only NAME` takes single scenes, `--seeds 1 2 3` repeats every scene.
 The files lie in `benchmarks/suites/`. A suite of your own is a TOML file: see
 [write a scene](../tutorials/write-a-scene.md)."""
+PYTHON = """# Python
+
+`import ctsim` is enough for the functions and types below. It loads none of them: each is imported when it is first
+used. `ctsim.__version__` is the version. A wrong input raises `ctsim.InputError` with one sentence that says what was
+expected. [API](api.md) has the modules behind them."""
 POSITIONAL = typing.get_args(tyro.conf.Positional[int])[1]
 REPEATED = typing.get_args(tyro.conf.UseAppendAction[int])[1]
 NO_PAIR = typing.get_args(tyro.conf.FlagCreatePairsOff[int])[1]
@@ -66,6 +73,7 @@ def pages() -> dict[str, str]:
         "commands.md": [COMMANDS, *(command(name, form) for name, form in forms().items())],
         "scene-keys.md": [SCENE_KEYS, *_scene_tables(), _presets(), _materials()],
         "methods.md": [METHODS, table(("method", "inputs", "what it does"), first), *map(method, TABLE)],
+        "python.md": [PYTHON, *map(public, ctsim._MODULES)],
         "suites.md": [SUITES, *map(suite, sorted(bundled()))],
     }
     return {name: "\n\n".join([NOTE, *found]).strip() + "\n" for name, found in parts.items()}
@@ -141,6 +149,17 @@ def method(name: str) -> str:
     ]
     head = f"## {name}\n\nInputs: {found.inputs}. Function: `{found.target}`.\n\n{described(function)}"
     return f"{head}\n\n{table(('parameter', 'value', 'default', 'meaning'), rows)}" if rows else head
+
+
+def public(name: str) -> str:
+    """Return heading, call and description of a name of the short interface; annotations as the source has them."""
+    found = getattr(ctsim, name)
+    call = ""
+    if inspect.isfunction(found):
+        node = next(n for n in ast.parse(inspect.getsource(found)).body if isinstance(n, ast.FunctionDef))
+        result = "" if node.returns is None else f" -> {ast.unparse(node.returns)}"
+        call = f"```text\nctsim.{name}({ast.unparse(node.args)}){result}\n```\n\n"
+    return f"## {name}\n\n{call}{described(found)}"
 
 
 def _scene_tables() -> list[str]:
