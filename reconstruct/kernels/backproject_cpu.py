@@ -84,6 +84,9 @@ def _add_slice(filtered, cos, sin, orbit, grid, image):
                 first, last = min(first, x), x + 1
         for view in range(n_view):
             c, s = cos[view], sin[view]
+            if n_v == 1:
+                _add_line(filtered[view, 0], c, s, y_mm, z_mm, orbit, grid, first, last, total)
+                continue
             for x in range(first, last):
                 x_mm = (x + 0.5 - n_x / 2) * grid[2] + grid[5]
                 inverse = 1.0 / (orbit[0] - (x_mm * c + y_mm * s))
@@ -102,6 +105,27 @@ def _add_slice(filtered, cos, sin, orbit, grid, image):
                 total[x] += np.float32((orbit[0] * inverse) ** 2) * (low + r * (high - low))
         for x in range(first, last):
             image[y, x] += total[x]
+
+
+@njit(cache=True, fastmath=FAST)
+def _add_line(line, c, s, y_mm, z_mm, orbit, grid, first, last, total):
+    """Add a view of one row to the voxels first…last−1 of a line; without branches, so that it is vector code."""
+    n_x, n_u = total.size, line.size
+    end_u, half_x = n_u - 1.0, n_x / 2
+    middle, x_step, x_off = end_u / 2, grid[2], grid[5]
+    dso, dsd, per_u, off_u = orbit[0], orbit[1], 1 / orbit[3], orbit[5]
+    highest = 0.5 * orbit[2]
+    for x in range(first, last):
+        x_mm = (x + 0.5 - half_x) * x_step + x_off
+        inverse = 1.0 / (dso - (x_mm * c + y_mm * s))
+        scale = dsd * inverse
+        u = (scale * (y_mm * c - x_mm * s) - off_u) * per_u + middle
+        seen = (u >= -0.5) & (u <= end_u + 0.5) & (abs(scale * z_mm - orbit[4]) <= highest)
+        u = min(max(u, 0.0), end_u)
+        i = np.uint32(u)
+        a, b = line[i], line[np.uint32(min(u + 1.0, end_u))]
+        weight = np.float32((dso * inverse) ** 2 if seen else 0.0)
+        total[x] += weight * (a + np.float32(u - i) * (b - a))
 
 
 @njit(parallel=True, cache=True)
