@@ -85,6 +85,8 @@ def read_rtk(out):
     stack, grid = (sitk.ReadImage(str(out / f"{name}.mha")) for name in ("projections", "grid"))
     (n_u, n_v, n_views), (d_u, d_v, _), (u, v, first) = stack.GetSize(), stack.GetSpacing(), stack.GetOrigin()
     assert first == 0 and n_views == len(angles)
+    matrices = [np.reshape(node.text.split(), (3, 4)).astype(float) for node in root.iter("Matrix")]
+    assert len(matrices) == n_views
     words = {"dso": float(root.findtext("SourceToIsocenterDistance"))}
     words |= {"dsd": float(root.findtext("SourceToDetectorDistance")), "n_detector": (n_v, n_u)}
     middle = {"d_detector": (d_v, d_u), "off_detector": (v + (n_v - 1) / 2 * d_v, u + (n_u - 1) / 2 * d_u)}

@@ -4,6 +4,7 @@ Lengths are mm. `docs/reference/conventions.md` says how the frames lie in each 
 """
 
 import json
+import math
 import pickle
 import shutil
 from collections.abc import Callable
@@ -114,16 +115,24 @@ def _rtk(folder: Path, scan: Measured) -> None:
         centre=(g.off_origin[order[0]], g.off_origin[order[1]], g.off_origin[order[2]]),
     )
     metaimage.write_volume(folder / "grid.mha", grid)
-    views = "".join(
-        f"  <Projection>\n    <GantryAngle>{float(angle)!r}</GantryAngle>\n  </Projection>\n"
-        for angle in angles_to(Library.RTK, g.angles)
-    )
+    views = "".join(_rtk_view(g, float(angle)) for angle in angles_to(Library.RTK, g.angles))
     (folder / "geometry.xml").write_text(
         '<?xml version="1.0"?>\n<!DOCTYPE RTKGEOMETRY>\n<RTKThreeDCircularGeometry version="3">\n'
         f"  <SourceToIsocenterDistance>{g.dso!r}</SourceToIsocenterDistance>\n"
         f"  <SourceToDetectorDistance>{g.dsd!r}</SourceToDetectorDistance>\n"
         f"{views}</RTKThreeDCircularGeometry>\n",
         encoding="utf-8",
+    )
+
+
+def _rtk_view(g: Geometry, degrees: float) -> str:
+    """Return a view's element: its angle, and the matrix that RTK checks it with, without offsets of the detector."""
+    cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    rows = ((-g.dsd * cos, 0.0, g.dsd * sin, 0.0), (0.0, -g.dsd, 0.0, 0.0), (sin, 0.0, cos, -g.dso))
+    matrix = "".join(f"      {' '.join(map(repr, row))}\n" for row in rows)
+    return (
+        f"  <Projection>\n    <GantryAngle>{degrees!r}</GantryAngle>\n"
+        f"    <Matrix>\n{matrix}    </Matrix>\n  </Projection>\n"
     )
 
 

@@ -100,7 +100,7 @@ def _better_unit(values: NDArray[Any], reference: NDArray[np.float32], unit: Uni
         scale = {"1/mm": 1.0, "1/cm": 0.1, "hu": (water or 0) / 1000}[other]
         shifted = own_mean * scale + (water or 0) * (other == "hu")
         off[other] = abs(math.log(own_spread * scale / spread)), _distance(shifted, mean)
-    better = [other for other in off if all(a < b for a, b in zip(off[other], off[unit], strict=True))]
+    better: list[Unit] = [other for other in off if all(a < b for a, b in zip(off[other], off[unit], strict=True))]
     return min(better, key=lambda other: sum(off[other]), default=None)
 
 
