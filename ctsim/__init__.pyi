@@ -14,3 +14,4 @@ from ctsim.types import Scan as Scan
 from ctsim.types import Volume as Volume
 
 __version__: str
+_MODULES: dict[str, str]

@@ -1,15 +1,17 @@
 """A picture of all recipes: one individual of each body, in two slices through its metal."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ctsim.benchmarks.scalebar import scale_bar
-from ctsim.benchmarks.studies.methods.panels import cut
+from ctsim.benchmarks.studies.methods.panels import METAL, cut
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.phantoms.bodies import Recipe
@@ -41,9 +43,9 @@ def gallery(kinds: Sequence[type[Recipe]] = (), *, n_voxel: int = 128, seed: int
         axes.axis("off")
     for k, kind in enumerate(kinds):
         row, column = divmod(k, COLUMNS)
-        _draw(grid[2 * row : 2 * row + 2, column], kind(n_voxel=(n_voxel,) * 3), n_voxel, seed)
+        _draw(grid[2 * row : 2 * row + 2, column], kind(n_voxel=(n_voxel, n_voxel, n_voxel)), n_voxel, seed)
     figure.suptitle(
-        f"upper: normal to z, lower: normal to y; {LOW:g} to {HIGH:g} HU at {KEV:g} keV; metal white", fontsize=9
+        f"upper: normal to z, lower: normal to y; {LOW:g} to {HIGH:g} HU at {KEV:g} keV; metal yellow", fontsize=9
     )
     return figure
 
@@ -54,18 +56,19 @@ def _draw(cells: NDArray[np.object_], recipe: Recipe, n: int, seed: int) -> None
     volume, metal, d_voxel = in_hu(phantom, recipe.size, n)
     at = cut(metal, phantom_body(volume))
     for axes, axis in zip(cells, (0, 1), strict=True):
-        image = np.where(np.take(metal, at[axis], axis), HIGH, np.take(volume, at[axis], axis))
-        _show(axes, image, d_voxel)
+        _show(axes, np.take(volume, at[axis], axis), np.take(metal, at[axis], axis), d_voxel)
     materials = sorted({s.material for s in phantom.solids if s.metal})
     cells[0].set_title(f"{recipe.recipe}\n{', '.join(materials)}, {recipe.size:g} mm", fontsize=8)
 
 
-def _show(axes: Axes, image: NDArray[np.float64], d_voxel: float) -> None:
+def _show(axes: Axes, image: NDArray[np.floating[Any]], metal: NDArray[np.bool_], d_voxel: float) -> None:
     axes.imshow(image, cmap="gray", vmin=LOW, vmax=HIGH, origin="lower", interpolation="nearest")
+    over = np.ma.masked_where(~metal, metal)
+    axes.imshow(over, cmap=ListedColormap([METAL]), origin="lower", interpolation="nearest")
     scale_bar(axes, image.shape, d_voxel)
 
 
-def in_hu(phantom: Phantom, size: float, n: int) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
+def in_hu(phantom: Phantom, size: float, n: int) -> tuple[NDArray[np.floating[Any]], NDArray[np.bool_], float]:
     """Return a phantom on a cube of `size` mm in n³ voxels: HU at 60 keV and the metal, [z, y, x]; the voxel in mm."""
     d = size / n
     grid = Geometry(
@@ -78,6 +81,6 @@ def in_hu(phantom: Phantom, size: float, n: int) -> tuple[NDArray[np.float64], N
     return 1000.0 * (volume - 1), metal_mask(phantom, grid) > 0, d
 
 
-def phantom_body(volume: NDArray[np.float64]) -> NDArray[np.bool_]:
+def phantom_body(volume: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
     """Return where a volume in HU is no air."""
     return volume > -900
