@@ -53,6 +53,7 @@ class Double:
     l0: float = 10.0
     kerma: float | None = 1.25
     phantom: str = "box"
+    has_truth: bool = True
 
     @property
     def place(self):
