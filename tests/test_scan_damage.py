@@ -87,7 +87,7 @@ def test_a_damaged_scan_is_read_or_refused_in_one_sentence(tmp_path, capfd, kind
 
 
 def test_the_command_ends_with_2(tmp_path, capsys, monkeypatch):
-    log = scan_files.skyscan(tmp_path / "scan", COUNTS, FEW, dso="nan")
+    log = scan_files.skyscan(tmp_path / "scan", COUNTS, FEW, dso=float("nan"))
     monkeypatch.setattr(sys, "argv", ["make-dataset", "import", str(log), str(tmp_path / "data")])
     assert cli.make_dataset() == 2
     said = capsys.readouterr().err
