@@ -7,6 +7,7 @@ import torch
 from closed_scans import BEAN, BODY, GEOMETRY, METAL, WIDE, line_integrals
 
 from ctsim.errors import InputError
+from ctsim.reconstruct import axis
 from ctsim.reconstruct.axis import axis_shift
 from ctsim.types import Scan
 
@@ -71,3 +72,13 @@ def test_what_has_no_opposite_views_is_refused():
     )
     with pytest.raises(InputError, match="views of this scan are poses"):
         axis_shift(scan)
+
+
+def test_opposite_rays_agree_at_the_axis():
+    """At the true shift the costs are left to interpolation: a tenth of those of the mirrored relation of angles."""
+    scan = shifted(3.7, BEAN, views=180)
+    order, angles = axis._turn(scan.geometry)
+    p, weight = axis._middle(scan, order)
+    model = axis._Opposite(scan.geometry, angles, p, weight)
+    mirrored = axis._Opposite(scan.geometry, angles, p[::-1], weight[::-1])  # the source turns the other way
+    assert model.cost(3.7) < 0.1 * mirrored.cost(3.7)
