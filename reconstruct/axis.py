@@ -6,6 +6,7 @@ opposite ray, so only rows count whose opposite rays stay within a pixel inside 
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ def axis_shift(scan: Scan) -> float:
     shifts = np.arange(-math.floor(reach), math.floor(reach) + 1) * COARSE
     costs = np.array([model.cost(float(shift)) for shift in shifts])
     best = float(shifts[int(np.argmin(costs))])
-    found = optimize.minimize_scalar(
+    found: Any = optimize.minimize_scalar(
         model.cost, bounds=(best - COARSE, best + COARSE), method="bounded", options={"xatol": FINE}
     )
     return float(found.x)
