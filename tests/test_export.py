@@ -134,7 +134,7 @@ def test_help_lists_the_command(monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["make-dataset", "--help"])
     with pytest.raises(SystemExit):
         cli.make_dataset()
-    assert "  export        write a volume as NIfTI, MetaImage or DICOM\n" in capsys.readouterr().out
+    assert "  export        write a volume or a scan for other programs\n" in capsys.readouterr().out
 
 
 def test_the_command_writes_references_labels_and_reconstructions(smallest, tmp_path, monkeypatch, capsys):

@@ -102,7 +102,7 @@ def test_making_data_does_without_torch():
 
 @pytest.mark.slow
 def test_nothing_below_benchmarks_draws_or_talks():
-    names = [m for m in modules("benchmarks", "reports") if m != "ctsim.beam.make_table"]
+    names = [m for m in modules("api", "benchmarks", "reports") if m != "ctsim.beam.make_table"]
     assert len(names) > 30
     brought = loaded("import torch")
     assert not (loaded("import " + ", ".join(names)) - brought) & DRAWS

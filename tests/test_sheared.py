@@ -159,13 +159,13 @@ def test_a_scan_is_the_same_with_and_without_skipping(case):
 
 @pytest.mark.parametrize("case", CASES)
 def test_an_object_is_within_the_cone_where_its_shadow_is_on_the_detector(case):
-    g, size = sheared(*case), 40.0
-    u, v = _shadow(g.pose_array(), size)
+    g, size, tall = sheared(*case), 40.0, 0.6
+    u, v = _shadow(g.pose_array(), size, tall)
     for view, pose in enumerate(g.pose_array()):
         source, centre, e_u, e_v = pose.reshape(4, 3)
         hit = centre + u[view, :, None] * e_u + v[view, :, None] * e_v - source
         # the rays to these pixels pass the circles that bound the object
-        heights = np.where(np.arange(hit.shape[0]) < 48, -1, 1) * REACH * size / 2
+        heights = np.where(np.arange(hit.shape[0]) < 48, -1, 1) * tall * size / 2
         share = (heights - source[2]) / hit[:, 2]
         radius = np.hypot(*(source + share[:, None] * hit)[:, :2].T)
         assert np.ptp(radius) < 1e-6 * size
