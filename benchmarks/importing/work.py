@@ -37,7 +37,7 @@ def bring(given: Flags) -> Path:
     Raises InputError where the scan cannot be read, lacks what no flag gives, or another scene has its name.
     """
     scan = open_scan(given.scan, given.format, _stated(given))
-    name = given.name or _name(scan.path)
+    name = given.name or _name(given.scan)
     identity = _identity(scan, given)
     if not given.force and is_complete(given.out, name, identity):
         sys.stdout.write(f"{given.out / name}: already complete\n")
