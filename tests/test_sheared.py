@@ -10,7 +10,6 @@ import pytest
 from ctsim.baselines.metal import reach
 from ctsim.detector.noise import Noise
 from ctsim.geometry import Geometry
-from ctsim.phantoms.bodies import REACH
 from ctsim.phantoms.scene import _shadow
 from ctsim.plan import make_plan
 from ctsim.settings import Simulation, Truth
