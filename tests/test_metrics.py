@@ -9,8 +9,19 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from ctsim.benchmarks.scores import metrics
 from ctsim.benchmarks.scores.metrics import window
-from ctsim.benchmarks.scores.protocol import AS_RETURNED, AT_50KEV, Truth, evaluate, tissue_range
+from ctsim.benchmarks.scores.protocol import (
+    AS_RETURNED,
+    AT_50KEV,
+    METAL_MARGIN,
+    Truth,
+    evaluate,
+    tissue_range,
+    truth_of,
+)
+from ctsim.dataset.truth import ScanWithTruth
 from ctsim.errors import InputError
+from ctsim.phantoms.dataset import simulate_scene
+from ctsim.phantoms.scene import parse_suite
 
 
 def volumes(shape=(13, 17, 19), seed=0, noise=0.1):
@@ -326,3 +337,29 @@ def test_without_metal_there_is_no_metal_score():
 def test_metal_does_not_set_the_tissue_range():
     t = truth()
     assert tissue_range(t, "effective") < 0.1 < t.references["effective"].max()
+
+
+def rods(diameter: float, **changes) -> ScanWithTruth:
+    """Three iron rods in water, in voxels of 2.5 mm."""
+    text = f'{{ recipe = "metal_rods", metal = "Fe", n_voxel = [24, 24, 24], insert_mm = {diameter} }}'
+    more = "".join(f"{key} = {value}\n" for key, value in changes.items())
+    scanner = "n_views = 2, n_detector = [8, 8], n_voxel = [24, 24, 24]"
+    return simulate_scene(parse_suite(f'name = "rods"\nphantom = {text}\nscanner = {{ {scanner} }}\n{more}')[0])
+
+
+def test_metal_thinner_than_a_voxel_is_not_judged_as_tissue():
+    thin = rods(0.8)
+    truth = truth_of(thin)
+    assert not truth.metal.any()  # no voxel is half full
+    more = thin.reference("effective") - thin.metal_free.reference("effective")
+    touched = more > 0.05 * np.median(thin.metal_free.reference("effective")[truth.body])
+    assert touched.sum() > 3 * 10 and more.max() > 0.02  # 1/mm, about water's own
+    assert not (truth.tissue & metrics.dilate(touched, METAL_MARGIN)).any()
+    blind = truth_of(rods(0.8, truth="{ twin = false }"))
+    assert np.array_equal(blind.tissue, blind.judged)  # nothing tells where it is
+
+
+def test_thick_metal_is_judged_by_its_mask_alone():
+    thick = rods(8.0)
+    truth = truth_of(thick)
+    assert truth.metal.any() and np.array_equal(truth.near_metal, metrics.dilate(truth.metal, METAL_MARGIN))

@@ -19,6 +19,8 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 
 METAL_MARGIN = 2
+THIN = 0.05
+"""Share of the body's median by which metal that fills less than half of a voxel raises the reference, to count."""
 BODY_MARGIN = 4
 RANGE_PERCENTILE = 99.9
 ReferenceKind = Literal["effective", "50kev"]
@@ -49,6 +51,8 @@ def truth_of(stored: ScanWithTruth) -> Truth:
     """Load the references of a stored scan and derive the regions from its masks."""
     metal, body = np.asarray(stored.metal) > 0, np.asarray(stored.labels) > 0
     near_metal = metrics.dilate(metal, METAL_MARGIN) if metal.any() else metal
+    thin = _thin_metal(stored, body & ~near_metal)
+    near_metal = near_metal | metrics.dilate(thin, METAL_MARGIN) if thin.any() else near_metal
     judged = metrics.dilate(body | metal, BODY_MARGIN)
     field = field_of_view(stored.geometry)
     cut = bool((body | metal)[~field].any())
@@ -71,6 +75,18 @@ def truth_of(stored: ScanWithTruth) -> Truth:
         l0=float(stored.l0),
         cut=cut,
     )
+
+
+def _thin_metal(stored: ScanWithTruth, body: Mask) -> Mask:
+    """Return the voxels of `body` that hold metal which the mask leaves out, because it fills less than half of them.
+
+    They are those in which the reference is above that of the twin without metal; a scan without twin does not tell.
+    """
+    if stored.metal_free is None or not body.any():
+        return np.zeros_like(body)
+    bare = np.asarray(stored.metal_free.reference("effective"))
+    more = np.asarray(stored.reference("effective")) - bare
+    return body & (more > THIN * np.median(bare[body]))
 
 
 def field_of_view(geometry: Geometry) -> Mask:

@@ -11,13 +11,14 @@ import msgspec
 
 from ctsim.benchmarks.engine.record import OK
 
-VERSION = 6
+VERSION = 7
 """Part of every run's identity; raised when a protocol changes its meaning.
 
 1: tissue, aligned, paper, metal, cost. 2: every method runs on the metal-free twin too, for `artefact`.
 3: `projection`, and `rmse` of `artefact`. The version was not raised for `at_energy`: only new code has it, and code is
 part of the identity. 4: `soft` and `structure`, of the twin too; `tissue` stays inside the field of view.
-5: fine structures in `soft`. 6: false bone begins at 1000 HU.
+5: fine structures in `soft`. 6: false bone begins at 1000 HU. 7: metal that
+fills less than half of its voxels is left out of `tissue`.
 """
 
 AS_RETURNED, AT_50KEV = "as returned", "read at 50 keV"
