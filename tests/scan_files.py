@@ -155,10 +155,10 @@ def _scanner(geometry: Geometry) -> dict:
     }
 
 
-def r2(folder: Path, p, geometry: Geometry, test=()) -> Path:
-    """Write line integrals as R2-Gaussian does, the views `test` for testing; return the folder."""
+def r2(folder: Path, p, geometry: Geometry, test=(), *, both=False) -> Path:
+    """Write line integrals as R2-Gaussian does, the views `test` for testing, `both` for training too."""
     folder.mkdir(parents=True, exist_ok=True)
-    parts = {"proj_train": [k for k in range(len(p)) if k not in test], "proj_test": list(test)}
+    parts = {"proj_train": [k for k in range(len(p)) if both or k not in test], "proj_test": list(test)}
     extents = {"sDetector": list(geometry.s_detector), "sVoxel": list(geometry.s_voxel[::-1])}
     meta = {"scanner": _scanner(geometry) | extents, "vol": "vol_gt.npy", "bbox": [[-1] * 3, [1] * 3]}
     for part, views in parts.items():
@@ -172,9 +172,9 @@ def r2(folder: Path, p, geometry: Geometry, test=()) -> Path:
     return folder
 
 
-def naf(path: Path, p, geometry: Geometry, test=(), protocol=4) -> Path:
+def naf(path: Path, p, geometry: Geometry, test=(), *, both=False, protocol=4) -> Path:
     """Write line integrals as NAF does."""
-    train = [k for k in range(len(p)) if k not in test]
+    train = [k for k in range(len(p)) if both or k not in test]
     found = _scanner(geometry) | {
         "dDetector": list(geometry.d_detector),
         "dVoxel": np.array(geometry.d_voxel[::-1]),

@@ -179,3 +179,15 @@ def test_r2_reads_its_folder_only(tmp_path, name):
 def test_lengths_are_stated_once(tmp_path):
     with pytest.raises(InputError, match="states its lengths"):
         scans.open_scan(scan_files.r2(tmp_path / "r2", P, GEOMETRY), stated=Stated(dso=1.0))
+
+
+@pytest.mark.parametrize("write", [scan_files.r2, scan_files.naf])
+def test_a_view_for_testing_is_not_reconstructed_from(tmp_path, write):
+    path = write(tmp_path / "rods.pickle", P, GEOMETRY, test=(3, 11), both=True)
+    scan = scans.open_scan(path, "r2" if write is scan_files.r2 else "naf")
+    kept = [k for k in range(len(P)) if k not in (3, 11)]
+    assert scan.held == (len(kept), len(kept) + 1)
+    for k, view in enumerate([*kept, 3, 11]):
+        assert np.allclose(scan.read(k), P[view], atol=1e-6)
+    every = scans.open_scan(write(tmp_path / "all.pickle", P, GEOMETRY, test=tuple(range(len(P))), both=True), "auto")
+    assert every.held == () and every.geometry.n_views == len(P)  # nothing else to reconstruct from

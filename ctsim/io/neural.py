@@ -1,7 +1,7 @@
 """Scans in the layouts of R2-Gaussian (meta_data.json and .npy files) and NAF (a pickle): line integrals of TIGRE.
 
-Rows are flipped against TIGRE's and ours. Views for testing are held out. Lengths are taken as mm, whatever the unit of
-the scene: the volume is then in the inverse of that unit.
+Rows are flipped against TIGRE's and ours. Views for testing are held out. Lengths are taken as mm, in any unit of the
+scene: the volume is then in the inverse of that unit.
 """
 
 from collections.abc import Callable
@@ -22,6 +22,7 @@ from ctsim.io.scanfile import TEXT, ScanFile, Stated
 
 NAME = "meta_data.json"
 NOTE = "lengths are those of the scene, taken as mm"
+SAME = 1e-6  # half of the angle (radians) below which two views are one
 Views = list[tuple[float, Callable[[], NDArray[Any]]]]
 
 
@@ -95,6 +96,7 @@ def _stack(path: Path, part: dict[str, Any]) -> tuple[NDArray[np.float64], NDArr
 
 
 def _scan(path: Path, scanner: dict[str, Any], train: Views, test: Views, shape: tuple[int, int]) -> ScanFile:
+    train, test = _apart(train, test)
     views = [*train, *test]
     angles = np.degrees([a for a, _ in views])
     if not train or len(views) > MOST_VIEWS or not np.isfinite(angles).all():
@@ -131,6 +133,16 @@ def _scan(path: Path, scanner: dict[str, Any], train: Views, test: Views, shape:
         held=tuple(range(len(train), len(views))),
         notes=(NOTE,),
     )
+
+
+def _apart(train: Views, test: Views) -> tuple[Views, Views]:
+    """Return the views to reconstruct from without those at the angle of a test view, and the test views.
+
+    A view that is in both is held out from no method. Where nothing else is left, there are no test views.
+    """
+    held = np.array([a for a, _ in test])
+    kept = [(a, read) for a, read in train if not np.any(np.abs(np.sin((held - a) / 2)) < SAME)]
+    return (kept, test) if kept else (train, [])
 
 
 def _sizes(path: Path, scanner: dict[str, Any], what: str, counts: tuple[int, ...]) -> tuple[float, ...]:
