@@ -81,7 +81,7 @@ def skyscan(folder: Path, counts, geometry: Geometry, *, prefix="rods", **change
 
 
 def shifts(log: Path, table) -> None:
-    """Write how far each image moved, [view, (right, down)] in pixels, beside a log."""
+    """Write how far each image moved, [view, (right, down)] in pixels, next to a log."""
     with (log.parent / f"{log.stem}_TS.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["image", "x shift", "y shift"])

@@ -202,7 +202,7 @@ def test_no_open_column_is_said(tmp_path):
     true = msgspec.structs.replace(GEOMETRY, d_detector=(0.6, 0.6))
     p = line_integrals(true, (((0, 0, 0), (40, 40, 40), 0.02), ((0, 0, 0), (4, 4, 4), -0.02)))
     stored = brought(tmp_path, scan_files.skyscan(tmp_path / "scan", counts_of(p), true))
-    assert "no column beside the object is open" in " ".join(stored.info.notes)
+    assert "no column next to the object is open" in " ".join(stored.info.notes)
 
 
 def test_the_same_import_does_nothing_and_views_are_held_out(tmp_path, capsys):

@@ -13,7 +13,10 @@ from ctsim.benchmarks.scores.score import NEED_TRUTH, NO_REFERENCE
 from ctsim.benchmarks.scores.unreferenced import HeldViews, Unreferenced, consistency
 from ctsim.benchmarks.studies.methods import records
 from ctsim.benchmarks.studies.methods.study import main
+from ctsim.benchmarks.submit import Flags as Submitted
+from ctsim.benchmarks.submit.work import submit
 from ctsim.dataset.store import open_scan
+from ctsim.errors import InputError
 from ctsim.reconstruct.fdk import reconstruct as fdk
 
 TRUE = msgspec.structs.replace(GEOMETRY, n_views=96, off_detector=(0.0, 0.0))
@@ -44,6 +47,14 @@ def test_a_run_and_its_table(data, tmp_path, capsys):
         assert f"## {protocol}" not in page.splitlines()
     assert "measured, without truth" in screen and "nmar[mask=auto]" in screen
     assert (results / "panels/rods.png").stat().st_size > 10_000
+
+
+def test_a_volume_made_elsewhere_has_no_truth_to_be_scored_with(data, tmp_path):
+    volume = tmp_path / "mine.npy"
+    np.save(volume, np.zeros(open_scan(data / "rods").geometry.n_voxel, np.float32))
+    with pytest.raises(InputError, match="--scene 'rods': is a measured scan, it has no truth"):
+        submit(Submitted(data=data, results=tmp_path / "results", volume=volume, scene="rods", name="mine"))
+    assert not (tmp_path / "results").exists()
 
 
 def test_scores_see_what_they_are_for(data):

@@ -45,7 +45,7 @@ class Flags:
     """Sheets in front of the tube, such as "Al 0.5mm" or "Cu 0.1mm + Al 1mm", or none; if the format does not state
     them."""
     i0: float | None = None
-    """Photons per open pixel and view (default: by the noise beside the object, else 1e5)."""
+    """Photons per open pixel and view (default: by the noise next to the object, else 1e5)."""
     hold: int | None = None
     """Views kept from the methods, for scores (default: one of 40, at most 12)."""
     force: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False

@@ -50,6 +50,8 @@ def submit(given: Flags) -> list[RunRecord]:
     """
     _check(given)
     place, stored = _scan(given)
+    if not stored.has_truth:
+        raise InputError(f"--scene {given.scene!r}: is a measured scan, it has no truth to score a volume with")
     paths = {METAL: given.volume} | ({} if given.twin is None else {TWIN: given.twin})
     if given.twin is not None and stored.metal_free is None:
         raise InputError(f"--twin: the scan {stored.name!r} has no metal-free twin")

@@ -1,4 +1,4 @@
-"""The open field of a scan that comes without one: the level of the columns beside the object, and its noise."""
+"""The open field of a scan that comes without one: the level of the columns next to the object, and its noise."""
 
 import math
 from collections.abc import Callable
@@ -45,7 +45,7 @@ def open_field(read: Callable[[int], NDArray[Any]], n_views: int, dark: float, l
     if level is None:
         level = float(np.median(levels[is_open])) if is_open.any() else brightest
     if not is_open.any():
-        note = "no column beside the object is open in every row: the open field is the brightest percentile"
+        note = "no column next to the object is open in every row: the open field is the brightest percentile"
     noise = [
         _MAD * float(np.median(np.abs(pair[1][side] - pair[0][side]))) / math.sqrt(2)
         for (pair, _), sides in zip(strips, is_open, strict=True)

@@ -26,7 +26,7 @@ class ScanFile:
     """What the headers of a scan say; `read` decodes a view [v, u], row 0 at the bottom.
 
     `geometry` has a grid that fits the field of view. Views are readings above a pedestal `dark`, to be compared with
-    the open field `flat` [v, u]; without one the air beside the object is measured. With `integrals` views are −ln of
+    the open field `flat` [v, u]; without one the air next to the object is measured. With `integrals` views are −ln of
     transmissions. `axis_known` says that the file states where the axis is; `filters` is None where they are unknown.
     `held` numbers the views that the format sets apart for testing.
     """

@@ -1,4 +1,4 @@
-"""Scans of Bruker SkyScan: a .log file beside 16-bit TIFF images, and a table of shifts (_TS.csv) where there is one.
+"""Scans of Bruker SkyScan: a .log file next to 16-bit TIFF images, and a table of shifts (_TS.csv) where there is one.
 
 Images are stored from the top row on, and the line of the optical axis is counted in the same way. Rotation Direction =
 CC turns the object counter-clockwise as seen from above, so the source turns clockwise about it. Image Rotation is the
@@ -36,7 +36,7 @@ def open_scan(path: Path, stated: Stated) -> ScanFile:
     declared = whole(log, found, "number of files", most=MOST_VIEWS)
     images = _images(log, found)
     if len(images) < declared:
-        raise InputError(f"{log} declares {declared} images, there are {len(images)} of its prefix beside it")
+        raise InputError(f"{log} declares {declared} images, there are {len(images)} of its prefix next to it")
     geometry = _geometry(log, found, (n_v, n_u), len(images), stated)
     angle = number(log, found, "image rotation", default=0.0)
     shifts = _shifts(log, len(images))
@@ -94,11 +94,11 @@ def _images(log: Path, found: Fields) -> list[Path]:
     named = (found.get("filename prefix", ""), log.stem)
     images = next((by_prefix[n.casefold()] for n in named if n.casefold() in by_prefix), None)
     if images is None:
-        raise InputError(f"{log} has no images beside it that are named {quoted(named[0])} and a number, .tif")
+        raise InputError(f"{log} has no images next to it that are named {quoted(named[0])} and a number, .tif")
     first = min(images)
     missing = next((k for k in range(first, first + len(images)) if k not in images), None)
     if missing is not None:
-        raise InputError(f"{log} lacks image {missing} of those that are beside it")
+        raise InputError(f"{log} lacks image {missing} of those that are next to it")
     return [images[k] for k in sorted(images)]
 
 
@@ -137,7 +137,7 @@ def _geometry(log: Path, found: Fields, n_detector: tuple[int, int], n_views: in
 
 
 def _shifts(log: Path, n_views: int) -> NDArray[np.float64] | None:
-    """Return how far each image moved, [view, (right, down)] in pixels, by the table beside the log; None without.
+    """Return how far each image moved, [view, (right, down)] in pixels, by the table next to the log; None without.
 
     Its first line names the columns; those that contain "x" and "y" count.
     """

@@ -31,9 +31,9 @@ def open_scan(path: Path, stated: Stated) -> ScanFile:
     poses = _poses(header)
     images, opens, darks = (_listed(header, prefix) for prefix in ("scan_", "io", "di"))
     if len(images) != len(poses):
-        raise InputError(f"{header} has {len(poses)} lines, there are {len(images)} images scan_*.tif beside it")
+        raise InputError(f"{header} has {len(poses)} lines, there are {len(images)} images scan_*.tif next to it")
     if not opens:
-        raise InputError(f"{header} has no open image io*.tif beside it")
+        raise InputError(f"{header} has no open image io*.tif next to it")
     columns, rows = stored = image_shape(images[0])
     dark = _mean(darks, stored) if darks else np.zeros((rows, columns))
     circle = as_circle(poses, (rows, columns))
