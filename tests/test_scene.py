@@ -96,7 +96,7 @@ def test_headline_scenes_mix_metals_and_coincide_with_no_grid() -> None:
     metals = {
         "thorax-Fe": {"Fe"},
         "hip-CoCr-Ti": {"CoCr", "Ti"},
-        "spine-Ti-CoCr": {"Ti", "CoCr"},
+        "spine-mixed": {"Ti", "CoCr", "W"},
         "jaw-mixed": {"Ti", "amalgam", "Au", "CoCr"},
         "rods-Al-thick": {"Al6061"},
     }
