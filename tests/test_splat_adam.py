@@ -25,7 +25,7 @@ KEY = rng.stream_key("test", "split", 0)
 def test_what_is_learned_stands_for_the_splats_and_within_the_bounds():
     given = splats(50, "ellipsoids", low=0.05, high=8.0)
     back = ACTIVATION.splats(ACTIVATION.parameters(given))
-    assert ACTIVATION.unit == 12 and ACTIVATION.bounds == (0.012, 12)
+    assert adam.unit_length(SMALL) == 12 and ACTIVATION.bounds == (0.012, 12)
     for name in ("positions", "scales", "rotations", "densities"):
         # float32 parameters of up to 10 are rounded to 5e-7, and so is the logarithm of what they stand for
         np.testing.assert_allclose(getattr(back, name), getattr(given, name), rtol=2e-6)
@@ -56,7 +56,7 @@ def test_gradients_pass_through_the_activation():
         wide[name] = wide[name] + h
         low, high = ACTIVATION.bounds
         scales = low + (high - low) / (1 + np.exp(-wide["scales"]))
-        return np.log(scales) * direction if name == "scales" else np.logaddexp(0, wide["densities"]) / 12 * two
+        return np.log(scales) * direction if name == "scales" else np.logaddexp(0, wide["densities"]) * two
 
     for name in ("scales", "densities"):
         numeric = (value(name, 1e-4) - value(name, -1e-4)) / 2e-4
@@ -222,7 +222,7 @@ def test_a_few_steps_bring_splats_to_what_was_seen():
     images = projector.forward(true.shapes(), true.densities[:, :1].copy())[:, 0]
     parameters = ACTIVATION.parameters(dataclasses.replace(start, densities=start.densities[:, :1].copy()))
     moments, losses = adam.no_moments(parameters), []
-    unit, rates = ACTIVATION.unit, {"positions": 0.02, "scales": 0.03, "rotations": 0.02, "densities": 0.05}
+    unit, rates = adam.unit_length(SMALL), {"positions": 0.02, "scales": 0.03, "rotations": 0.02, "densities": 0.05}
     for k in range(90):
         given, view = ACTIVATION.splats(parameters), k % 6
         there = projector.forward(given.shapes(), given.densities, [view])[0, 0]

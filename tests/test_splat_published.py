@@ -16,6 +16,7 @@ from ctsim.reconstruct.beam import detected
 from ctsim.reconstruct.settings import parameters_of
 from ctsim.reconstruct.splat import adam, densify
 from ctsim.reconstruct.splat.learner import LEAST_VALUE, Learner, seed_splats
+from ctsim.reconstruct.splat.loss import l1_ssim
 from ctsim.reconstruct.splat.objective import Objective
 from ctsim.reconstruct.splat.published import fit_published, paper, r2, read_out
 from ctsim.reconstruct.splat.published_settings import Baseline, Settings
@@ -326,6 +327,32 @@ def test_tv_pulls_at_densities_as_its_finite_difference_says():
     by_tv = by_tv - plain(parameters, response, 0, 7).parameters["densities"]
     assert tv(0) > 0.1
     assert by_tv.sum() == pytest.approx((tv(step) - tv(-step)) / (2 * step), rel=0.01)
+
+
+def test_a_step_is_that_of_the_scene_scaled_to_its_unit_cube():
+    """R2-Gaussian divides lengths and P by half the widest side, so densities, losses and steps are the same there."""
+    settings, unit = msgspec.structs.replace(R2, tv_share=5.0), 16.0
+    small = msgspec.structs.replace(
+        GEOMETRY,
+        **{name: getattr(GEOMETRY, name) / unit for name in ("dso", "dsd")},
+        **{name: tuple(x / unit for x in getattr(GEOMETRY, name)) for name in ("d_voxel", "d_detector")},
+    )
+    scan = sphere()
+    here, parameters, response = problem(scan, settings)
+    assert here.unit == unit and adam.unit_length(small) == 1
+    scaled = dataclasses.replace(scan, geometry=small, counts=scan.i0 * (scan.counts / scan.i0) ** (1 / unit))
+    there = Objective.of(scaled, settings)
+    moved = {**parameters, "positions": parameters["positions"] / np.float32(unit)}
+    a, b = here(parameters, response, 3, 0), there(moved, response, 3, 0)
+    values = there.paths(there.activation.splats(moved), 3)[0]
+    published = l1_ssim(np.where(there.valid[3], values[:, :40], np.float32(0)), there.p[3], 1.0)[0]
+    plain = dataclasses.replace(there, settings=msgspec.structs.replace(settings, tv_share=0.0))
+    assert plain(moved, response, 3, 0).loss == published < b.loss
+    pairs = [(a.parameters[name], b.parameters[name]) for name in ("scales", "densities")]
+    pairs += [(a.parameters["positions"] * unit, b.parameters["positions"]), (a.centres, b.centres)]
+    assert a.loss == pytest.approx(b.loss, rel=1e-5)  # P of float32 counts, to 1e-6
+    for one, other in pairs:
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-3 * np.abs(other).max())
 
 
 def test_splats_are_seeded_as_published():

@@ -1,7 +1,7 @@
 """What the published splat methods learn and how: bounded parameters and Adam (R²-Gaussian, Zha et al. 2024).
 
-A unit is half the volume's widest side, so that the volume is [−1, 1]³; rates and thresholds were published for that.
-Positions stay mm, and P stays P: densities are learned per unit and divided by its length.
+A unit is half the volume's widest side, in which the published rates and thresholds take the volume to be [−1, 1]³.
+There lengths and P are both divided by the unit, so a density keeps its value in 1/mm: it is learned in 1/mm here.
 """
 
 import dataclasses
@@ -30,12 +30,11 @@ SCALES = (0.0005, 0.5)  # shares of the volume's widest side, R2-Gaussian's boun
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Activation:
-    """Turns what is learned into splats: ρ = softplus(x)/unit, s = low + (high − low)·sigmoid(x), and q as it is.
+    """Turns what is learned into splats: ρ = softplus(x) in 1/mm, s = low + (high − low)·sigmoid(x), and q as it is.
 
-    `unit` is mm a unit; `bounds` are the least and the greatest scale in mm.
+    `bounds` are the least and the greatest scale in mm.
     """
 
-    unit: float
     bounds: tuple[float, float]
 
     def splats(self, parameters: Parameters) -> Splats:
@@ -57,7 +56,7 @@ class Activation:
             raise InputError(f"densities must be positive to be a softplus, got {splats.densities.min()}")
         low, high = self.bounds
         share = np.clip((splats.scales.astype(np.float64) - low) / (high - low), 1e-4, 1 - 1e-4)
-        density = splats.densities.astype(np.float64) * self.unit
+        density = splats.densities.astype(np.float64)
         return {
             "positions": splats.positions,
             "scales": np.log(share / (1 - share)).astype(np.float32),
@@ -79,10 +78,10 @@ class Activation:
             "densities": densities,
         }
 
-    def _numbers(self) -> tuple[np.float32, np.float32, np.float32]:
-        """Return the least scale, the range of scales, and 1/unit."""
+    def _numbers(self) -> tuple[np.float32, np.float32]:
+        """Return the least scale and the range of scales."""
         low, high = self.bounds
-        return np.float32(low), np.float32(high - low), np.float32(1 / self.unit)
+        return np.float32(low), np.float32(high - low)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,7 +101,7 @@ def unit_length(geometry: Geometry) -> float:
 def activation(geometry: Geometry) -> Activation:
     """Return R2-Gaussian's activations in the volume of `geometry`."""
     side = max(geometry.s_voxel)
-    return Activation(unit=unit_length(geometry), bounds=(SCALES[0] * side, SCALES[1] * side))
+    return Activation(bounds=(SCALES[0] * side, SCALES[1] * side))
 
 
 def no_moments(parameters: Parameters) -> Moments:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ctsim import rng
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.reconstruct.splat.adam import Array, Moments, unit_length
+from ctsim.reconstruct.splat.adam import Array, Moments
 from ctsim.reconstruct.splat.kernels.rotations_cpu import write_rotations
 from ctsim.reconstruct.splat.model import Splats
 
@@ -18,7 +18,7 @@ Threshold = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
 
 
 class Schedule(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """When and where to densify; `large` is a share of the volume's widest side, `faint` per unit (see `adam`)."""
+    """When and where to densify; `large` is a share of the volume's widest side, `faint` is in 1/mm."""
 
     first: Step = 500
     last: Step = 15000
@@ -67,7 +67,7 @@ def densify(
         scales[tail] /= np.float32(1.6)
     origin = np.concatenate([stay, np.full(len(order) - len(stay), -1)])
     grown = Splats(positions=positions, scales=scales, densities=densities[order], rotations=splats.rotations[order])
-    return _pruned(grown, origin, geometry, schedule.faint / unit_length(geometry))
+    return _pruned(grown, origin, geometry, schedule.faint)
 
 
 def _pruned(

@@ -1,8 +1,7 @@
 """The course of the published splat methods: seeds, steps of Adam, densification, and all of it as arrays.
 
-Where the publications leave it open: views come in a new random order each pass. 0.005, above which voxels are seeds,
-is taken as 1/mm, a fifth of water: the published figures are in 1/mm, and per unit it would be below an FDK volume's
-noise, so that most splats would lie in air.
+Where the publications leave it open: views come in a new random order each pass. Densities are in 1/mm, as published:
+0.005, above which voxels are seeds, is a fifth of water.
 """
 
 import dataclasses
@@ -26,7 +25,7 @@ from ctsim.reconstruct.splat.response import Response
 
 LEAST_VALUE = 0.005  # 1/mm, of a voxel that may be a seed
 NEIGHBOURS = 3  # whose distance is a splat's first scale
-LEAST_DENSITY = 1e-10  # per unit, to which densities are raised when learning starts again
+LEAST_DENSITY = 1e-10  # 1/mm, to which densities are raised when learning starts again
 RESPONSE_RATE = 1e-3
 
 
@@ -102,7 +101,7 @@ class Learner:
 
     def _rates(self) -> dict[str, float | Array]:
         densities = np.array([RATES[c] for c in self.settings.channels], np.float32)
-        scaled = adam.RATES["positions"] * self.objective.activation.unit
+        scaled = adam.RATES["positions"] * self.objective.unit
         return {**adam.RATES, "positions": scaled, "densities": densities}
 
     def _learn_response(self, gradient: NDArray[np.float64], done: int) -> None:
@@ -123,7 +122,7 @@ class Learner:
         splats, origin = densify.densify(self.splats(), pull, geometry, self._schedule, key)
         splats, order = sorted_by_z(splats)
         # a density that underflowed is no softplus; one channel may be 0 where the other is not
-        densities = np.maximum(splats.densities, np.float32(LEAST_DENSITY / activation.unit))
+        densities = np.maximum(splats.densities, np.float32(LEAST_DENSITY))
         splats = dataclasses.replace(splats, densities=densities)
         self._take(activation.parameters(splats))
         self._moments = densify.carried(self._moments, origin[order])

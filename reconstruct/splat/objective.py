@@ -1,7 +1,8 @@
 """The loss of one view that the published splat methods go down, and its gradient.
 
-Where the publications leave it open: clamped pixels are 0 in both images that a loss compares; SSIM's range is the
-scan's greatest P; TV pulls at densities only, not at places and shapes.
+The images that it compares are P over `unit`, half the volume's widest side in mm: the P of R2-Gaussian's scenes of
+[−1, 1]³, which its weight and range of SSIM (1) and its threshold of densification are for. Where the publications
+leave it open: clamped pixels are 0 in both images, and TV pulls at densities only, not at places and shapes.
 """
 
 import dataclasses
@@ -23,6 +24,8 @@ from ctsim.reconstruct.splat.response import Response
 from ctsim.reconstruct.splat.volume import voxelise, voxelise_adjoint
 from ctsim.types import Scan
 
+SSIM_RANGE = 1.0  # of P over the unit
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Terms:
@@ -36,7 +39,10 @@ class Terms:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Objective:
-    """The loss of one view: line integrals `p`, 0 where they do not count, and which do, `valid`, [view, v, u]."""
+    """The loss of one view: line integrals `p`, 0 where they do not count, and which do, `valid`, [view, v, u].
+
+    `unit` is half the volume's widest side in mm, `data_range` the greatest P.
+    """
 
     settings: Settings
     projector: Projector
@@ -44,6 +50,7 @@ class Objective:
     p: NDArray[np.float32]
     valid: NDArray[np.bool_]
     data_range: float
+    unit: float
 
     @classmethod
     def of(cls, scan: Scan, settings: Settings) -> "Objective":
@@ -58,6 +65,7 @@ class Objective:
             p=counted,
             valid=valid,
             data_range=max(float(counted.max(initial=0.0)), 1e-6),
+            unit=adam.unit_length(scan.geometry),
         )
 
     def __call__(self, parameters: Mapping[str, Array], response: Response, view: int, step: int) -> Terms:
@@ -66,9 +74,10 @@ class Objective:
         paths = self.paths(splats, view)
         p, slopes = self.line_integrals(paths, response)
         valid, n_u = self.valid[view], self.p.shape[2]
-        value, by_p = l1_ssim(np.where(valid, p[:, :n_u], np.float32(0)), self.p[view], self.data_range)
+        share = np.float32(1 / self.unit)
+        value, by_p = l1_ssim(np.where(valid, p[:, :n_u] * share, np.float32(0)), self.p[view] * share, SSIM_RANGE)
         pull = np.zeros_like(p)
-        pull[:, :n_u] = by_p * valid
+        pull[:, :n_u] = by_p * valid * share
         by_theta = np.zeros(0)
         if self.settings.learns and response.trainable:
             by_theta = responses.theta_gradient(response, *self._both(paths), pull)
@@ -109,11 +118,11 @@ class Objective:
         return (np.zeros_like(paths[0]), paths[0]) if len(paths) == 1 else (paths[0], paths[1])
 
     def _tv(self, splats: Splats, step: int) -> tuple[float, Array]:
-        """Return TV of a brick of the volume per unit, and the settings' share of its gradient by densities (1/mm)."""
+        """Return TV of a brick of the volume in 1/mm, and the settings' share of its gradient by densities."""
         part = brick(self.projector.geometry, stream(self.settings), step)
         volume = voxelise(splats, part, splats.densities.sum(1, keepdims=True), mean=False)[0]
-        tv, by_volume = total_variation(volume * np.float32(self.activation.unit))
-        scaled = (by_volume * (self.settings.tv_share * self.activation.unit)).astype(np.float32)
+        tv, by_volume = total_variation(volume)
+        scaled = (by_volume * self.settings.tv_share).astype(np.float32)
         return tv, voxelise_adjoint(splats, part, scaled[None], mean=False)
 
 

@@ -4,8 +4,8 @@ The successor, `splat-paper`, learns two densities a splat, ρ(Ē) = ρa + ρb·
 baseline, `splat-r2`, one density, no response, and adds 0.05 TV of a brick. The steps between, as the successor's
 ablation has them, are a change of `basis` and `response`: see `docs/explanation/splats.md`.
 
-R2-Gaussian scales scenes to [−1, 1]³. Here lengths stay mm and P stays P, which is not homogeneous once it is
-polychromatic, so densities are learned per unit, half the volume's widest side.
+R2-Gaussian scales scenes to [−1, 1]³ and P with them, so that densities keep their value in 1/mm. Here lengths stay mm,
+for a polychromatic P does not scale with them; the loss divides it by half the volume's widest side.
 """
 
 import math

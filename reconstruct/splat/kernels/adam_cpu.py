@@ -35,15 +35,15 @@ def step(values, gradient, first, second, rates, corrections):
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def activate(scales, densities, numbers, out_scales, out_densities):
-    """Fill scales [splat, 3] by low + span·sigmoid(x) and densities [splat, channel] by softplus(x)/unit."""
-    low, span, per_unit = numbers
+    """Fill scales [splat, 3] by low + span·sigmoid(x) and densities [splat, channel] by softplus(x)."""
+    low, span = numbers
     for i in prange(scales.shape[0]):
         for k in range(scales.shape[1]):
             out_scales[i, k] = low + span / (ONE + math.exp(-scales[i, k]))
         for c in range(densities.shape[1]):
             x = densities[i, c]
             # log(1 + eˣ) without overflow
-            out_densities[i, c] = (max(x, np.float32(0)) + math.log1p(math.exp(-abs(x)))) * per_unit
+            out_densities[i, c] = max(x, np.float32(0)) + math.log1p(math.exp(-abs(x)))
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
@@ -53,10 +53,10 @@ def through(given, numbers, out_scales, out_densities):
     `given` are the scales, the densities before activation, and the gradients by log scales and by densities.
     """
     scales, densities, by_log_scales, by_densities = given
-    low, span, per_unit = numbers
+    low, span = numbers
     for i in prange(scales.shape[0]):
         for k in range(scales.shape[1]):
             share = (scales[i, k] - low) / span
             out_scales[i, k] = by_log_scales[i, k] * share * (ONE - share) * span / scales[i, k]  # d log s/dx
         for c in range(densities.shape[1]):
-            out_densities[i, c] = by_densities[i, c] / (ONE + math.exp(-densities[i, c])) * per_unit
+            out_densities[i, c] = by_densities[i, c] / (ONE + math.exp(-densities[i, c]))
