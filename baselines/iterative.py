@@ -13,15 +13,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ctsim.baselines.beyond import seen_beyond
 from ctsim.baselines.kernels.dot_cpu import dot_by_row
 from ctsim.baselines.metal import Trace, auto_mask
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.reconstruct.beyond import field_radius, seen_beyond
 from ctsim.reconstruct.fdk import ramp
 from ctsim.reconstruct.log import NO_SIGNAL, is_blind, line_integrals
 from ctsim.reconstruct.projector import Views, adjoint_columns, forward_columns
-from ctsim.reconstruct.redundancy import ray_weights
 from ctsim.reconstruct.settings import about
 from ctsim.reconstruct.watch import Stopwatch
 from ctsim.reconstruct.watch import watch as watch
@@ -73,7 +72,7 @@ class System:
         self.support &= self.adjoint(np.ones_like(self.data)) > 0
         self.scale = weighted_norm(self.data, self.weights) or 1.0
         self.lengths = self.forward(self.support.astype(np.float32))
-        self.beyond = seen_beyond(self.data, self.lengths, self.geometry, scan.i0, _radius(self.geometry))
+        self.beyond = seen_beyond(self.data, self.geometry, scan.i0, self.lengths)
 
     def empty(self) -> Array:
         """Return the volume that all methods start from."""
@@ -201,8 +200,4 @@ def _weights(given: Weights, scan: Scan, data: Array) -> tuple[Array, dict[str, 
 def _within_field_of_view(geometry: Geometry) -> NDArray[np.bool_]:
     """Mark the voxel columns [y, x] that FDK reconstructs as well; with poses given, all of them."""
     _, y, x = geometry.voxel_centres()
-    return np.add.outer(y**2, x**2) <= _radius(geometry) ** 2
-
-
-def _radius(geometry: Geometry) -> float:
-    return math.inf if geometry.poses is not None else ray_weights(geometry).radius
+    return np.add.outer(y**2, x**2) <= field_radius(geometry) ** 2

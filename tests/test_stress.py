@@ -27,7 +27,7 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.reconstruct import log
 from ctsim.reconstruct.log import line_integrals
-from ctsim.reconstruct.splat import course, level, ordered
+from ctsim.reconstruct.splat import course, level, ordered, starved
 from ctsim.reconstruct.splat.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.learner import seed_splats
 from ctsim.reconstruct.splat.loss import l1_ssim
@@ -234,8 +234,9 @@ def test_dead_pixels_are_left_out_by_weight_0(monkeypatch):
     """A pixel that never sees anything has P = 0, as an open one: counted in, it carves the object away."""
     given = scan_of(noise=Noise(dead_fraction=0.02))
     masked = error(given)
-    weighed = level.weighted
+    weighed, told = level.weighted, starved.weights_and_bounds
     everywhere(monkeypatch, "weighted", lambda g, p, valid, *s: weighed(g, p, np.ones_like(valid), *s))
+    everywhere(monkeypatch, "weights_and_bounds", lambda scan, p, valid, *s: told(scan, p, np.ones_like(valid), *s))
     # 0.14 and 0.45: what is carved away scores as an empty volume does
     assert masked < 0.2 < 2 * masked < error(given)
 
@@ -250,6 +251,7 @@ def test_starved_rays_count_for_little(monkeypatch):
         return dataclasses.replace(weighed(g, p, valid, *scatter), weights=valid.astype(np.float32))
 
     everywhere(monkeypatch, "weighted", unweighted)
+    everywhere(monkeypatch, "weights_and_bounds", lambda scan, p, valid, *s: valid.astype(np.float32))
     assert 1.4 * weighted < error(given)  # 0.16 and 0.29
 
 

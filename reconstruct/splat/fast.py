@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry, few_views
 from ctsim.reconstruct.beam import detected, refuse_beam
+from ctsim.reconstruct.beyond import seen_beyond
 from ctsim.reconstruct.log import finite_or_not, how_it_ended, line_integrals
 from ctsim.reconstruct.scatter import open_excess
 from ctsim.reconstruct.settings import about, keywords
@@ -25,9 +26,10 @@ from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
 from ctsim.reconstruct.splat.common import Common, Energy
 from ctsim.reconstruct.splat.course import PASSES, Course, levels_of, passes_over
 from ctsim.reconstruct.splat.curve import STRONGEST, MaterialCurve
-from ctsim.reconstruct.splat.level import Data, weighted
+from ctsim.reconstruct.splat.level import Data
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import FILTER, Response, basis_functions, evaluate, make_response, tangent
+from ctsim.reconstruct.splat.starved import Below, weights_and_bounds
 from ctsim.reconstruct.splat.volume import voxelise
 from ctsim.reconstruct.watch import Stopwatch
 from ctsim.types import Scan, Status, Volume
@@ -36,8 +38,12 @@ OPEN = 5.0  # standard deviations of an open pixel below which a ray met nothing
 LEAST_OPEN = 0.01
 VIEWS, SHORTEST = 12, 0.5  # views whose pixels stand for all, and the least path in voxels that counts as one
 DENSEST = 15.0  # times water, that is no metal: enamel 9, titanium 43
-AT_THE_END, FEW, FEWEST = 0.9, 1e-4, 10
-"""Share of the curve's last attenuation, which no metal has; the share of the splats, or how many, that may have it."""
+AT_THE_END, FEW, FEWEST, MANY = 0.9, 1e-4, 10, 0.01
+"""Share of the curve's last attenuation, which no metal has; the share of the splats, or how many, that may have it;
+and the share with which a fit has diverged."""
+DARK, UNEXPLAINED, DARK_SHARE = 3.0, 0.6, 1e-4
+"""P above which a reading is dark; the root mean square that a fit misses dark readings by at most where metal is
+right (0.1 to 0.4 on scenes of teeth, thorax and hip, 1.0 to 3.6 where it is hollow or smeared); their least share."""
 Image = NDArray[np.float32]
 
 
@@ -92,7 +98,9 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     valid = ~clamped.numpy()
     scatter = open_excess(p.numpy(), valid) if settings.scatter is None else settings.scatter
     finest = finer(scan.geometry, settings.fineness)
-    data = weighted(finest, p.numpy(), valid, scatter)
+    below = Below.of(scan)
+    weights = weights_and_bounds(scan, p.numpy(), valid, scatter, below.noise)
+    data = Data(geometry=finest, p=p.numpy(), weights=weights, scatter=scatter)
     response = settings.make_response(scan.e_max)
 
     fit = None if clamped.all() else _fitted(_course(data, response, settings), scan, settings, stopwatch)
@@ -112,8 +120,14 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         return Volume(values=empty, status=status, reason=reason, details=details, at_energy=at_energy)
     values, rho, how = _read(fit, settings, scan.geometry)
     status, reason = _verdict(fit, values)
+    dark = fit.lacking(np.asarray(few_views(fit.data.geometry.n_views, VIEWS)), DARK)
+    missed = float(np.sqrt(np.mean(np.square(dark, dtype=np.float64)))) if dark.size else None
+    beyond = seen_beyond(data.p, scan.geometry, scan.i0)
+    limits = [said for said in (below.sentence, _unexplained(fit, dark, missed), beyond.sentence) if said]
     details |= {
         "read-out": how,
+        "dark_misfit": missed,
+        **({"limitation": "; ".join(limits)} if limits else {}),
         "misfit": fit.misfit if math.isfinite(fit.misfit) else None,
         "view_updates": fit.view_updates,
         "densities": {"rho_a": rho[0], "rho_b": rho[1]},
@@ -164,13 +178,32 @@ def _verdict(fit: Fit, values: Image) -> tuple[Status, str]:
     status, reason = finite_or_not(values)
     if status is not Status.OK:
         return status, reason
-    runaway = int((fit.u >= AT_THE_END * fit.curve.knots[-1]).sum())
-    if runaway <= max(FEW * len(fit.u), FEWEST):
+    runaway = _runaway(fit)
+    if runaway <= max(MANY * len(fit.u), FEWEST):
         return Status.OK, ""
     return Status.DIVERGED, (
         f"{runaway} of {len(fit.u)} splats went to {AT_THE_END * STRONGEST:g} times the attenuation of iron: "
         "readings are darker than any metal makes them; are the scan's dark and open field right?"
     )
+
+
+def _runaway(fit: Fit) -> int:
+    """Return how many splats stand where no metal does."""
+    return int((fit.u >= AT_THE_END * fit.curve.knots[-1]).sum())
+
+
+def _unexplained(fit: Fit, dark: Image, missed: float | None) -> str:
+    """Say where metal does not explain its shadow, if it does not; `dark` is what dark readings lack."""
+    views = few_views(fit.data.geometry.n_views, VIEWS)
+    readings = len(views) * math.prod(fit.data.geometry.n_detector)
+    if missed is not None and missed > UNEXPLAINED and dark.size > DARK_SHARE * readings:
+        return (
+            f"readings of P > {DARK:g} are missed by {missed:.2g} (root mean square): metal is thinner than the grid "
+            "or denser than its readings show, so its values, and tissue next to it, may be wrong"
+        )
+    if _runaway(fit) > max(FEW * len(fit.u), FEWEST):
+        return f"metal reaches {AT_THE_END * STRONGEST:g} times iron, where the assumed materials end"
+    return ""
 
 
 def finer(geometry: Geometry, fineness: float) -> Geometry:

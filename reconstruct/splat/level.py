@@ -10,11 +10,15 @@ from scipy import ndimage
 
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.splat.kernels import carve_cpu
+from ctsim.reconstruct.splat.starved import WEIGHT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Data:
-    """Line integrals `p` and their weights, float32 [view, v, u]; `scatter`, S/I0, is in p still."""
+    """Line integrals `p` and their weights, float32 [view, v, u]; `scatter`, S/I0, is in p still.
+
+    Where a weight is negative, p is the least that a dark reading allows, without scatter (see `starved`).
+    """
 
     geometry: Geometry
     p: NDArray[np.float32]
@@ -62,16 +66,21 @@ def coarser(data: Data) -> Data:
         angles_deg=None,
         poses=tuple(tuple(row) for row in poses.tolist()),
     )
-    p, seen = np.empty(geometry.shape, np.float32), np.empty(geometry.shape, np.bool_)
+    p = np.empty(geometry.shape, np.float32)
+    seen, bounds = (np.empty(geometry.shape, np.bool_) for _ in range(2))
     shape = (n_v, step[0], n_u, step[1])
     for k, view in enumerate(views):
         of_four, weights = (a[view, : n_v * step[0], : n_u * step[1]].reshape(shape) for a in (data.p, data.weights))
-        valid = weights > 0
-        n = valid.sum((1, 3))
-        mean = np.where(valid, np.exp(-of_four), 0).sum((1, 3)) / np.maximum(n, 1)
+        valid, dark = weights > 0, weights < 0
+        n = (valid | dark).sum((1, 3))
+        signal = np.exp(-of_four) + data.scatter * dark
+        mean = np.where(valid | dark, signal, 0).sum((1, 3)) / np.maximum(n, 1)
         seen[k] = n > 0
-        p[k] = -np.log(np.where(seen[k], mean, 1))
-    return weighted(geometry, p, seen, data.scatter)
+        bounds[k] = dark.any((1, 3)) & ~valid.any((1, 3))
+        p[k] = -np.log(np.where(seen[k], mean - data.scatter * bounds[k], 1))
+    coarse = weighted(geometry, p, seen, data.scatter)
+    coarse.weights[bounds] = -WEIGHT
+    return coarse
 
 
 def refined(values: NDArray[np.float32], fine: Geometry) -> NDArray[np.float32]:

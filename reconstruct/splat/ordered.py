@@ -134,15 +134,16 @@ class Fit:
 
         The curvature is that of all views in which it was measured: it changes little from subset to subset.
         """
-        values = self.curve.densities_of(self.u, self.lattice.unit, self._pair)
-        paths = self.projector.forward(values, views)
-        la, lb = (np.ascontiguousarray(paths[:, c]) for c in (0, 1))
+        la, lb = self._paths(views)
         p, by_a, by_b = evaluate(self.response, la, lb)
+        measured, weights = (self.projector.arranged(a[views]) for a in (self.data.p, self.data.weights))
+        dark = weights < 0
         if self.data.scatter:
             primary = np.exp(-p)
             seen = primary + np.float32(self.data.scatter)
-            p, by_a, by_b = -np.log(seen), by_a * (primary / seen), by_b * (primary / seen)
-        measured, weights = (self.projector.arranged(a[views]) for a in (self.data.p, self.data.weights))
+            left = np.where(dark, np.float32(1), primary / seen)
+            p, by_a, by_b = np.where(dark, p, -np.log(seen)), by_a * left, by_b * left
+        weights = np.abs(weights)
         slopes = np.stack([weights * by_a, weights * by_b], 1, dtype=np.float32)
         if measure:
             along = np.asarray(by_a * la + by_b * lb, np.float32)  # J·u: the majoriser's other half
@@ -150,11 +151,25 @@ class Fit:
             self._measured += len(views)
         lacking = measured - p
         lacking *= weights > 0
+        np.maximum(lacking, 0, out=lacking, where=dark)  # a bound is met by all that is darker
         gradient = self.curve.transpose(self.u, self._back(slopes, lacking, views), length, self._gradient)
         curvature = self.curve.transpose(self.u, self._curvature, len(views) / self._measured, self._roots)
         self._move(gradient, curvature, len(views))
         self.view_updates += len(views)
         return float(np.abs(lacking).sum(dtype=np.float64)) / (len(views) * math.prod(self.data.geometry.n_detector))
+
+    def _paths(self, views: NDArray[np.int64]) -> tuple[Image, Image]:
+        """Return La and Lb of some views."""
+        paths = self.projector.forward(self.curve.densities_of(self.u, self.lattice.unit, self._pair), views)
+        return np.ascontiguousarray(paths[:, 0]), np.ascontiguousarray(paths[:, 1])
+
+    def lacking(self, views: NDArray[np.int64], above: float) -> Image:
+        """Return measured p − P of those readings of some views, no bounds, whose p is more than `above`."""
+        p, _, _ = evaluate(self.response, *self._paths(views))
+        if self.data.scatter:
+            p = -np.logaddexp(-p, np.float32(math.log(self.data.scatter)))
+        measured, weights = (self.projector.arranged(a[views]) for a in (self.data.p, self.data.weights))
+        return (measured - p)[(weights > 0) & (measured > above)]
 
     def _back(self, slopes: Image, images: Image, views: NDArray[np.int64]) -> Image:
         return self.projector.adjoint(slopes * images[:, None], views, self._pair)

@@ -1,17 +1,22 @@
 """Whether the object goes on where the unknowns end: beyond the detector's edge or the reconstruction grid.
 
-Iterative methods explain all of a ray's attenuation within the grid and the field of view. What lies beyond is
-then put into voxels that do not hold it, and the residual need not show it.
+Iterative methods and splats explain all of a ray's attenuation within the grid and the field of view. What lies beyond
+is then put into voxels that do not hold it, and the residual need not show it.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.geometry import Geometry
+from ctsim.reconstruct.redundancy import ray_weights
 
-SIGMAS, LEAST = 5.0, 0.02  # a ray is attenuated above this many standard deviations of photon noise, and above this
+SIGMAS, LEAST = 5.0, 0.1
+"""A ray is attenuated above this many standard deviations of photon noise, and above this: a screen that has not glowed
+before leaves the first views up to 0.06 too dark."""
+NEARLY = 0.98  # of the farthest that is seen from the axis
 SHARE = 1e-3  # of a side's pixels; a tenth of that, of all rays, where they miss the grid
 
 
@@ -39,22 +44,38 @@ class Beyond:
 
 
 def seen_beyond(
-    data: NDArray[np.float32], lengths: NDArray[np.float32], geometry: Geometry, i0: float, radius: float
+    data: NDArray[np.float32], geometry: Geometry, i0: float, lengths: NDArray[np.float32] | None = None
 ) -> Beyond:
     """Count attenuated rays beyond the unknowns.
 
-    `data` are the line integrals [view, v, u], `lengths` those through the unknowns in mm, `radius` of the field of
-    view in mm. The first and last row count where rays leave the grid upwards or downwards at all.
+    `data` are the line integrals [view, v, u], `lengths` those through the unknowns in mm; without them no ray is said
+    to miss all. The first and last row count where rays leave the grid upwards or downwards at all, a column where
+    nothing farther out is seen from the other side, as it is beyond the short side of an offset detector.
     """
     lit = data > np.maximum(LEAST, SIGMAS * np.sqrt(np.exp(np.maximum(data, 0)) / np.float32(i0)))
-    missing = int((lit & (lengths == 0)).sum())
-    edges = {"first column": lit[:, :, 0], "last column": lit[:, :, -1]}
+    missing = 0 if lengths is None else int((lit & (lengths == 0)).sum())
+    radius = field_radius(geometry)
+    first, last = _reaches(geometry)
+    edges = {"first column": lit[:, :, 0]} if first >= NEARLY * min(radius, last) else {}
+    edges |= {"last column": lit[:, :, -1]} if last >= NEARLY * min(radius, first) else {}
     if _leaves_through_the_ends(geometry, radius):
         edges |= {"first row": lit[:, 0], "last row": lit[:, -1]}
     return Beyond(
         missing=missing if missing > 0.1 * SHARE * data.size else 0,
         sides={name: int(edge.sum()) for name, edge in edges.items() if edge.sum() > SHARE * edge.size},
     )
+
+
+def field_radius(geometry: Geometry) -> float:
+    """Return the radius in mm of the field of view, infinite where poses are given."""
+    return math.inf if geometry.poses is not None else ray_weights(geometry).radius
+
+
+def _reaches(geometry: Geometry) -> tuple[float, float]:
+    """Return how far from the axis (mm) the rays to the first and to the last column pass."""
+    half, off = geometry.n_detector[1] / 2 * geometry.d_detector[1], geometry.off_detector[1]
+    first, last = (abs(u) * geometry.dso / math.hypot(geometry.dsd, u) for u in (off - half, off + half))
+    return first, last
 
 
 def _leaves_through_the_ends(geometry: Geometry, radius: float) -> bool:

@@ -1,0 +1,144 @@
+"""Dark readings: what they still say to a fit of splats, and what a fit says of metal that it does not explain."""
+
+import dataclasses
+import math
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from ctsim import score_volume
+from ctsim.benchmarks.make_dataset import main as make_dataset
+from ctsim.dataset.store import list_scans, open_scan
+from ctsim.geometry import Geometry
+from ctsim.reconstruct.beyond import seen_beyond
+from ctsim.reconstruct.log import line_integrals
+from ctsim.reconstruct.splat import starved
+from ctsim.reconstruct.splat.fast import reconstruct
+from ctsim.reconstruct.splat.level import Data, coarser
+from ctsim.reconstruct.splat.starved import WEIGHT, Below, weights_and_bounds
+from ctsim.types import Scan
+
+GEOMETRY = Geometry(
+    dso=200.0,
+    dsd=300.0,
+    n_voxel=(16, 16, 16),
+    d_voxel=(1.0, 1.0, 1.0),
+    n_detector=(32, 40),
+    d_detector=(1.0, 1.0),
+    n_views=8,
+)
+I0, NOISE, DARK = 1e5, 6.0, 50.0
+
+
+def scan_of(p, noise=NOISE, seed=0, whole=False) -> Scan:
+    """Counts of one a photon behind `p`, with Gaussian noise of the readout and that of photons."""
+    draws = np.random.default_rng(seed)
+    counts = DARK + draws.poisson(I0 * np.exp(-np.broadcast_to(p, GEOMETRY.shape))) + draws.normal(0, noise, p.shape)
+    counts = torch.from_numpy(np.rint(counts).astype(np.int32)) if whole else torch.from_numpy(counts).float()
+    return Scan(geometry=GEOMETRY, counts=counts, flat=torch.full((32, 40), I0 + DARK), i0=I0, dark=DARK)
+
+
+def bounds_of(scan, scatter=0.0):
+    p, clamped = line_integrals(scan, slice(None))
+    weights = weights_and_bounds(scan, p.numpy(), ~clamped.numpy(), scatter, Below.of(scan).noise)
+    return p.numpy(), weights
+
+
+def test_a_dark_reading_bounds_its_ray_from_below_and_a_bright_one_is_read():
+    true = np.random.default_rng(1).choice([0.5, 3.0, 7.0, 9.0, 15.0], GEOMETRY.shape)
+    p, weights = bounds_of(scan_of(true))
+    starving = weights < 0
+    assert np.all(weights[starving] == np.float32(-WEIGHT))
+    assert not starving[true < 7].any() and starving[true == 15].mean() > 0.95  # 2 σ of one side
+    # a bound is wrong where noise takes 2 σ and more off a reading: 2.3 % of those near it, and 3 σ of 3000 readings
+    assert (p > true)[starving].mean() < 0.031 and p[starving].min() > math.log(I0 / (5 * NOISE))
+    read = line_integrals(scan_of(true), slice(None))[0].numpy()
+    assert np.array_equal(p[~starving], read[~starving])
+    np.testing.assert_allclose(weights[~starving], np.exp(-read[~starving]), rtol=1e-6)
+
+
+def test_scatter_takes_its_share_of_a_bound():
+    scan = scan_of(-np.log(np.exp(-np.full(GEOMETRY.shape, 15.0)) + 0.01), noise=0.0)
+    p, weights = bounds_of(scan, scatter=0.01)
+    assert (weights < 0).mean() > 0.99  # 1000 photons, 3 % of noise
+    np.testing.assert_allclose(p[weights < 0], -math.log(starved.DOUBT * 0.01), atol=0.5)
+    assert not (bounds_of(scan)[1] < 0).any()  # without it they are readings
+
+
+def test_what_is_dead_or_not_finite_says_nothing():
+    scan = scan_of(np.full(GEOMETRY.shape, 15.0))
+    scan.counts[0, 0, :5] = torch.tensor([math.nan, math.inf, -math.inf, math.nan, math.inf])
+    scan.flat[5, 5] = DARK
+    _, weights = bounds_of(scan)
+    assert not weights[0, 0, :4].any() and not weights[:, 5, 5].any() and (weights[1:, 6:] < 0).mean() > 0.9
+
+
+@pytest.mark.parametrize("whole", [False, True])
+@pytest.mark.parametrize("noise", [0.3, 3.0, 30.0])
+def test_noise_is_told_by_what_is_below_the_dark_level(noise, whole):
+    """Readings of half a count and less, rounded, tell none."""
+    below = Below.of(scan_of(np.full(GEOMETRY.shape, 15.0), noise, whole=whole))
+    expected = 0.0 if whole and noise < 1 else noise / I0
+    rounding = 0.5 / noise if whole else 0.0  # at most, of a reading
+    assert below.noise == pytest.approx(expected, rel=0.06 + rounding) and not below.sentence  # 0.03 photons a reading
+    assert Below.of(scan_of(np.full(GEOMETRY.shape, 2.0), noise)).noise == 0.0
+
+
+@pytest.mark.parametrize("true", [15.0, np.linspace(2, 15, math.prod(GEOMETRY.shape)).reshape(GEOMETRY.shape)])
+def test_a_dark_level_that_is_too_high_is_said(true):
+    scan = scan_of(np.broadcast_to(true, GEOMETRY.shape))
+    assert not Below.of(scan).sentence
+    assert "is the scan's dark level right?" in Below.of(dataclasses.replace(scan, dark=DARK + 5 * NOISE)).sentence
+
+
+def test_four_bounds_make_a_coarse_one_and_one_reading_among_them_a_reading():
+    p, weights = np.full(GEOMETRY.shape, 8.0, np.float32), np.full(GEOMETRY.shape, -WEIGHT, np.float32)
+    p[0, 2, 2], weights[0, 2, 2] = 1.0, math.exp(-1)
+    weights[0, 4:6, 4:6] = 0
+    coarse = coarser(Data(geometry=GEOMETRY, p=p, weights=weights, scatter=0.01))
+    assert coarse.weights[0, 0, 0] == np.float32(-WEIGHT) and coarse.p[0, 0, 0] == pytest.approx(8.0, rel=1e-5)
+    mixed = (math.exp(-1) + 3 * (math.exp(-8) + 0.01)) / 4
+    assert coarse.p[0, 1, 1] == pytest.approx(-math.log(mixed), rel=1e-5)
+    assert coarse.weights[0, 1, 1] == pytest.approx(mixed, rel=1e-5) and coarse.weights[0, 2, 2] == 0
+
+
+def test_an_offset_detector_is_not_short_where_the_other_side_sees():
+    lit = np.ones(GEOMETRY.shape, np.float32)
+    assert set(seen_beyond(lit, GEOMETRY, I0).sides) >= {"first column", "last column"}
+    shifted = msgspec.structs.replace(GEOMETRY, off_detector=(0.0, 8.0))
+    sides = seen_beyond(lit, shifted, I0).sides
+    assert "last column" in sides and "first column" not in sides
+
+
+SCENE = """
+
+name = "small"
+seed = 7
+phantom = { recipe = "random", metal = "METAL", n_inserts = 1, insert_mm = 14.0, n_voxel = [97, 97, 97] }
+scanner = { n_voxel = [56, 56, 56], n_detector = [98, 98], n_views = 80, i0 = 1e5 }
+"""
+
+
+def made(folder, metal):
+    (folder / "scene.toml").write_text(SCENE.replace("METAL", metal), encoding="utf-8")
+    assert make_dataset([str(folder / "scene.toml"), str(folder / "data")]) == 0
+    return open_scan(list_scans(folder / "data")[0])
+
+
+@pytest.mark.slow
+def test_dense_metal_is_not_hollow_and_is_said_to_be_uncertain(tmp_path, monkeypatch):
+    stored = made(tmp_path, "W")
+    with_bounds = reconstruct(stored.scan)
+    monkeypatch.setattr(starved, "WEIGHT", 1e-12)
+    without = reconstruct(stored.scan)
+    core = [score_volume(volume, stored)["metal"].values["core_ratio"] for volume in (with_bounds, without)]
+    assert core[0] > 2 * core[1]  # 0.54 and 0.18
+    assert "metal is thinner than the grid" in with_bounds.details["limitation"]
+
+
+@pytest.mark.slow
+def test_metal_that_explains_its_shadow_is_not_doubted(tmp_path):
+    volume = reconstruct(made(tmp_path, "Ti").scan)
+    assert "limitation" not in volume.details and volume.details["dark_misfit"] < 0.4
