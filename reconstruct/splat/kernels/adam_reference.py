@@ -15,9 +15,9 @@ def step(values: Array, gradient: Array, first: Array, second: Array, rates: Arr
     return values.astype(np.float64) - rates * mean / (np.sqrt(square) + 1e-15), m, v
 
 
-def activate(x_scales: Array, x_densities: Array, low: float, span: float, per_unit: float) -> tuple[Wide, Wide]:
-    """Return scales low + span·sigmoid(x) and densities softplus(x)/unit."""
-    return low + span * _sigmoid(x_scales), np.logaddexp(0, x_densities.astype(np.float64)) * per_unit
+def activate(x_scales: Array, x_densities: Array, low: float, span: float) -> tuple[Wide, Wide]:
+    """Return scales low + span·sigmoid(x) and densities softplus(x)."""
+    return low + span * _sigmoid(x_scales), np.logaddexp(0, x_densities.astype(np.float64))
 
 
 def by_scales(x: Array, by_log_scales: Array, low: float, span: float) -> Wide:
@@ -26,9 +26,9 @@ def by_scales(x: Array, by_log_scales: Array, low: float, span: float) -> Wide:
     return by_log_scales * span * share * (1 - share) / (low + span * share)
 
 
-def by_densities(x: Array, gradient: Array, per_unit: float) -> Wide:
-    """Take gradients by densities to those by what is learned: dρ/dx = σ/unit."""
-    return gradient * _sigmoid(x) * per_unit
+def by_densities(x: Array, gradient: Array) -> Wide:
+    """Take gradients by densities to those by what is learned: dρ/dx = σ."""
+    return gradient * _sigmoid(x)
 
 
 def _sigmoid(x: Array) -> Wide:
