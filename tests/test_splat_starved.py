@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -12,13 +13,16 @@ from ctsim import score_volume
 from ctsim.benchmarks.make_dataset import main as make_dataset
 from ctsim.dataset.store import list_scans, open_scan
 from ctsim.geometry import Geometry
+from ctsim.reconstruct import starved
 from ctsim.reconstruct.beyond import seen_beyond
 from ctsim.reconstruct.log import line_integrals
-from ctsim.reconstruct.splat import starved
+from ctsim.reconstruct.splat import fast
+from ctsim.reconstruct.splat.curve import MaterialCurve
 from ctsim.reconstruct.splat.fast import reconstruct
 from ctsim.reconstruct.splat.level import Data, coarser
-from ctsim.reconstruct.splat.starved import WEIGHT, Below, weights_and_bounds
-from ctsim.types import Scan
+from ctsim.reconstruct.splat.response import make_response
+from ctsim.reconstruct.starved import WEIGHT, Below, weights_and_bounds
+from ctsim.types import Scan, Status
 
 GEOMETRY = Geometry(
     dso=200.0,
@@ -33,7 +37,7 @@ I0, NOISE, DARK = 1e5, 6.0, 50.0
 
 
 def scan_of(p, noise=NOISE, seed=0, whole=False) -> Scan:
-    """Counts of one a photon behind `p`, with Gaussian noise of the readout and that of photons."""
+    """Counts behind `p`, one for each photon, with the noise of the photons and Gaussian noise of the readout."""
     draws = np.random.default_rng(seed)
     counts = DARK + draws.poisson(I0 * np.exp(-np.broadcast_to(p, GEOMETRY.shape))) + draws.normal(0, noise, p.shape)
     counts = torch.from_numpy(np.rint(counts).astype(np.int32)) if whole else torch.from_numpy(counts).float()
@@ -113,7 +117,6 @@ def test_an_offset_detector_is_not_short_where_the_other_side_sees():
 
 
 SCENE = """
-
 name = "small"
 seed = 7
 phantom = { recipe = "random", metal = "METAL", n_inserts = 1, insert_mm = 14.0, n_voxel = [97, 97, 97] }
@@ -134,8 +137,24 @@ def test_dense_metal_is_not_hollow_and_is_said_to_be_uncertain(tmp_path, monkeyp
     monkeypatch.setattr(starved, "WEIGHT", 1e-12)
     without = reconstruct(stored.scan)
     core = [score_volume(volume, stored)["metal"].values["core_ratio"] for volume in (with_bounds, without)]
-    assert core[0] > 2 * core[1]  # 0.54 and 0.18
+    assert core[0] > 2 * core[1]  # 0.52 and 0.18
     assert "metal is thinner than the grid" in with_bounds.details["limitation"]
+
+
+@pytest.mark.parametrize(
+    "runaway, status, said",
+    [(10, Status.OK, ""), (200, Status.OK, "18 times iron"), (1001, Status.DIVERGED, "18 times iron")],
+)
+def test_splats_at_the_end_of_the_curve_are_said_and_many_are_divergence(runaway, status, said):
+    """Of 100 000 splats: up to ten may be there, more are a limit, more than a hundredth a divergence."""
+    curve = MaterialCurve.of(make_response("tube", e_max=90.0, basis="klein-nishina"), 30.0)
+    u = np.full(100_000, curve.water, np.float32)
+    u[:runaway] = curve.knots[-1]
+    fit = SimpleNamespace(u=u, curve=curve)
+    found, reason = fast._verdict(fit, u)
+    assert found is status and ("18 times the attenuation of iron" in reason) == (status is Status.DIVERGED)
+    assert said in fast._unexplained(fit, 0.3) and bool(said) == bool(fast._unexplained(fit, 0.3))
+    assert "missed by 0.7" in fast._unexplained(fit, 0.7)
 
 
 @pytest.mark.slow

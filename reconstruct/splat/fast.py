@@ -29,8 +29,8 @@ from ctsim.reconstruct.splat.curve import STRONGEST, MaterialCurve
 from ctsim.reconstruct.splat.level import Data
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import FILTER, Response, basis_functions, evaluate, make_response, tangent
-from ctsim.reconstruct.splat.starved import Below, weights_and_bounds
 from ctsim.reconstruct.splat.volume import voxelise
+from ctsim.reconstruct.starved import Below, weights_and_bounds
 from ctsim.reconstruct.watch import Stopwatch
 from ctsim.types import Scan, Status, Volume
 
@@ -120,10 +120,9 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         return Volume(values=empty, status=status, reason=reason, details=details, at_energy=at_energy)
     values, rho, how = _read(fit, settings, scan.geometry)
     status, reason = _verdict(fit, values)
-    dark = fit.lacking(np.asarray(few_views(fit.data.geometry.n_views, VIEWS)), DARK)
-    missed = float(np.sqrt(np.mean(np.square(dark, dtype=np.float64)))) if dark.size else None
+    missed = _dark_misfit(fit)
     beyond = seen_beyond(data.p, scan.geometry, scan.i0)
-    limits = [said for said in (below.sentence, _unexplained(fit, dark, missed), beyond.sentence) if said]
+    limits = [said for said in (below.sentence, _unexplained(fit, missed), beyond.sentence) if said]
     details |= {
         "read-out": how,
         "dark_misfit": missed,
@@ -192,11 +191,18 @@ def _runaway(fit: Fit) -> int:
     return int((fit.u >= AT_THE_END * fit.curve.knots[-1]).sum())
 
 
-def _unexplained(fit: Fit, dark: Image, missed: float | None) -> str:
-    """Say where metal does not explain its shadow, if it does not; `dark` is what dark readings lack."""
+def _dark_misfit(fit: Fit) -> float | None:
+    """Return the root mean square of p − P over dark readings of a few views, None where there are hardly any."""
     views = few_views(fit.data.geometry.n_views, VIEWS)
-    readings = len(views) * math.prod(fit.data.geometry.n_detector)
-    if missed is not None and missed > UNEXPLAINED and dark.size > DARK_SHARE * readings:
+    lacking = fit.lacking(np.asarray(views), DARK)
+    if lacking.size <= DARK_SHARE * len(views) * math.prod(fit.data.geometry.n_detector):
+        return None
+    return float(np.sqrt(np.mean(np.square(lacking, dtype=np.float64))))
+
+
+def _unexplained(fit: Fit, missed: float | None) -> str:
+    """Say that metal does not explain its shadow, `missed` by its dark readings, or nothing."""
+    if missed is not None and missed > UNEXPLAINED:
         return (
             f"readings of P > {DARK:g} are missed by {missed:.2g} (root mean square): metal is thinner than the grid "
             "or denser than its readings show, so its values, and tissue next to it, may be wrong"

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.splat.kernels import carve_cpu
-from ctsim.reconstruct.splat.starved import WEIGHT
+from ctsim.reconstruct.starved import WEIGHT, photon_weights
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,10 +33,7 @@ class Data:
 
 def weighted(geometry: Geometry, p: NDArray[np.float32], valid: NDArray[np.bool_], scatter: float = 0.0) -> Data:
     """Weight line integrals [view, v, u] by the photons that came through, exp(−p), and 0 where not `valid`."""
-    weights = np.empty(p.shape, np.float32)
-    for reading, seen, weight in zip(p, valid, weights, strict=True):  # a view at a time stays in the cache
-        weight[...] = np.where(seen, np.exp(-np.maximum(reading, 0)), 0)
-    return Data(geometry=geometry, p=p, weights=weights, scatter=scatter)
+    return Data(geometry=geometry, p=p, weights=photon_weights(p, valid), scatter=scatter)
 
 
 def coarser(data: Data) -> Data:

@@ -41,7 +41,7 @@ class Terms:
 class Objective:
     """The loss of one view: line integrals `p`, 0 where they do not count, and which do, `valid`, [view, v, u].
 
-    `unit` is half the volume's widest side in mm, `data_range` the greatest P.
+    `unit` is half the volume's widest side in mm, `greatest` the greatest P that counts.
     """
 
     settings: Settings
@@ -49,7 +49,7 @@ class Objective:
     activation: Activation
     p: NDArray[np.float32]
     valid: NDArray[np.bool_]
-    data_range: float
+    greatest: float
     unit: float
 
     @classmethod
@@ -64,7 +64,7 @@ class Objective:
             activation=adam.activation(scan.geometry),
             p=counted,
             valid=valid,
-            data_range=max(float(counted.max(initial=0.0)), 1e-6),
+            greatest=max(float(counted.max(initial=0.0)), 1e-6),
             unit=adam.unit_length(scan.geometry),
         )
 

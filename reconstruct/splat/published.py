@@ -209,7 +209,7 @@ def _median_paths(splats: Splats, objective: Objective) -> tuple[float, float]:
     for view in few_views(objective.projector.geometry.n_views, VIEWS):
         paths = objective.paths(splats, int(view))[..., : objective.p.shape[2]]
         both = np.stack([np.zeros_like(paths[0]), paths[0]]) if len(paths) == 1 else paths
-        met.append(both[:, objective.p[view] > 0.01 * objective.data_range])
+        met.append(both[:, objective.p[view] > 0.01 * objective.greatest])
     rays = np.concatenate(met, 1)
     if not rays.shape[1]:
         return 0.0, 0.0

@@ -25,6 +25,14 @@ SIGNIFICANT = 5.0  # standard deviations
 Image = NDArray[np.float32]
 
 
+def photon_weights(p: Image, valid: NDArray[np.bool_]) -> Image:
+    """Return the share of photons that came through, exp(−p), of line integrals [view, v, u]; 0 where not `valid`."""
+    weights = np.empty(p.shape, np.float32)
+    for reading, seen, weight in zip(p, valid, weights, strict=True):  # a view at a time stays in the cache
+        weight[...] = np.where(seen, np.exp(-np.maximum(reading, 0)), 0)
+    return weights
+
+
 def weights_and_bounds(scan: Scan, p: Image, valid: NDArray[np.bool_], scatter: float, noise: float) -> Image:
     """Return weights [view, v, u]: exp(−p) of readings, 0 of what says nothing, and −WEIGHT of bounds.
 
@@ -37,11 +45,10 @@ def weights_and_bounds(scan: Scan, p: Image, valid: NDArray[np.bool_], scatter: 
     scale = np.where(usable, 1 / np.where(usable, open_field, 1), 0).astype(np.float32)
     least = max(floor / float(np.median(open_field[usable])), SURE * noise) if usable.any() else 0.0
     may_be = np.float32(math.hypot(SURE * noise, UNSEEN / scan.i0) + DOUBT * scatter)
-    weights = np.empty(p.shape, np.float32)
-    for view, (reading, seen, weight) in enumerate(zip(p, valid, weights, strict=True)):  # one stays in the cache
+    weights = photon_weights(p, valid)
+    for view, (reading, weight) in enumerate(zip(p, weights, strict=True)):
         share = _signal(scan, view) * scale - np.float32(scatter)
         starved = usable & np.isfinite(share) & (share <= least + DOUBT * scatter)
-        weight[...] = np.where(seen, np.exp(-np.maximum(reading, 0)), 0)
         weight[starved] = -WEIGHT
         reading[starved] = -np.log(np.maximum(share[starved], 0) + may_be)
     return weights
@@ -76,7 +83,11 @@ class Below:
 
     @property
     def sentence(self) -> str:
-        """What is wrong where they are no such half: readings whose mean is not 0 without photons; or nothing."""
+        """Say that the dark level is too high, or nothing.
+
+        Where it is right, noise alone puts readings below it: half a Gaussian, whose mean is 0.8 of its root mean
+        square. Where it is too high the ratio is nearer to 1.
+        """
         if self.count < ENOUGH or self.mean <= (HALF + SIGNIFICANT * SPREAD / math.sqrt(self.count)) * self.rms:
             return ""
         return f"{self.count} readings are below the dark level, by more than noise: is the scan's dark level right?"
