@@ -4,6 +4,16 @@ from pathlib import Path
 import pytest
 
 os.environ.setdefault("MPLBACKEND", "agg")
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that wait leave their core to the other worker's
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Share the cores among the workers: threads that wait for one another lose most of them to other processes."""
+    if workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):
+        import numba
+
+        numba.set_num_threads(max(1, numba.config.NUMBA_NUM_THREADS // workers))  # pyright: ignore[reportAttributeAccessIssue]
+
 
 SMALLEST = """
 name = "smallest"

@@ -372,7 +372,7 @@ def test_pixels_that_a_bright_sliver_decides_are_refined():
     r = Response(mu=r.mu[:, at_60 : at_60 + 1], w1=one, w2=one, edge_mu=r.mu[:, at_60].astype(np.float64))
     tracer, few, more = Tracer.of(phantom), [], []
     for view in range(g.n_views):
-        exact = rods_in_air(rods, float(r.mu[3, 0]), g, view, 48)
+        exact = rods_in_air(rods, float(r.mu[3, 0]), g, view, 32)
         usual, plain = (-np.log(transmit(tracer, g, view, r, edge_tolerance=x)[0]) for x in (0.03, math.inf))
         few.append(np.abs(plain - exact))
         more.append(np.abs(usual - exact))
