@@ -68,6 +68,8 @@ def run_benchmark() -> int:
 
 
 def _dispatch(command: str, module: str, others: dict[str, Command]) -> int:
+    # threads that wait for each other sleep instead of spinning on a core that other programs could have
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     arguments = sys.argv[1:]
     if arguments and arguments[0] in others:
         name = arguments[0]
