@@ -8,10 +8,11 @@ import torch
 from conftest import SMALLEST
 
 from ctsim.benchmarks import make_dataset
-from ctsim.benchmarks.scores import projection
+from ctsim.benchmarks.scores import judge, projection
 from ctsim.benchmarks.scores.judge import Judge, Twin
 from ctsim.benchmarks.scores.projection import REGIONS, HeldOut, half_way, held_out, projection_score, with_floor
 from ctsim.benchmarks.scores.protocol import truth_of
+from ctsim.benchmarks.studies.methods import heldout, records, run, study
 from ctsim.dataset.store import list_scans, open_scan
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.projector import forward
@@ -92,6 +93,50 @@ def test_linear_truths_are_those_of_the_references(stored):
         assert own[kind][f"{kind}/outside"] < 0.1 * size
     noted = with_floor(held, truth).note
     assert f"{own['effective']['effective/outside']:.4f} (effective)" in noted
+
+
+def test_kept_views_are_those_that_were_simulated(stored, tmp_path):
+    held = held_out(stored)
+    assert heldout.kept(stored, tmp_path) is None
+    heldout.keep(held, stored, tmp_path)
+    found = heldout.kept(stored, tmp_path)
+    assert (found.geometry, found.reference, found.note) == (held.geometry, held.reference, held.note)
+    for own, again in ((held.truths, found.truths), (held.regions, found.regions)):
+        assert own.keys() == again.keys()
+        for name, array in own.items():
+            assert array.dtype == again[name].dtype and np.array_equal(array, again[name])
+
+
+def test_kept_views_of_other_data_code_or_protocols_do_not_count(stored, tmp_path, monkeypatch):
+    heldout.keep(held_out(stored), stored, tmp_path)
+    assert heldout.kept(dataclasses.replace(stored, content_hash="another"), tmp_path) is None
+    for name, value in (("source_hash", lambda: "another"), ("VERSION", -1)):
+        with monkeypatch.context() as patch:
+            patch.setattr(heldout, name, value)
+            assert heldout.kept(stored, tmp_path) is None
+    path = heldout.path_of(stored, tmp_path)
+    whole = path.read_bytes()
+    for damaged in (b"", whole[:1000], whole[: len(whole) // 2], b"x" * 100):
+        path.write_bytes(damaged)
+        assert heldout.kept(stored, tmp_path) is None
+    path.write_bytes(whole)
+    assert heldout.kept(stored, tmp_path) is not None
+
+
+def test_another_command_simulates_no_views_again(smallest, tmp_path, monkeypatch):
+    made = []
+
+    def counted(scan):
+        made.append(scan.name)
+        return held_out(scan)
+
+    monkeypatch.setattr(judge, "held_out", counted)
+    for method in ("fdk", "zero"):
+        assert study.main([str(smallest), str(tmp_path), "--method", method]) == 0
+        run._runner.cache_clear()  # as in a new process
+    assert made == ["smallest"]
+    found = [r.scores["projection"].values for r in records.read(tmp_path) if r.run.variant == records.METAL]
+    assert len(found) == 2 and None not in {value for values in found for value in values.values()}
 
 
 def held_double(volume, offsets):

@@ -24,6 +24,7 @@ from ctsim.benchmarks.scores.judge import Judge, Twin
 from ctsim.benchmarks.scores.projection import HeldOut
 from ctsim.benchmarks.scores.score import NO_TWIN, NOT_ASKED, TWIN_ENDED
 from ctsim.benchmarks.scores.unreferenced import HeldViews, Unreferenced
+from ctsim.benchmarks.studies.methods import heldout
 from ctsim.benchmarks.studies.methods.attempt import SCORED, Outcome, describe, run_here, scan_for, skip, warm_up
 from ctsim.benchmarks.studies.methods.grids import with_grid
 from ctsim.benchmarks.studies.methods.plan import Job, job_of
@@ -100,7 +101,12 @@ class Runner:
     def _judge_of(self, stored: StoredScan) -> Judge | Unreferenced:
         """Load what a scan's volumes are scored with; methods come round by round, so its views are kept."""
         known = self._views.pop(stored.content_hash, None)
+        if known is None and stored.has_truth:
+            known = heldout.kept(stored, self._results)
+        new = known is None
         judge = _judge(stored, known)
+        if new and isinstance(judge.views, HeldOut):
+            heldout.keep(judge.views, stored, self._results)
         self._views[stored.content_hash] = judge.views
         if len(self._views) > MOST_VIEWS:
             del self._views[next(iter(self._views))]
