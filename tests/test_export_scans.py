@@ -12,6 +12,7 @@ import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 
+import h5py
 import msgspec
 import numpy as np
 import pytest
@@ -22,6 +23,8 @@ from ctsim.benchmarks.export.scans import LAYOUTS, Measured, write_scan
 from ctsim.dataset.interop import Library, points_to
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.io import exchange
+from ctsim.io.scanfile import Stated
 from ctsim.reconstruct.fdk import ramp
 from ctsim.types import Scan
 
@@ -54,7 +57,15 @@ def measured(geometry):
     rng = np.random.default_rng(1)
     p = rng.permutation(np.prod(geometry.shape)).reshape(geometry.shape).astype(np.float32)
     reference = rng.permutation(np.prod(geometry.n_voxel)).reshape(geometry.n_voxel).astype(np.float32) + 1
-    return Measured(geometry=geometry, p=p, reference=reference)
+    counts, flat = (rng.integers(200, 60000, shape) for shape in (geometry.shape, geometry.n_detector))
+    return Measured(
+        geometry=geometry,
+        p=p,
+        reference=reference,
+        counts=counts.astype(np.uint16),
+        flat=flat.astype(np.float32),
+        dark=103.5,
+    )
 
 
 def centres(n, d, off):
@@ -189,7 +200,7 @@ def name_of(to):
     return f"scan{LAYOUTS[to].file}"
 
 
-@pytest.mark.parametrize("to", LAYOUTS)
+@pytest.mark.parametrize("to", READERS)
 def test_every_reading_and_voxel_is_where_the_library_has_it(tmp_path, to):
     scan = measured(HELD[to])
     write_scan(tmp_path / name_of(to), to, scan)
@@ -223,6 +234,22 @@ def test_the_true_volume_lies_on_the_voxels(tmp_path, to, scale):
     assert np.array_equal(np.sort(image, axis=None), np.sort(scan.reference * np.float32(scale), axis=None))
 
 
+def test_counts_come_back_from_data_exchange(tmp_path):
+    assert LAYOUTS.keys() - READERS.keys() == {"dxchange"}
+    g = msgspec.structs.replace(GEOMETRY, off_detector=(0.0, 0.0), off_origin=(0.0, 0.0, 0.0))
+    scan = measured(g)
+    write_scan(tmp_path / "a.h5", "dxchange", scan)
+    found = exchange.open_scan(tmp_path / "a.h5", Stated())
+    np.testing.assert_allclose(found.geometry.pose_array(), g.pose_array(), rtol=0, atol=1e-9)
+    for view in range(g.n_views):
+        assert np.array_equal(found.read(view), scan.counts[view].astype(np.float64) - scan.dark)
+    assert np.array_equal(found.flat, scan.flat - np.float32(scan.dark))
+    with h5py.File(tmp_path / "a.h5") as file:  # as the format's reference has it: the first row is the top one
+        assert np.array_equal(file["exchange/data"][1, 0], scan.counts[1, -1])
+        assert file["exchange/data"].dtype == np.uint16 and file["exchange/data_white"].shape == (1, *g.n_detector)
+        assert np.diff(file["exchange/theta"]) == pytest.approx(-g.arc_deg / g.n_views)
+
+
 class Arrays(pickle.Unpickler):
     """Loads arrays and nothing else."""
 
@@ -245,6 +272,8 @@ def test_the_pickle_holds_arrays_numbers_and_names_only(tmp_path):
 @pytest.mark.parametrize(
     ("to", "change", "said"),
     [
+        ("dxchange", {}, "off_detector is (2.0, -3.0) mm"),
+        ("dxchange", {"off_detector": (0.0, 0.0)}, "off_origin is (4.0, -5.0, 6.0) mm"),
         ("r2", {}, "off_detector is (2.0, -3.0) mm"),
         ("naf", {}, "off_origin is (4.0, -5.0, 6.0) mm"),
         ("leap", {}, "square in x and y, but d_voxel is (1.0, 2.0, 3.0)"),

@@ -13,14 +13,14 @@ class Flags:
 
     NIfTI and MetaImage keep the values in 1/mm, or HU with --hu. DICOM slices are HU in 16 bits. All three state
     spacing and place. The layouts of TIGRE, RTK, ASTRA, LEAP, R2-Gaussian (r2) and NAF hold line integrals, geometry
-    and grid.
+    and grid; Data Exchange (dxchange) holds counts, open field, dark level and geometry.
     """
 
     scan: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCAN")]
     """Folder of a scan, data/SCENE."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    """New file (.nii, .nii.gz, .mha or .pickle), or new folder (DICOM slices, and the layouts of libraries)."""
-    to: Literal["nifti", "mha", "dicom", "tigre", "rtk", "astra", "leap", "r2", "naf"]
+    """New file (.nii, .nii.gz, .mha, .pickle or .h5), or new folder (DICOM slices, and the layouts of libraries)."""
+    to: Literal["nifti", "mha", "dicom", "tigre", "rtk", "astra", "leap", "r2", "naf", "dxchange"]
     """Format of a volume, or library."""
     volume: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "reference_effective"
     """A volume of the scan (reference_effective, reference_50kev, labels, metal, metal_free/…), or a TIFF stack or .npy

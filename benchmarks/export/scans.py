@@ -20,6 +20,7 @@ from ctsim.dataset.interop import Library, angles_to, astra_vectors, projections
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.io import metaimage
+from ctsim.io.formats import load
 from ctsim.io.placed import Placed
 
 EVERY = 10
@@ -31,12 +32,16 @@ PER_METRE = 1000  # NAF's lengths are metres
 class Measured:
     """What is exported: line integrals [view, v, u] and the true attenuation [z, y, x] in 1/mm, both float32.
 
-    R2-Gaussian and NAF do not start without a true volume, which they compare their own with.
+    R2-Gaussian and NAF do not start without a true volume, which they compare their own with. Data Exchange holds
+    `counts` [view, v, u] instead, the open field `flat` [v, u], and the level `dark` that both include.
     """
 
     geometry: Geometry
     p: NDArray[np.float32]
     reference: NDArray[np.float32]
+    counts: NDArray[Any]
+    flat: NDArray[np.float32]
+    dark: float
 
 
 def write_scan(out: Path, to: str, scan: Measured) -> None:
@@ -257,15 +262,21 @@ def _naf(path: Path, scan: Measured) -> None:
         pickle.dump(content, file, protocol=4)
 
 
+def _dxchange(path: Path, scan: Measured) -> None:
+    """Write Data Exchange, the HDF5 file of tomographic beamlines: what the detector read, as TomoPy expects it."""
+    load("ctsim.io.exchange", path).write_scan(path, scan.geometry, scan.counts, scan.flat, scan.dark)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
     """A library's layout: how it is written, and which geometries it can hold.
 
-    `file` is how its name ends where it is one file, "" for a folder.
+    `file` is how its name ends where it is one file, "" for a folder. `content` are its readings.
     """
 
     write: Callable[[Path, Measured], None]
     file: str = ""
+    content: str = "line integrals"
     poses: bool = False
     off_detector: bool = True
     off_origin: bool = True
@@ -279,4 +290,5 @@ LAYOUTS = {
     "leap": Layout(write=_leap, square=True),
     "r2": Layout(write=_r2, off_detector=False),
     "naf": Layout(write=_naf, file=".pickle", off_origin=False),
+    "dxchange": Layout(write=_dxchange, file=".h5", content="counts", off_detector=False, off_origin=False),
 }

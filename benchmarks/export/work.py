@@ -65,11 +65,19 @@ def _export_scan(given: Flags, stored: StoredScan) -> None:
     plain = Flags(scan=given.scan, out=given.out, to=given.to)
     if given != plain:
         raise InputError(f"--to {given.to} writes the scan: expected neither --volume, --hu nor --kev")
-    p, _ = line_integrals(stored.scan, slice(None))
-    truth = np.asarray(stored.reference("effective"), np.float32)
-    write_scan(given.out, given.to, Measured(geometry=stored.geometry, p=p.numpy(), reference=truth))
-    shape = " × ".join(str(n) for n in stored.geometry.shape)
-    sys.stdout.write(f"{given.out}: {shape} line integrals (view × v × u) for {given.to}\n")
+    scan = stored.scan
+    p, _ = line_integrals(scan, slice(None))
+    content = Measured(
+        geometry=stored.geometry,
+        p=p.numpy(),
+        reference=np.asarray(stored.reference("effective"), np.float32),
+        counts=scan.counts.numpy(),
+        flat=scan.flat.numpy(),
+        dark=scan.dark,
+    )
+    write_scan(given.out, given.to, content)
+    shape, what = " × ".join(str(n) for n in stored.geometry.shape), LAYOUTS[given.to].content
+    sys.stdout.write(f"{given.out}: {shape} {what} (view × v × u) for {given.to}\n")
 
 
 def _check_out(out: Path, to: str) -> None:

@@ -1,4 +1,4 @@
-"""Scans in HDF5: Data Exchange (DXchange) and NXtomo. Images are stored from the top row on.
+"""Scans in HDF5: Data Exchange (DXchange), read and written, and NXtomo. Images are stored from the top row on.
 
 An angle turns the object counter-clockwise as seen from above, so the source turns clockwise about it. Lengths are read
 with their attribute `units`. Data that lie in other files are refused.
@@ -33,6 +33,30 @@ def open_scan(path: Path, stated: Stated) -> ScanFile:
         entry = _entry(file)
         found = _dxchange(path, file) if entry is None else _nxtomo(path, file, entry)
     return _scan(path, stated, **found)
+
+
+def write_scan(path: Path, geometry: Geometry, counts: NDArray[Any], flat: NDArray[np.float32], dark: float) -> None:
+    """Write counts [view, v, u], the open field [v, u] and the level `dark` that both include, in Data Exchange.
+
+    The format has no place for a grid, nor for an offset of the detector. Lengths are mm, angles degrees.
+    """
+    levels = {"data_white": flat, "data_dark": np.full(flat.shape, dark, np.float32)}
+    lengths = {
+        f"{SOURCE}/distance": geometry.dso,
+        f"{DETECTOR}/distance": geometry.dsd - geometry.dso,
+        f"{DETECTOR}/pixel_size_y": geometry.d_detector[0],
+        f"{DETECTOR}/pixel_size_x": geometry.d_detector[1],
+    }
+    with h5py.File(path, "w") as file:
+        file["implements"] = "exchange:measurement"
+        file["exchange/data"] = counts[:, ::-1]
+        for name, image in levels.items():
+            file[f"exchange/{name}"] = image[None, ::-1]
+        file["exchange/theta"] = -np.degrees(geometry.angles)
+        file["exchange/theta"].attrs["units"] = "deg"
+        for name, length in lengths.items():
+            file[name] = length
+            file[name].attrs["units"] = "mm"
 
 
 def _entry(file: h5py.File) -> str | None:
