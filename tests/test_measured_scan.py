@@ -11,7 +11,7 @@ from ctsim.benchmarks.importing.work import bring
 from ctsim.benchmarks.scores.judge import Twin
 from ctsim.benchmarks.scores.score import NEED_TRUTH, NO_REFERENCE
 from ctsim.benchmarks.scores.unreferenced import HeldViews, Unreferenced, consistency
-from ctsim.benchmarks.studies.methods import records
+from ctsim.benchmarks.studies.methods import records, study
 from ctsim.benchmarks.studies.methods.study import main
 from ctsim.benchmarks.submit import Flags as Submitted
 from ctsim.benchmarks.submit.work import submit
@@ -47,6 +47,14 @@ def test_a_run_and_its_table(data, tmp_path, capsys):
         assert f"## {protocol}" not in page.splitlines()
     assert "measured, without truth" in screen and "nmar[mask=auto]" in screen
     assert (results / "panels/rods.png").stat().st_size > 10_000
+
+
+def test_a_measured_scan_is_of_no_code_of_the_simulator(data, smallest, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(study, "source_hash", lambda: "another")
+    for folder, warned in ((smallest, True), (data, False)):
+        caplog.clear()
+        assert main([str(folder), str(tmp_path / folder.name), "--method", "zero", "--dry-run"]) == 0
+        assert ("other code of the simulator" in caplog.text) == warned
 
 
 def test_a_volume_made_elsewhere_has_no_truth_to_be_scored_with(data, tmp_path):

@@ -169,7 +169,8 @@ def _scans(given: Flags) -> list[StoredScan]:
     for wanted in given.scene:
         if wanted not in names:
             raise InputError(f"--scene {wanted!r}: {given.data} has {human_choice(names, wanted)}")
-    _warn_of_other_code(given.data, frozenset(given.scene or names))
+    simulated = frozenset(s.name for s in scans if s.has_truth)  # the simulator's code made no measured scan
+    _warn_of_other_code(given.data, frozenset(given.scene or names) & simulated)
     return scans
 
 
