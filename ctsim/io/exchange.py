@@ -6,6 +6,7 @@ with their attribute `units`. Data that lie in other files are refused.
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,24 @@ PROJECTION, FLAT, DARK = 0, 1, 2  # NXtomo's image_key
 SOURCE, DETECTOR = "measurement/instrument/source", "measurement/instrument/detector"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Found:
+    """What a file says: the dataset of images by `name`, which of them are views, and their angles in degrees.
+
+    `flat` and `dark` are mean images in the file's order of rows; `lengths` are from the axis to source and detector
+    and `pixels` the sizes (v, u) in mm. None is what is not there.
+    """
+
+    name: str
+    views: NDArray[np.int64]
+    angles: NDArray[np.float64]
+    flat: NDArray[np.float64] | None
+    dark: NDArray[np.float64] | None
+    shape: tuple[int, int]
+    lengths: tuple[float | None, float | None]
+    pixels: tuple[float | None, float | None]
+
+
 def open_scan(path: Path, stated: Stated) -> ScanFile:
     """Read what an HDF5 file says of a scan; lengths that it lacks are those `stated`."""
     if not path.is_file():
@@ -32,7 +51,7 @@ def open_scan(path: Path, stated: Stated) -> ScanFile:
     with h5py.File(path, "r") as file:
         entry = _entry(file)
         found = _dxchange(path, file) if entry is None else _nxtomo(path, file, entry)
-    return _scan(path, stated, **found)
+    return _scan(path, stated, found)
 
 
 def write_scan(path: Path, geometry: Geometry, counts: NDArray[Any], flat: NDArray[np.float32], dark: float) -> None:
@@ -151,24 +170,24 @@ def _angles(path: Path, file: h5py.File, name: str, count: int) -> NDArray[np.fl
     return np.degrees(values) if _unit(file, name).lower().startswith("rad") else values
 
 
-def _dxchange(path: Path, file: h5py.File) -> dict[str, Any]:
+def _dxchange(path: Path, file: h5py.File) -> _Found:
     data = _stack(path, file, "exchange/data", needed=True)
     n = data.shape[0]
     flats, darks = (_stack(path, file, f"exchange/data_{kind}") for kind in ("white", "dark"))
     near, far = (_length(path, file, f"{group}/distance") for group in (SOURCE, DETECTOR))
-    return {
-        "name": "exchange/data",
-        "views": np.arange(n),
-        "angles": _angles(path, file, "exchange/theta", n),
-        "flat": None if flats is None else _mean(flats),
-        "dark": None if darks is None else _mean(darks),
-        "shape": data.shape[1:],
-        "lengths": (near, far),
-        "pixels": tuple(_length(path, file, f"{DETECTOR}/pixel_size_{axis}") for axis in "yx"),
-    }
+    return _Found(
+        name="exchange/data",
+        views=np.arange(n),
+        angles=_angles(path, file, "exchange/theta", n),
+        flat=None if flats is None else _mean(flats),
+        dark=None if darks is None else _mean(darks),
+        shape=data.shape[1:],
+        lengths=(near, far),
+        pixels=(_length(path, file, f"{DETECTOR}/pixel_size_y"), _length(path, file, f"{DETECTOR}/pixel_size_x")),
+    )
 
 
-def _nxtomo(path: Path, file: h5py.File, entry: str) -> dict[str, Any]:
+def _nxtomo(path: Path, file: h5py.File, entry: str) -> _Found:
     detector, source = f"{entry}/instrument/detector", f"{entry}/instrument/source"
     data = _stack(path, file, f"{detector}/data", needed=True)
     n = data.shape[0]
@@ -178,16 +197,16 @@ def _nxtomo(path: Path, file: h5py.File, entry: str) -> dict[str, Any]:
     views = np.flatnonzero(keys == PROJECTION)
     if not views.size:
         raise InputError(f"{path} has no projection: no image_key is {PROJECTION}")
-    return {
-        "name": f"{detector}/data",
-        "views": views,
-        "angles": angles[views],
-        "flat": _mean(data, np.flatnonzero(keys == FLAT)),
-        "dark": _mean(data, np.flatnonzero(keys == DARK)),
-        "shape": data.shape[1:],
-        "lengths": (_length(path, file, f"{source}/distance"), _length(path, file, f"{detector}/distance")),
-        "pixels": tuple(_length(path, file, f"{detector}/{axis}_pixel_size") for axis in "yx"),
-    }
+    return _Found(
+        name=f"{detector}/data",
+        views=views,
+        angles=angles[views],
+        flat=_mean(data, np.flatnonzero(keys == FLAT)),
+        dark=_mean(data, np.flatnonzero(keys == DARK)),
+        shape=data.shape[1:],
+        lengths=(_length(path, file, f"{source}/distance"), _length(path, file, f"{detector}/distance")),
+        pixels=(_length(path, file, f"{detector}/y_pixel_size"), _length(path, file, f"{detector}/x_pixel_size")),
+    )
 
 
 def _mean(images: Any, which: NDArray[np.int64] | None = None) -> NDArray[np.float64] | None:
@@ -199,29 +218,17 @@ def _mean(images: Any, which: NDArray[np.int64] | None = None) -> NDArray[np.flo
     return total / len(chosen) if len(chosen) else None
 
 
-def _scan(
-    path: Path,
-    stated: Stated,
-    *,
-    name: str,
-    views: NDArray[np.int64],
-    angles: NDArray[np.float64],
-    flat: NDArray[np.float64] | None,
-    dark: NDArray[np.float64] | None,
-    shape: tuple[int, int],
-    lengths: tuple[float | None, float | None],
-    pixels: tuple[float | None, ...],
-) -> ScanFile:
-    near, far = lengths
+def _scan(path: Path, stated: Stated, found: _Found) -> ScanFile:
+    near, far = found.lengths
     dso = stated.needed(path, "dso", near)
     dsd = stated.needed(path, "dsd", None if near is None or far is None else near + far)
-    d_v, d_u = (stated.needed(path, "pixel", size) for size in pixels)
+    d_v, d_u = (stated.needed(path, "pixel", size) for size in found.pixels)
     if not 0 < dso < dsd or min(d_v, d_u) <= 0:
         raise InputError(f"{path} has the source {dso:g} mm from the axis and {dsd:g} mm from pixels of {d_u:g} mm")
-    if any(image is not None and image.shape != shape for image in (flat, dark)):
-        raise InputError(f"{path} has open or dark images of another shape than {shape}")
-    n_voxel, d_voxel = grid_of(dso, dsd, shape, (d_v, d_u))
-    pedestal = np.zeros(shape) if dark is None else dark
+    if any(image is not None and image.shape != found.shape for image in (found.flat, found.dark)):
+        raise InputError(f"{path} has open or dark images of another shape than {found.shape}")
+    n_voxel, d_voxel = grid_of(dso, dsd, found.shape, (d_v, d_u))
+    pedestal = np.zeros(found.shape) if found.dark is None else found.dark
     return ScanFile(
         path=path,
         geometry=Geometry(
@@ -229,13 +236,13 @@ def _scan(
             dsd=dsd,
             n_voxel=n_voxel,
             d_voxel=d_voxel,
-            n_detector=shape,
+            n_detector=found.shape,
             d_detector=(d_v, d_u),
-            n_views=len(views),
-            angles_deg=tuple((-angles).tolist()),
+            n_views=len(found.views),
+            angles_deg=tuple((-found.angles).tolist()),
         ),
-        read=_reader(path, name, views, pedestal),
-        flat=None if flat is None else (flat - pedestal)[::-1].astype(np.float32),
+        read=_reader(path, found.name, found.views, pedestal),
+        flat=None if found.flat is None else (found.flat - pedestal)[::-1].astype(np.float32),
         axis_known=False,
     )
 
