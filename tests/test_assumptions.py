@@ -1,9 +1,15 @@
+import numpy as np
 import pytest
 from run_records import append, make_record
 
 from ctsim.benchmarks.scores.score import Score
+from ctsim.benchmarks.studies.methods.grids import coincide
+from ctsim.benchmarks.suites import load
 from ctsim.benchmarks.tools import assumptions
 from ctsim.errors import InputError
+from ctsim.phantoms.scene import build
+from ctsim.reconstruct.splat.fast import Settings, finer
+from ctsim.scaninfo import LabelGrid
 
 
 def record(scene, method, psnr):
@@ -36,3 +42,15 @@ def test_other_results_are_refused(tmp_path):
     append(tmp_path, record("box", "fdk", 20.0))
     with pytest.raises(InputError, match="run the suite assumptions first"):
         assumptions.main([str(tmp_path)])
+
+
+@pytest.mark.parametrize("scene", load("assumptions"), ids=lambda scene: scene.name)
+def test_a_scene_shares_the_grid_that_its_name_says(scene):
+    geometry = scene.resolve().geometry
+    splats = finer(geometry, Settings().fineness).n_voxel
+    phantom = build(scene)
+    labels = LabelGrid(n_voxel=phantom.labels.shape, d_voxel=phantom.d_voxel, off_origin=phantom.off_origin)
+    favour = scene.name.split("-", 2)[2]
+    assert coincide(splats, geometry, labels) == (favour in ("splat-grid", "ideal"))
+    assert coincide(geometry.n_voxel, geometry, labels) == (favour == "volume-grid")
+    assert np.all(np.greater(splats, geometry.n_voxel))

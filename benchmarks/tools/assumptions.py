@@ -1,11 +1,12 @@
 """What each thing that a simulation shares with a method gave whom, as a table.
 
-    make-dataset assumptions data/ --seeds 1 2 3
+    make-dataset assumptions data/
     run-benchmark data/ results/ --method fdk --method nmar --method ibhc --method fista-tv --method splat
     python -m ctsim.benchmarks.tools.assumptions results/ docs/measured
 
 The scenes of the suite `assumptions` are "OBJECT-FAVOUR"; "OBJECT-strict" grants no method anything. A cell is what a
-favour adds to the method's number on the strict scene. The page is written to the folder, or printed without one.
+favour adds to the method's number on the strict scene, a mean over the seeds. The page is written to the folder, or
+printed without one.
 """
 
 import sys
@@ -61,7 +62,9 @@ def page(records: Sequence[RunRecord]) -> str:
     tables = [table for name in objects for table in _tables(name, scenes, records, found)]
     commands = [line.strip() for line in (__doc__ or "").splitlines() if line.startswith("    ")]
     made = "; ".join(f"`{command}`" for command in commands)
-    head = f"# What a simulation shares with a method: measured\n\nMade by {made}. Do not edit.\n\n{CAPTION}\n\n"
+    seeds = ", ".join(str(seed) for seed in sorted({record.run.seed for record in records}))
+    caption = f"{CAPTION} Seeds: {seeds}."
+    head = f"# What a simulation shares with a method: measured\n\nMade by {made}. Do not edit.\n\n{caption}\n\n"
     return f"{head}{provenance(records)}\n\n" + "\n".join(table.markdown() for table in tables)
 
 

@@ -66,6 +66,11 @@ PAGES: dict[str, Page] = {
         command="python -m ctsim.benchmarks.tools.sensitivity data/thorax-Fe-s1 docs/measured",
         sources=("benchmarks/scores/", "benchmarks/tools/sensitivity.py"),
     ),
+    "assumptions": Page(
+        title="What a simulation shares with a method",
+        command="python -m ctsim.benchmarks.tools.assumptions results/ docs/measured",
+        sources=(*METHODS, "benchmarks/scores/", f"{SUITES}assumptions.toml"),
+    ),
     "methods": Page(
         title="Methods: settings and experiments",
         command="run-benchmark pareto results/ --suite benchmarks/suites/tune-settings.toml --part methods",
