@@ -42,7 +42,8 @@ def test_no_ray_that_meets_a_primitive_lies_outside_its_shadow(kind):
         source, centre, e_u, e_v = pose.reshape(4, 3)
         step = 3 if kind == TORUS else 1  # its reference solves a quartic a ray
         # pixel centres and corners, since both are asked for
-        for v, u, shift in ((v, u, s) for v in range(n_v) for u in range(view, n_u, step) for s in (0.0, -0.5, 0.5)):
+        columns = range(view % step, n_u, step)
+        for v, u, shift in ((v, u, s) for v in range(n_v) for u in columns for s in (0.0, -0.5, 0.5)):
             towards = centre + (u + shift - (n_u - 1) / 2) * e_u + (v + shift - (n_v - 1) / 2) * e_v - source
             towards /= np.linalg.norm(towards)
             for p, prim in enumerate(prims):
