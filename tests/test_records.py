@@ -40,6 +40,15 @@ def test_scans_of_different_code_are_named():
         assert "lung (seed 1) by v1; lung (seed 2) by v2" in text
 
 
+def test_limits_that_methods_state_are_named_below_the_tables():
+    dark = {"limitation": "readings of P > 3 are missed by 1.2"}
+    found = [record(seed=k, scan=f"s{k}", label="splat", details=dark) for k in (1, 2)]
+    twin = record(label="sirt", variant="metal_free", details={"limitation": "the scan is truncated"})
+    said = "limits that methods state of their volumes: splat on lung (seed 1), lung (seed 2): readings of P > 3"
+    assert [text.partition(" are missed")[0] for text in records.remarks([*found, twin])] == [said]
+    assert said in tables.render(found, "md")
+
+
 def test_every_field_of_a_run_changes_its_identity():
     changes = {
         "scene": "teeth", "scene_id": "x", "scan": "x", "seed": 1, "method": "nmar", "params": {"a": 2, "b": 2.5},

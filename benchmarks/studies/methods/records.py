@@ -214,10 +214,21 @@ def remarks(records: Sequence[RunRecord]) -> list[str]:
     known = {r.task.data: r.data_code for r in shown if r.data_code}
     made = {f"{r.run.scene} (seed {r.run.seed})": known.get(r.task.data, "") for r in shown}
     grids = {f"{r.label} on {r.run.scene}": r.details for r in shown}
-    return [text for text in (outdated(records), mixture(made.items()), shared_text(grids), _stated(shown)) if text]
+    said = outdated(records), mixture(made.items()), shared_text(grids), _stated(shown), _limits(shown)
+    return [text for text in said if text]
 
 
 def _stated(shown: Sequence[RunRecord]) -> str:
     """Say whose seconds were not measured here; "" where all were."""
     labels = dict.fromkeys(r.label for r in shown if r.cost is not None and r.cost.device == STATED)
     return f"not measured but stated: the seconds of {', '.join(labels)}" if labels else ""
+
+
+def _limits(shown: Sequence[RunRecord]) -> str:
+    """Say which volumes come with a limitation that their method states; "" where none does."""
+    runs: dict[tuple[str, str], list[str]] = {}
+    for r in shown:
+        if r.run.variant == METAL and (text := r.details.get("limitation")):
+            runs.setdefault((r.label, str(text)), []).append(f"{r.run.scene} (seed {r.run.seed})")
+    listed = (f"{label} on {', '.join(cases)}: {text}" for (label, text), cases in runs.items())
+    return f"limits that methods state of their volumes: {'; '.join(listed)}" if runs else ""
