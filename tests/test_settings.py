@@ -102,8 +102,8 @@ def test_a_parameter_that_is_not_there_is_refused_and_near_ones_are_suggested(na
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
-        ("splat.filtration=abc", "expected a number within 0.1 to 20 (mm Al), got 'abc'"),
-        ("splat.filtration=0.05", "expected a number within 0.1 to 20 (mm Al), got 0.05"),
+        ("splat.filtration=abc", "expected a number within 0.1 to 20 (mm Al), or null, got 'abc'"),
+        ("splat.filtration=0.05", "expected a number within 0.1 to 20 (mm Al), or null, got 0.05"),
         ("splat.passes=3", "expected a list of 2, each a whole number within 0 to 1000, or null, got 3"),
         ("splat.passes=[0,0]", "expected two counts that are not both 0, got (0, 0)"),
         ("splat.filtraton=1", "unknown parameter; did you mean filtration?"),
@@ -201,10 +201,10 @@ def test_a_method_takes_keywords_or_settings_and_checks_both(smallest):
 
 
 def test_bounds_are_those_of_the_struct_alone():
-    found = parameters_of(fast.Settings)["filtration"]
-    assert found.expected == "a number within 0.1 to 20 (mm Al)" and found.default == 0.5
+    found = parameters_of(fast.Settings)["fineness"]
+    assert found.expected == "a number within 1 to 16" and found.default == 1.5
     hints = typing.get_type_hints(fast.Settings, include_extras=True)
-    assert hints["filtration"] == found.kind
+    assert hints["fineness"] == found.kind
 
 
 def test_the_list_of_methods_names_every_parameter_with_its_default_and_unit(monkeypatch, capsys):
@@ -218,7 +218,7 @@ def test_the_list_of_methods_names_every_parameter_with_its_default_and_unit(mon
         head, *lines = block.strip().splitlines()
         assert head == f"{name}: {method.inputs}"
         assert [line.split()[0] for line in lines] == list(method.params)
-    words = "filtration 0.5 a number within 0.1 to 20 (mm Al); filtration behind the assumed tube"
+    words = "filtration null a number within 0.1 to 20 (mm Al), or null; filtration behind the assumed tube"
     assert words in " ".join(blocks["splat"].split())
     monkeypatch.setattr(sys, "argv", ["run-benchmark", "methods", "fdk"])
     assert cli.run_benchmark() == 0 and capsys.readouterr().out == blocks["fdk"].rstrip("\n") + "\n"

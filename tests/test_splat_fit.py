@@ -324,7 +324,7 @@ def test_early_passes_and_coarser_grids_denoise_more(small, monkeypatch):
         return denoise(self, values, tau, iterations)
 
     monkeypatch.setattr(Lattice, "denoise", noting)
-    reconstruct(small.scan, passes=(3, 5))
+    reconstruct(small.scan, passes=(3, 5), filtration=0.5)
     sizes = list(dict.fromkeys(size for size, _ in told))
     assert len(sizes) == 2
     coarse, fine = ([tau for size, tau in told if size == wanted] for wanted in sizes)

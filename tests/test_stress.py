@@ -324,7 +324,8 @@ def test_a_fit_begins_on_one_side_of_waters_kink(monkeypatch):
 
     monkeypatch.setattr(course.Course, "_fit", spied)
     for kvp in (60.0, 70.0, 80.0, 90.0, 100.0, 110.0):
-        find("splat", {"passes": (1, 0)}).reconstruct(scan_of("water", side=8, tube=Tube(kvp=kvp)).scan)
+        method = find("splat", {"passes": (1, 0), "filtration": 0.5})
+        method.reconstruct(scan_of("water", side=8, tube=Tube(kvp=kvp)).scan)
     assert began == [True] * 6
 
 

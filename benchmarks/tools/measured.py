@@ -71,6 +71,12 @@ PAGES: dict[str, Page] = {
         command="python -m ctsim.benchmarks.tools.assumptions results/ docs/measured",
         sources=(*METHODS, "benchmarks/scores/", f"{SUITES}assumptions.toml"),
     ),
+    "beams": Page(
+        title="Beams that splats are not told",
+        command="python -m ctsim.benchmarks.tools.beams docs/measured",
+        sources=(*SIMULATOR, "reconstruct/splat/", "benchmarks/scores/", f"{SUITES}beams.toml"),
+        explained="splats.md",
+    ),
     "methods": Page(
         title="Methods: settings and experiments",
         command="run-benchmark pareto results/ --suite benchmarks/suites/tune-settings.toml --part methods",

@@ -26,6 +26,7 @@ from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
 from ctsim.reconstruct.splat.common import Common, Energy
 from ctsim.reconstruct.splat.course import PASSES, Course, levels_of, passes_over
 from ctsim.reconstruct.splat.curve import STRONGEST, MaterialCurve
+from ctsim.reconstruct.splat.filtration import USUAL, Filtration, found
 from ctsim.reconstruct.splat.level import Data
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import FILTER, Response, basis_functions, evaluate, make_response, tangent
@@ -38,6 +39,7 @@ OPEN = 5.0  # standard deviations of an open pixel below which a ray met nothing
 LEAST_OPEN = 0.01
 VIEWS, SHORTEST = 12, 0.5  # views whose pixels stand for all, and the least path in voxels that counts as one
 DENSEST = 15.0  # times water, that is no metal: enamel 9, titanium 43
+ENOUGH, TRIAL = 32, (3, 6)  # voxels along an axis on which the filtration is found, and the passes of a trial
 AT_THE_END, FEW, FEWEST, MANY = 0.9, 1e-4, 10, 0.01
 """Share of the curve's last attenuation, which no metal has; the share of the splats, or how many, that may have it;
 and the share with which a fit has diverged."""
@@ -49,6 +51,7 @@ Image = NDArray[np.float32]
 
 Passes = Annotated[int, msgspec.Meta(ge=0, le=1000)]
 Excess = Annotated[float, msgspec.Meta(ge=0, le=100)]
+Filter = Annotated[float, msgspec.Meta(ge=FILTER[0], le=FILTER[2])]
 
 
 class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -69,7 +72,7 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     fineness: Annotated[float, about("how much finer the finest grid is than the volume's", ge=1, le=16)] = 1.5
     exact: Annotated[bool, about("project splats by their exact line integrals, not by EWA")] = False
     response: Annotated[Literal["tube", "known"], about("beam: assumed, or known from tube and detector")] = "tube"
-    filtration: Annotated[float, about("filtration behind the assumed tube", "mm Al", ge=FILTER[0], le=FILTER[2])] = 0.5
+    filtration: Annotated[Filter | None, about("filtration behind the assumed tube; null: found", "mm Al")] = None
     readout: Annotated[Energy | Literal["hardened"], about("energy at which the volume is read")] = "hardened"
     scatter: Annotated[Excess | None, about("scatter in every reading; null: estimated", "of the open field")] = None
 
@@ -79,10 +82,10 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
             raise InputError("passes: expected two counts that are not both 0, got (0, 0)")
         refuse_beam(self.response, self.tube, self.detector)
 
-    def make_response(self, e_max: float) -> Response:
-        """Build the response for a scan of greatest energy `e_max` (keV)."""
+    def make_response(self, e_max: float, filtration: float) -> Response:
+        """Build the response for a scan of greatest energy `e_max` (keV), of the tube behind a `filtration` (mm Al)."""
         if self.response == "tube":
-            return make_response("tube", e_max=e_max, basis="klein-nishina", theta=(self.filtration,))
+            return make_response("tube", e_max=e_max, basis="klein-nishina", theta=(filtration,))
         seen = detected(self.tube, self.detector, e_max)
         return make_response("known", e_max=e_max, basis="klein-nishina", spectrum=seen)
 
@@ -101,11 +104,14 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     below = Below.of(scan)
     weights = weights_and_bounds(scan, p.numpy(), valid, scatter, below.noise)
     data = Data(geometry=finest, p=p.numpy(), weights=weights, scatter=scatter)
-    response = settings.make_response(scan.e_max)
+    levels = levels_of(data, coarse=(settings.passes or PASSES)[0] > 0)
+    filtration = None if clamped.all() else _filtration(levels, scan, settings)
+    response = settings.make_response(scan.e_max, filtration.value if filtration else settings.filtration or USUAL)
 
-    fit = None if clamped.all() else _fitted(_course(data, response, settings), scan, settings, stopwatch)
+    fit = None if clamped.all() else _fitted(_course(levels, response, settings), scan, settings, stopwatch)
     details: dict[str, Any] = {
         "response": response.described(),
+        **({} if filtration is None else {"filtration": filtration.described()}),
         "scatter": scatter,
         "clamped_pixels": int(clamped.sum()),
         "grid": list(finest.n_voxel),
@@ -122,7 +128,8 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     status, reason = _verdict(fit, values)
     missed = _dark_misfit(fit)
     beyond = seen_beyond(data.p, scan.geometry, scan.i0)
-    limits = [said for said in (below.sentence, _unexplained(fit, missed), beyond.sentence) if said]
+    found_at = "" if filtration is None else filtration.sentence
+    limits = [said for said in (below.sentence, _unexplained(fit, missed), beyond.sentence, found_at) if said]
     details |= {
         "read-out": how,
         "dark_misfit": missed,
@@ -138,6 +145,20 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         details=details,
         at_energy=functools.partial(_at_energy, rho, response),
     )
+
+
+def _filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtration | None:
+    """Find the filtration by coarse fits; None where it is given or the beam is known."""
+    if settings.response != "tube" or settings.filtration is not None:
+        return None
+    levels = levels if len(levels) > 1 else levels_of(levels[-1], coarse=True)
+    few = levels[: 1 + next((k for k, level in enumerate(levels) if min(level.geometry.n_voxel) >= ENOUGH), 0)]
+    trial = msgspec.structs.replace(settings, passes=TRIAL)
+
+    def fit_of(value: float) -> Fit | None:
+        return _course(few, settings.make_response(scan.e_max, value), trial).go(lambda fit, whole, share: True)
+
+    return found(fit_of)
 
 
 def _fitted(course: Course, scan: Scan, settings: Settings, stopwatch: Stopwatch) -> Fit | None:
@@ -193,11 +214,12 @@ def _runaway(fit: Fit) -> int:
 
 def _dark_misfit(fit: Fit) -> float | None:
     """Return the root mean square of p − P over dark readings of a few views, None where there are hardly any."""
-    views = few_views(fit.data.geometry.n_views, VIEWS)
-    lacking = fit.lacking(np.asarray(views), DARK)
-    if lacking.size <= DARK_SHARE * len(views) * math.prod(fit.data.geometry.n_detector):
+    views = np.asarray(few_views(fit.data.geometry.n_views, VIEWS))
+    p, weights = fit.data.p[views], fit.data.weights[views]
+    dark = (weights > 0) & (p > DARK)
+    if dark.sum() <= DARK_SHARE * dark.size:
         return None
-    return float(np.sqrt(np.mean(np.square(lacking, dtype=np.float64))))
+    return float(np.sqrt(np.mean(np.square((p - fit.fitted(views))[dark], dtype=np.float64))))
 
 
 def _unexplained(fit: Fit, missed: float | None) -> str:
@@ -256,9 +278,9 @@ def _summed(weights: tuple[float, float], rho: Image) -> Image:
     return np.float32(weights[0]) * rho[0] + np.float32(weights[1]) * rho[1]
 
 
-def _course(data: Data, response: Response, settings: Settings) -> Course:
+def _course(levels: list[Data], response: Response, settings: Settings) -> Course:
+    data = levels[-1]
     met = max(OPEN / math.sqrt(_open_photons(data)), LEAST_OPEN)
-    levels = levels_of(data, coarse=(settings.passes or PASSES)[0] > 0)
     return Course(
         levels=levels,
         passes=passes_over(levels, settings.passes),

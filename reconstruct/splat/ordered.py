@@ -163,13 +163,18 @@ class Fit:
         paths = self.projector.forward(self.curve.densities_of(self.u, self.lattice.unit, self._pair), views)
         return np.ascontiguousarray(paths[:, 0]), np.ascontiguousarray(paths[:, 1])
 
-    def lacking(self, views: NDArray[np.int64], above: float) -> Image:
-        """Return measured p − P of those readings of some views, no bounds, whose p is more than `above`."""
+    def fitted(self, views: NDArray[np.int64]) -> Image:
+        """Return P of some views, with the scatter of the data: [view, v, u]."""
         p, _, _ = evaluate(self.response, *self._paths(views))
         if self.data.scatter:
             p = -np.logaddexp(-p, np.float32(math.log(self.data.scatter)))
-        measured, weights = (self.projector.arranged(a[views]) for a in (self.data.p, self.data.weights))
-        return (measured - p)[(weights > 0) & (measured > above)]
+        return self.projector.pictures(p)
+
+    def shadow(self, views: NDArray[np.int64], above: float) -> Image:
+        """Return the line integrals of what is above a value of `u`: [view, v, u]."""
+        values = np.where(self.u > above, self.u / np.float32(self.lattice.unit), np.float32(0))
+        np.stack([values, values], 1, out=self._pair)  # the projector takes two channels: one is looked at
+        return self.projector.pictures(self.projector.forward(self._pair, views)[:, 0])
 
     def _back(self, slopes: Image, images: Image, views: NDArray[np.int64]) -> Image:
         return self.projector.adjoint(slopes * images[:, None], views, self._pair)

@@ -1,0 +1,146 @@
+"""How splats fare before beams that they are not told: the filtration that they find, and what it is worth.
+
+    python -m ctsim.benchmarks.tools.beams docs/measured
+
+Each scene of the suite `beams` is simulated and reconstructed three times: behind the usual filtration, behind the one
+that is found, and with the true tube and detector. The page is written to the folder, or printed without one.
+"""
+
+import math
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from ctsim import score_volume, simulate_scene
+from ctsim.beam.quadrature import full_rule
+from ctsim.beam.spectrum import spectrum
+from ctsim.benchmarks.cli import guarded
+from ctsim.benchmarks.engine.host import commit, machine
+from ctsim.benchmarks.engine.table import Table, simple
+from ctsim.benchmarks.suites import load
+from ctsim.errors import InputError
+from ctsim.materials import attenuation
+from ctsim.phantoms.scene import Scene
+from ctsim.reconstruct.splat.fast import Settings, reconstruct
+from ctsim.reconstruct.splat.filtration import USUAL
+from ctsim.reconstruct.splat.response import FILTER, make_response
+from ctsim.types import Scanner
+
+NAME = "beams.md"
+TITLE = "Beams that splats are not told"
+SUITE = "beams"
+LONGEST = 40.0  # mm of water, on which the true beam and a filtration are compared
+CAPTION = (
+    f"PSNR3D of tissue (dB), soft-tissue RMSE (HU), and the attenuation in the metal's core over the true one. Usual: "
+    f"behind {USUAL:g} mm Al, which is assumed where nothing is found. Found: behind the filtration that the method "
+    "finds in the scan, in brackets the range that explains it as well. Known: told the tube and the detector. The "
+    f"equivalent filtration is the one behind which the assumed tube hardens in up to {LONGEST:g} mm of water as the "
+    "true beam does; it is computed from both spectra, without any scan."
+)
+HEAD = (
+    *("scene", "equivalent (mm Al)", "found (mm Al)", "usual: PSNR3D", "HU", "core"),
+    *("found: PSNR3D", "HU", "core", "known: PSNR3D", "HU", "core", "limit said"),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fared:
+    """PSNR3D in dB, soft-tissue RMSE in HU, the core's ratio, and the details of a volume."""
+
+    psnr: float
+    rmse: float
+    core: float
+    details: Mapping[str, Any]
+
+    def cells(self) -> list[str]:
+        """Return the numbers as a table shows them."""
+        return [f"{self.psnr:.2f}", f"{self.rmse:.0f}", f"{self.core:.2f}"]
+
+
+def main(arguments: list[str]) -> int:
+    """Write or print the page; return 0."""
+    if len(arguments) > 1:
+        raise InputError("expected the folder of the measured pages or nothing")
+    text = page(load(SUITE), lambda name: sys.stderr.write(f"{name}\n"))
+    if not arguments:
+        sys.stdout.write(text)
+        return 0
+    path = Path(arguments[0]) / NAME
+    path.write_text(text, encoding="utf-8")
+    sys.stdout.write(f"{path}\n")
+    return 0
+
+
+def page(scenes: Sequence[Scene], tell: Callable[[str], object]) -> str:
+    """Return the page: how it was made, and a row for each scene; `tell` is called with a scene's name at its start."""
+    rows = []
+    for scene in scenes:
+        tell(scene.name)
+        rows.append(row(scene))
+    command = next(line.strip() for line in (__doc__ or "").splitlines() if line.startswith("    "))
+    made = f"# {TITLE}\n\nMade by `{command}`. Do not edit. Commit {commit()}, {machine()}."
+    return f"{made}\n\n{CAPTION}\n\n{table(rows).markdown()}"
+
+
+def table(rows: Sequence[Sequence[str]]) -> Table:
+    """Return the table of rows of cells."""
+    return simple(HEAD, [list(cells) for cells in rows], numbers=HEAD[1:-1])
+
+
+def row(scene: Scene) -> list[str]:
+    """Simulate a scene, reconstruct it three times, and return its cells."""
+    stored, scanner = simulate_scene(scene), scene.resolve()
+
+    def fared(**settings: Any) -> Fared:
+        volume = reconstruct(stored.scan, Settings(**settings))
+        scores = score_volume(volume, stored)
+        told = [scores[protocol].values[metric] for protocol, metric in
+                (("tissue", "psnr3d"), ("soft", "rmse"), ("metal", "core_ratio"))]  # fmt: skip
+        psnr, rmse, core = (math.nan if value is None else float(value) for value in told)
+        return Fared(psnr=psnr, rmse=rmse, core=core, details=volume.details)
+
+    tables = {"tube": msgspec.to_builtins(scanner.tube), "detector": msgspec.to_builtins(scanner.detector)}
+    usual, found, known = fared(filtration=USUAL), fared(), fared(response="known", **tables)
+    filtration = found.details["filtration"]
+    return [
+        scene.name,
+        f"{equivalent(scanner):.2g}",
+        f"{filtration['value']:.2g} ({filtration['low']:.2g} to {filtration['high']:.2g})",
+        *(cell for one in (usual, found, known) for cell in one.cells()),
+        found.details.get("limitation", ""),
+    ]
+
+
+def equivalent(scanner: Scanner) -> float:
+    """Return the filtration (mm Al) behind which the assumed tube hardens in water as a scanner's beam does.
+
+    Lengths of water that are read off one beam with the table of the other must be proportional to the true ones.
+    """
+    true = full_rule(spectrum(scanner.tube), scanner.detector)
+    lengths = np.linspace(0.5, LONGEST, 80)
+    p = _p(lengths, true.energies, true.w1)
+
+    def curved(log_filtration: float) -> float:
+        theta, e_max = (math.exp(log_filtration),), float(true.energies.max())
+        response = make_response("tube", e_max=e_max, basis="klein-nishina", theta=theta)
+        fine = np.linspace(0, 2 * LONGEST, 400)
+        read = np.interp(p, _p(fine, response.energies_kev, response.eta), fine)
+        return float(np.sqrt(np.mean((read - (read @ lengths) / (lengths @ lengths) * lengths) ** 2)))
+
+    ends = math.log(FILTER[0]), math.log(FILTER[2])
+    return math.exp(float(minimize_scalar(curved, bounds=ends, method="bounded").x))
+
+
+def _p(lengths: NDArray[np.float64], energies: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
+    return -np.log(np.exp(-np.outer(lengths, attenuation("water", energies))) @ shares)
+
+
+if __name__ == "__main__":
+    sys.exit(guarded("beams", "ctsim.benchmarks.tools.beams", sys.argv[1:]))

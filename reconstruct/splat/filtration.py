@@ -1,0 +1,117 @@
+"""The filtration behind the assumed tube, found from the scan alone.
+
+Line integrals of a wrong response are those of no object: views contradict each other wherever dense and thin paths
+cross, and no fit explains them all. What a coarse fit leaves unexplained is averaged over neighbouring rays, whose
+noise and missed edges cancel, while the error of the response does not: it changes slowly. Rays through metal are left
+out, since what its shape leaves is larger. The misfit falls steeply up to the right filtration, and then hardly
+changes: beams that are nearly monochromatic all look alike. Scatter and blur, which the response does not know, move
+the least misfit beyond it. So the value is the one nearest to the usual filtration that explains the scan nearly as
+well as the best.
+
+Consistency of the data is what other calibrations of a beam without a phantom use, too (Würfl et al., Epipolar
+consistency beam hardening, Med. Phys. 44, 2017).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from ctsim.reconstruct.splat.ordered import Fit
+from ctsim.reconstruct.splat.response import FILTER
+
+USUAL = 0.5  # mm of aluminium, from which the search starts
+TRIED = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 14.0, 20.0)
+AS_GOOD = 1.05  # times the least misfit: better is not told from it, as materials and spectra are not those assumed
+WIDTH = 1 / 16  # σ of the averages, in widths of the panel
+MET, DARK = 0.15, 3.0
+"""P of rays that count: below they graze the object, above scatter and lacking photons make more than the beam does."""
+METAL, FAINT = 8.0, 1e-3
+"""Times water, what is metal; what of P it adds at most to a ray that is said not to meet it."""
+LEAST = 0.3  # of the neighbours that count: an average over fewer is left out
+FEWEST = 1000  # averages, below which there is no misfit
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Filtration:
+    """The filtration (mm of aluminium), the least and the greatest that explain the scan as well, and all misfits.
+
+    `misfits` are the root mean squares of P by the filtration tried, empty where the scan shows too little.
+    """
+
+    value: float
+    low: float
+    high: float
+    misfits: dict[float, float]
+
+    def described(self) -> dict[str, Any]:
+        """Return all of it in the types of JSON."""
+        tried = {f"{t:g}": round(value, 6) for t, value in self.misfits.items()}
+        return {"value": self.value, "low": self.low, "high": self.high, "misfits": tried}
+
+    @property
+    def sentence(self) -> str:
+        """Say that the softest beam of the assumed tube explains the scan best, or nothing.
+
+        The hardest is no such limit: hard beams differ little.
+        """
+        if not self.misfits or min(self.misfits, key=lambda t: self.misfits[t]) != FILTER[0]:
+            return ""
+        return (
+            f"the beam is as soft as that of the assumed tube behind {FILTER[0]:g} mm Al, or softer: values may be "
+            'too low; the response "known" takes the tube and the detector'
+        )
+
+
+def found(fit_of: Callable[[float], Fit | None]) -> Filtration:
+    """Search the filtration that a scan shows; `fit_of` returns the coarse fit at a filtration, None for nothing."""
+    start = TRIED.index(USUAL)
+    misfits: dict[float, float] = {}
+
+    def misfit_at(k: int) -> float:
+        if (value := TRIED[k]) not in misfits:
+            fit = fit_of(value)
+            misfits[value] = math.inf if fit is None else misfit(fit)
+        return misfits[value]
+
+    if not math.isfinite(misfit_at(start)):
+        return Filtration(value=USUAL, low=FILTER[0], high=FILTER[2], misfits={})
+    for way in (1, -1):
+        k = start
+        # one more than where it stops falling, since a step of the search is not all that it varies by
+        while 0 <= k + way < len(TRIED) and misfit_at(k) <= AS_GOOD * min(misfits.values()):
+            k += way
+            misfit_at(k)
+    return _chosen(dict(sorted(misfits.items())))
+
+
+def _chosen(misfits: dict[float, float]) -> Filtration:
+    """Choose among the misfits, between which they are taken as straight lines over the logarithm."""
+    tried, values = np.log(list(misfits)), np.array(list(misfits.values()))
+    limit = AS_GOOD * values.min()
+    fine = np.linspace(tried[0], tried[-1], 2001)
+    good = fine[np.interp(fine, tried, values) <= limit]
+    nearest = good[np.argmin(np.abs(good - math.log(USUAL)))]
+    value = USUAL if misfits[USUAL] <= limit else float(np.exp(nearest))
+    return Filtration(
+        value=round(value, 3), low=round(math.exp(good[0]), 3), high=round(math.exp(good[-1]), 3), misfits=misfits
+    )
+
+
+def misfit(fit: Fit) -> float:
+    """Return the root mean square of locally averaged p − P, over rays that meet the object and no metal."""
+    views = np.arange(fit.data.geometry.n_views)
+    p = fit.fitted(views)
+    metal = fit.shadow(views, METAL * fit.curve.water)
+    counts = (fit.data.weights > 0) & (p > MET) & (p < DARK) & (metal < FAINT)
+    sigma = (0, *[WIDTH * fit.data.geometry.n_detector[1]] * 2)
+    share = ndimage.gaussian_filter(counts.astype(np.float32), sigma)
+    total = ndimage.gaussian_filter(np.where(counts, fit.data.p - p, np.float32(0)), sigma)
+    counts &= share > LEAST
+    if counts.sum() < FEWEST:
+        return math.inf
+    means = total[counts] / share[counts]
+    return float(np.sqrt(np.mean(np.square(means, dtype=np.float64))))
