@@ -39,7 +39,7 @@ OPEN = 5.0  # standard deviations of an open pixel below which a ray met nothing
 LEAST_OPEN = 0.01
 VIEWS, SHORTEST = 12, 0.5  # views whose pixels stand for all, and the least path in voxels that counts as one
 DENSEST = 15.0  # times water, that is no metal: enamel 9, titanium 43
-ENOUGH, TRIAL = 32, (3, 6)  # voxels along an axis on which the filtration is found, and the passes of a trial
+ENOUGH, TRIAL = 32, (2, 4)  # voxels along an axis on which the filtration is found, and the passes of a trial
 AT_THE_END, FEW, FEWEST, MANY = 0.9, 1e-4, 10, 0.01
 """Share of the curve's last attenuation, which no metal has; the share of the splats, or how many, that may have it;
 and the share with which a fit has diverged."""
