@@ -135,7 +135,8 @@ def equivalent(scanner: Scanner) -> float:
         return float(np.sqrt(np.mean((read - (read @ lengths) / (lengths @ lengths) * lengths) ** 2)))
 
     ends = math.log(FILTER[0]), math.log(FILTER[2])
-    return math.exp(float(minimize_scalar(curved, bounds=ends, method="bounded").x))
+    best: Any = minimize_scalar(curved, bounds=ends, method="bounded")
+    return math.exp(float(best.x))
 
 
 def _p(lengths: NDArray[np.float64], energies: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
