@@ -85,7 +85,7 @@ def page(scenes: Sequence[Scene], tell: Callable[[str], object]) -> str:
         tell(scene.name)
         rows.append(row(scene))
     command = next(line.strip() for line in (__doc__ or "").splitlines() if line.startswith("    "))
-    made = f"# {TITLE}\n\nMade by `{command}`. Do not edit. Commit {commit()}, {machine()}."
+    made = f"# {TITLE}\n\nMade by `{command}`. Do not edit. Measured at commit {commit()}, {machine()}."
     return f"{made}\n\n{CAPTION}\n\n{table(rows).markdown()}"
 
 
