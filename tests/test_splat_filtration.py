@@ -52,6 +52,12 @@ def test_a_scan_that_shows_nothing_leaves_the_usual_filtration():
     assert got == Filtration(value=USUAL, low=0.1, high=20.0, misfits={}) and not got.sentence
 
 
+@pytest.mark.parametrize("broken", [math.nan, math.inf])
+def test_a_trial_that_fails_is_left_out(monkeypatch, broken):
+    got = found(Tried(monkeypatch, lambda t: 1.0 if t == USUAL else broken))
+    assert got.value == USUAL and got.misfits == {USUAL: 1.0}
+
+
 def test_a_beam_softer_than_any_assumed_is_said(monkeypatch):
     assert "as soft as" in found(Tried(monkeypatch, lambda t: t)).sentence
     assert not found(Tried(monkeypatch, lambda t: 1 / t)).sentence

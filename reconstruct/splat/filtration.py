@@ -74,7 +74,8 @@ def found(fit_of: Callable[[float], Fit | None]) -> Filtration:
     def misfit_at(k: int) -> float:
         if (value := TRIED[k]) not in misfits:
             fit = fit_of(value)
-            misfits[value] = math.inf if fit is None else misfit(fit)
+            found_there = math.inf if fit is None else misfit(fit)
+            misfits[value] = found_there if math.isfinite(found_there) else math.inf
         return misfits[value]
 
     if not math.isfinite(misfit_at(start)):
@@ -85,7 +86,7 @@ def found(fit_of: Callable[[float], Fit | None]) -> Filtration:
         while 0 <= k + way < len(TRIED) and misfit_at(k) <= AS_GOOD * min(misfits.values()):
             k += way
             misfit_at(k)
-    return _chosen(dict(sorted(misfits.items())))
+    return _chosen({t: value for t, value in sorted(misfits.items()) if math.isfinite(value)})
 
 
 def _chosen(misfits: dict[float, float]) -> Filtration:
