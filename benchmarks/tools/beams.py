@@ -42,8 +42,8 @@ CAPTION = (
     f"behind {USUAL:g} mm Al, which is assumed where nothing is found. Found: behind the filtration that the method "
     "finds in the scan, in brackets the range that explains it as well. Known: told the tube and the detector. The "
     f"equivalent filtration is the one behind which the assumed tube hardens in up to {LONGEST:g} mm of water as the "
-    "true beam does; it is computed from both spectra, without any scan. The constants of the search were chosen on these "
-    "scenes, among others, so that this is no test on scenes unseen."
+    "true beam does; it is computed from both spectra, without any scan. The constants of the search were chosen on "
+    "these scenes, among others, so that this is no test on scenes unseen."
 )
 HEAD = (
     *("scene", "equivalent (mm Al)", "found (mm Al)", "usual: PSNR3D", "HU", "core"),
