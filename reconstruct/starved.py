@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.reconstruct.log import count_floor
+from ctsim.reconstruct.scatter import Scatter
 from ctsim.types import Scan
 
 SURE = 2.0  # standard deviations of the dark noise that a reading may lie below the truth
 UNSEEN = 3.0  # photons that may have been expected where none came, at 95 %
-DOUBT = 0.25  # of the scatter, which is taken as one constant
+DOUBT = 0.25  # of the scatter, which is known no better behind metal
 WEIGHT = 0.002  # of a bound, as of a reading of P = 6.2
 ENOUGH = 100  # readings below the dark level that tell noise
 HALF, SPREAD = math.sqrt(2 / math.pi), math.sqrt(1 - 3 / math.pi)
@@ -33,24 +34,29 @@ def photon_weights(p: Image, valid: NDArray[np.bool_]) -> Image:
     return weights
 
 
-def weights_and_bounds(scan: Scan, p: Image, valid: NDArray[np.bool_], scatter: float, noise: float) -> Image:
+def weights_and_bounds(scan: Scan, p: Image, valid: NDArray[np.bool_], scatter: Scatter, noise: float) -> Image:
     """Return weights [view, v, u]: exp(−p) of readings, 0 of what says nothing, and −WEIGHT of bounds.
 
-    Where a reading is a bound, `p` is changed to the least −ln(primary/open) that it allows. `scatter` and `noise`, the
-    standard deviation of a dark reading, are over the open field.
+    `p` is changed. Where a reading is a bound, it becomes the least −ln(primary/open) that it allows; elsewhere what
+    would be read if scatter were the same everywhere, its mean, which keeps the logarithm finite. `noise`, the standard
+    deviation of a dark reading, is over the open field.
     """
     open_field = scan.flat.numpy() - np.float32(scan.dark)
-    floor = count_floor(scan)
+    floor, mean = count_floor(scan), np.float32(scatter.mean)
     usable = np.isfinite(open_field) & (open_field > floor)
     scale = np.where(usable, 1 / np.where(usable, open_field, 1), 0).astype(np.float32)
     least = max(floor / float(np.median(open_field[usable])), SURE * noise) if usable.any() else 0.0
-    may_be = np.float32(math.hypot(SURE * noise, UNSEEN / scan.i0) + DOUBT * scatter)
+    darkest = np.float32(math.hypot(SURE * noise, UNSEEN / scan.i0))
     weights = photon_weights(p, valid)
     for view, (reading, weight) in enumerate(zip(p, weights, strict=True)):
-        share = _signal(scan, view) * scale - np.float32(scatter)
-        starved = usable & np.isfinite(share) & (share <= least + DOUBT * scatter)
+        scattered = scatter.of(view, reading.shape)
+        share, doubt = _signal(scan, view) * scale - scattered, np.float32(DOUBT) * scattered
+        starved = usable & np.isfinite(share) & (share <= least + doubt)
         weight[starved] = -WEIGHT
-        reading[starved] = -np.log(np.maximum(share[starved], 0) + may_be)
+        if scatter.source is not None:
+            read = weight > 0
+            reading[read] = -np.log(share[read] + mean)
+        reading[starved] = -np.log((np.maximum(share, 0) + darkest + doubt)[starved])
     return weights
 
 

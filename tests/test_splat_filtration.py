@@ -105,3 +105,11 @@ def test_the_usual_beam_is_found_to_be_one():
 
 def test_a_fit_without_coarser_levels_finds_it_on_one(hard):
     assert quality(hard, passes=(0, 1))[1] == quality(hard, passes=(3, 1))[1]
+
+
+def test_a_grid_too_coarse_for_the_edges_leaves_the_usual_filtration():
+    """Searched on 18 voxels, 12 mm were found in a scan behind 0.5, and its error grew by half."""
+    coarse = scan_behind(("Al", 0.5), n_voxel=[18, 18, 18], n_detector=[27, 27], n_views=12, scatter={"level": 0})
+    volume = reconstruct(coarse.scan, Settings(fineness=1.5))
+    assert max(volume.details["grid"]) < 32 and "filtration" not in volume.details
+    assert volume.details["response"] == reconstruct(coarse.scan, Settings(filtration=USUAL)).details["response"]

@@ -16,6 +16,7 @@ from ctsim.geometry import Geometry
 from ctsim.reconstruct import starved
 from ctsim.reconstruct.beyond import seen_beyond
 from ctsim.reconstruct.log import line_integrals
+from ctsim.reconstruct.scatter import Scatter
 from ctsim.reconstruct.splat import fast
 from ctsim.reconstruct.splat.curve import MaterialCurve
 from ctsim.reconstruct.splat.fast import reconstruct
@@ -46,7 +47,7 @@ def scan_of(p, noise=NOISE, seed=0, whole=False) -> Scan:
 
 def bounds_of(scan, scatter=0.0):
     p, clamped = line_integrals(scan, slice(None))
-    weights = weights_and_bounds(scan, p.numpy(), ~clamped.numpy(), scatter, Below.of(scan).noise)
+    weights = weights_and_bounds(scan, p.numpy(), ~clamped.numpy(), Scatter(floor=scatter), Below.of(scan).noise)
     return p.numpy(), weights
 
 

@@ -18,6 +18,7 @@ from ctsim.benchmarks.engine.study import provenance
 from ctsim.benchmarks.engine.table import Table, simple
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest, read
 from ctsim.benchmarks.studies.methods.tables import Numbers, numbers
+from ctsim.benchmarks.tools.page import put
 from ctsim.errors import InputError
 
 STRICT = "-strict"
@@ -39,14 +40,7 @@ def main(arguments: list[str]) -> int:
     if len(arguments) not in (1, 2):
         raise InputError("expected RESULTS, and the folder of the measured pages or nothing")
     records = latest(read(Path(arguments[0])))
-    text = page(records)
-    if len(arguments) == 1:
-        sys.stdout.write(text)
-        return 0
-    path = Path(arguments[1]) / NAME
-    path.write_text(text, encoding="utf-8")
-    sys.stdout.write(f"{path}\n")
-    return 0
+    return put(page(records), NAME, arguments[1] if len(arguments) > 1 else None)
 
 
 def page(records: Sequence[RunRecord]) -> str:

@@ -8,9 +8,8 @@ that is found, and with the true tube and detector. The page is written to the f
 
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -22,10 +21,8 @@ from ctsim import score_volume, simulate_scene
 from ctsim.beam.quadrature import full_rule
 from ctsim.beam.spectrum import spectrum
 from ctsim.benchmarks.cli import guarded
-from ctsim.benchmarks.engine.host import commit, machine
 from ctsim.benchmarks.engine.table import Table, simple
-from ctsim.benchmarks.suites import load
-from ctsim.errors import InputError
+from ctsim.benchmarks.tools.page import headed, of_suite, told
 from ctsim.materials import attenuation
 from ctsim.phantoms.scene import Scene
 from ctsim.reconstruct.splat.fast import Settings, reconstruct
@@ -67,27 +64,12 @@ class Fared:
 
 def main(arguments: list[str]) -> int:
     """Write or print the page; return 0."""
-    if len(arguments) > 1:
-        raise InputError("expected the folder of the measured pages or nothing")
-    text = page(load(SUITE), lambda name: sys.stderr.write(f"{name}\n"))
-    if not arguments:
-        sys.stdout.write(text)
-        return 0
-    path = Path(arguments[0]) / NAME
-    path.write_text(text, encoding="utf-8")
-    sys.stdout.write(f"{path}\n")
-    return 0
+    return of_suite(arguments, SUITE, NAME, page)
 
 
-def page(scenes: Sequence[Scene], tell: Callable[[str], object]) -> str:
-    """Return the page: how it was made, and a row for each scene; `tell` is called with a scene's name at its start."""
-    rows = []
-    for scene in scenes:
-        tell(scene.name)
-        rows.append(row(scene))
-    command = next(line.strip() for line in (__doc__ or "").splitlines() if line.startswith("    "))
-    made = f"# {TITLE}\n\nMade by `{command}`. Do not edit. Measured at commit {commit()}, {machine()}."
-    return f"{made}\n\n{CAPTION}\n\n{table(rows).markdown()}"
+def page(scenes: Sequence[Scene]) -> str:
+    """Return the page: how it was made, and a row for each scene."""
+    return headed(TITLE, __doc__, CAPTION, table(told(scenes, row)).markdown())
 
 
 def table(rows: Sequence[Sequence[str]]) -> Table:

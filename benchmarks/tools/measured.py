@@ -77,6 +77,12 @@ PAGES: dict[str, Page] = {
         sources=(*SIMULATOR, "reconstruct/splat/", "benchmarks/scores/", f"{SUITES}beams.toml"),
         explained="splats.md",
     ),
+    "scatter": Page(
+        title="Scatter that splats find",
+        command="python -m ctsim.benchmarks.tools.scatter docs/measured",
+        sources=(*SIMULATOR, "reconstruct/", "benchmarks/scores/", f"{SUITES}scatter.toml"),
+        explained="splats.md",
+    ),
     "methods": Page(
         title="Methods: settings and experiments",
         command="run-benchmark pareto results/ --suite benchmarks/suites/tune-settings.toml --part methods",

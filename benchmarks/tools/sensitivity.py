@@ -26,6 +26,7 @@ from ctsim.benchmarks.scores.metrics import Mask, dilate
 from ctsim.benchmarks.scores.score import COLUMNS, Metric
 from ctsim.benchmarks.scores.soft import AROUND, SoftLayout
 from ctsim.benchmarks.scores.structure import StructureLayout
+from ctsim.benchmarks.tools.page import put
 from ctsim.dataset.store import open_scan
 from ctsim.errors import InputError
 
@@ -173,14 +174,7 @@ def main(arguments: list[str]) -> int:
     if len(arguments) not in (1, 2):
         raise InputError("expected SCAN, and the folder of the measured pages or nothing")
     stored = open_scan(Path(arguments[0]))
-    text = page(stored.name, Judge.of(stored))
-    if len(arguments) == 1:
-        sys.stdout.write(text)
-        return 0
-    path = Path(arguments[1]) / NAME
-    path.write_text(text, encoding="utf-8")
-    sys.stdout.write(f"{path}\n")
-    return 0
+    return put(page(stored.name, Judge.of(stored)), NAME, arguments[1] if len(arguments) > 1 else None)
 
 
 def page(name: str, judge: Judge) -> str:

@@ -20,7 +20,7 @@ from ctsim.geometry import Geometry, few_views
 from ctsim.reconstruct.beam import detected, refuse_beam
 from ctsim.reconstruct.beyond import seen_beyond
 from ctsim.reconstruct.log import finite_or_not, how_it_ended, line_integrals
-from ctsim.reconstruct.scatter import open_excess
+from ctsim.reconstruct.scatter import Scatter, scatter_of
 from ctsim.reconstruct.settings import about, keywords
 from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
 from ctsim.reconstruct.splat.common import Common, Energy
@@ -61,8 +61,9 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     voxels would be more than 6e10, minutes of two cores. `tv` is stronger in the first passes and on coarser levels.
     The finest grid is at most as fine as the detector's pixels at the isocentre. `response` "tube" is a tube behind
     `filtration`, seen by a scintillator. `readout` "hardened" is by the object's own water; `Volume.at_energy` gives
-    the volume at any energy. `scatter` null has it found in the pixels that no shadow reaches (`open_excess`); 0 is for
-    scans whose open pixels are brighter than their open field for another reason.
+    the volume at any energy. `scatter` null has it found, with its course over the panel, from the pixels that no
+    shadow reaches (`scatter_of`); a number is the same everywhere, and 0 is for scans whose open pixels are brighter
+    than their open field for another reason.
     """
 
     passes: Annotated[tuple[Passes, Passes] | None, about("over the views: on each coarser level, on the finest")] = (
@@ -99,11 +100,11 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     stopwatch = Stopwatch(limit=settings.seconds)
     p, clamped = line_integrals(scan, slice(None))
     valid = ~clamped.numpy()
-    scatter = open_excess(p.numpy(), valid) if settings.scatter is None else settings.scatter
+    scatter = _scatter(scan, p.numpy(), valid, settings)
     finest = finer(scan.geometry, settings.fineness)
     below = Below.of(scan)
     weights = weights_and_bounds(scan, p.numpy(), valid, scatter, below.noise)
-    data = Data(geometry=finest, p=p.numpy(), weights=weights, scatter=scatter)
+    data = Data(geometry=finest, p=p.numpy(), weights=weights, scatter=scatter.mean)
     levels = levels_of(data, coarse=(settings.passes or PASSES)[0] > 0)
     filtration = None if clamped.all() else _filtration(levels, scan, settings)
     response = settings.make_response(scan.e_max, filtration.value if filtration else settings.filtration or USUAL)
@@ -112,7 +113,8 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     details: dict[str, Any] = {
         "response": response.described(),
         **({} if filtration is None else {"filtration": filtration.described()}),
-        "scatter": scatter,
+        "scatter": scatter.mean,
+        "scatter_kernel": {"gain": scatter.gain, "floor": scatter.floor},
         "clamped_pixels": int(clamped.sum()),
         "grid": list(finest.n_voxel),
         "splats": 0 if fit is None else len(fit.lattice),
@@ -147,9 +149,19 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     )
 
 
+def _scatter(scan: Scan, p: Image, valid: NDArray[np.bool_], settings: Settings) -> Scatter:
+    if settings.scatter is not None:
+        return Scatter(floor=settings.scatter)
+    return scatter_of(p, valid, scan.geometry, scan.i0)
+
+
 def _filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtration | None:
-    """Find the filtration by coarse fits; None where it is given or the beam is known."""
-    if settings.response != "tube" or settings.filtration is not None:
+    """Find the filtration by coarse fits; None where it is given, the beam is known, or the finest grid too coarse.
+
+    Edges that no grid holds are then the misfit: on 18 voxels 12 mm of aluminium are found where 0.5 are right.
+    """
+    given = settings.response != "tube" or settings.filtration is not None
+    if given or min(levels[-1].geometry.n_voxel[1:]) < ENOUGH:
         return None
     levels = levels if len(levels) > 1 else levels_of(levels[-1], coarse=True)
     few = levels[: 1 + next((k for k, level in enumerate(levels) if min(level.geometry.n_voxel) >= ENOUGH), 0)]
