@@ -8,23 +8,26 @@ with one kernel, whose height is not assumed but read, with a constant, from the
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, optimize
+from scipy import ndimage, optimize, stats
 
 from ctsim.geometry import Geometry
 
 BLOCKS = 48  # most along a side of the panel, over which readings are averaged: scatter is smooth
 SPREAD = 0.22  # σ of the kernel over the distance from the axis to the panel
 ROUNDS = 3  # of the scatter and of the source without it
-BRIGHT, NORMAL = 0.1, 1.4826  # of the open field, below open ones; standard over median deviation
-NOISE, MARGIN = 2.0, 2  # standard deviations of a block below 1, and blocks around it, that are no open pixels
-APART = 0.25  # of the open field: more than that, open readings do not differ by
-SIGNIFICANT, FEWEST = 0.2, 100  # mean excess over the noise of a block, and open blocks, below which nothing is told
+BRIGHT, APART = 0.1, 0.25  # of the open field: no open block is so much darker than it, or than the brightest
+NORMAL, TRIMMED = 1.4826, 0.1  # standard over median deviation; share of the views at either end that is no usual one
+NEAR, MARGIN = 3, 2  # blocks a side that are compared with one, and around an open one, which must be open, too
+LOW, HIGH = 2.0, 5.0  # standard deviations that an open block may be below the open field, and above its neighbours
+CUT, SIGNIFICANT = 0.055, 5.0
+"""The mean of a Gaussian above −LOW, and standard deviations of the mean, beyond which open blocks show an excess."""
+FEWEST = 100  # open blocks, below which nothing is told
 FAINTEST = 1e-4  # primary over open field below which the source is not told from none
 DARKEST = 0.01  # share of the blocks that may, in the mean around them, hold less than the scatter found
-NEAR = 3  # blocks a side around one
 
 Image = NDArray[np.float32]
 
@@ -62,33 +65,85 @@ def scatter_of(p: Image, valid: NDArray[np.bool_], geometry: Geometry, i0: float
     The open field is taken without an object and so without its scatter, and nothing else makes a ray brighter than
     that but noise and a drift of the tube. Gain and constant are fitted by least squares, neither below 0, to the
     blocks of pixels that are as bright as the open field, within a noise of at least that of `i0` photons, and not next
-    to darker ones. Where these hardly exceed the open field, or there are none, scatter is 0. What is found is scaled
-    down until the darkest readings hold it.
+    to darker ones. Where these do not exceed the open field significantly, or there are none, scatter is 0. What is
+    found is scaled down until 99 % of the blocks hold it.
     """
     means, step = _block_means(p, valid)
-    least = max(1.0, float(np.quantile(means, 0.99)) - APART)
-    around = ndimage.uniform_filter(means, (1, NEAR, NEAR), mode="nearest")
-    bright = means > least - BRIGHT
-    deviation = NORMAL * float(np.median(np.abs(means - around)[bright])) if bright.any() else 0.0
-    noise = max(deviation, 1 / math.sqrt(i0 * math.prod(step)))  # a median: the object's outline deviates by more
-    near = (1, 2 * MARGIN + 1, 2 * MARGIN + 1)
-    is_open = ndimage.minimum_filter(means, near, mode="nearest") >= least - NOISE * noise
+    noise = _noise(means, 1 / math.sqrt(i0 * math.prod(step)))
+    means *= _steadied(means, noise)
+    is_open = _open_blocks(means, noise)
     excess = means[is_open].astype(np.float64) - 1
-    if excess.size < FEWEST or excess.mean() <= SIGNIFICANT * noise:
+    if excess.size < FEWEST or excess.mean() <= (CUT + SIGNIFICANT / math.sqrt(excess.size)) * noise:
         return Scatter(floor=0.0)
     gap = SPREAD * (geometry.dsd - geometry.dso)
     sigma = (0.0, *(gap / (d * k) for d, k in zip(geometry.d_detector, step, strict=True)))
     gain, constant, source = 0.0, 0.0, np.zeros_like(means)
     for _ in range(ROUNDS):
         primary = np.clip(means - gain * source - constant, FAINTEST, 1)
-        source = ndimage.gaussian_filter(-np.log(primary) * primary, sigma, mode="nearest")
+        source = _blurred(-np.log(primary) * primary, sigma)
         both = np.stack([source[is_open], np.ones(excess.size)], 1, dtype=np.float64)
         gain, constant = optimize.nnls(both, excess)[0].tolist()
-    most = float(np.quantile(around / np.maximum(gain * source + constant, FAINTEST), DARKEST))
-    held = min(max(most, 0.0), 1.0)
+    held = _held(means, gain * source + constant)
     if gain == 0:
         return Scatter(floor=held * constant)
     return Scatter(floor=held * constant, gain=held * gain, source=source, step=step)
+
+
+def _noise(means: Image, photons: float) -> float:
+    """Return the standard deviation of an open block by its neighbours, at least that of `photons`."""
+    bright = means > 1 - BRIGHT
+    # a median: the object's outline deviates by more
+    deviation = NORMAL * float(np.median(np.abs(means - _mean(means))[bright])) if bright.any() else 0.0
+    return max(deviation, photons)
+
+
+def _steadied(means: Image, noise: float) -> Image:
+    """Return by what each view is to be multiplied so that what is open in all of them stays the same, within noise.
+
+    Otherwise the brighter views of a tube that flickers would be taken for scatter, and those that are darker, as a
+    screen's first ones, for shadow.
+    """
+    always = _smallest(means.mean(0), 2 * MARGIN + 1) >= 1 - noise
+    if not always.any():
+        return np.ones((len(means), 1, 1), np.float32)
+    levels = np.median(means[:, always], axis=1).astype(np.float64)
+    usual = float(np.mean(stats.trimboth(levels, TRIMMED)))
+    unsteady = (np.abs(levels - usual) > noise) & (levels > 0)  # less is scatter's own course as well
+    return np.asarray(np.where(unsteady, usual / np.where(unsteady, levels, 1), 1), np.float32)[:, None, None]
+
+
+def _open_blocks(means: Image, noise: float) -> NDArray[np.bool_]:
+    """Return which blocks [view, row, column] no shadow reaches."""
+    least = max(1.0, float(np.quantile(means, 0.99)) - APART)
+    # a block that is bright alone holds a defect or a hit of the panel
+    alone = means - ndimage.median_filter(means, (1, NEAR, NEAR), mode="nearest") > HIGH * noise
+    return (_smallest(means, 2 * MARGIN + 1) >= least - LOW * noise) & ~alone
+
+
+def _smallest(blocks: NDArray[Any], side: int) -> NDArray[Any]:
+    """Return the smallest of the blocks around each, `side` along row and column, the last two axes."""
+    return np.asarray(ndimage.minimum_filter(blocks, (*[1] * (blocks.ndim - 2), side, side), mode="nearest"))
+
+
+def _blurred(blocks: Image, sigma: tuple[float, ...]) -> Image:
+    return np.asarray(ndimage.gaussian_filter(blocks, sigma, mode="nearest"), np.float32)
+
+
+def _mean(blocks: Image) -> Image:
+    """Return the mean of the blocks [view, row, column] around each."""
+    size: Any = (1, NEAR, NEAR)
+    return np.asarray(ndimage.uniform_filter(blocks, size, mode="nearest"), np.float32)
+
+
+def _held(means: Image, scatter: Image) -> float:
+    """Return the share of the scatter, both [view, row, column], that all blocks but some of the darkest hold."""
+    # blocks without a pixel, and views that are lost, are no dark ones
+    lit = means > 0
+    somewhere, in_some = np.any(lit, axis=0, keepdims=True), np.any(lit, axis=(1, 2), keepdims=True)
+    alive = _smallest(np.logical_and(somewhere, in_some), NEAR)
+    around = _mean(means)  # noise alone may be darker
+    ratios = (around / np.maximum(scatter, FAINTEST))[alive]
+    return min(float(np.quantile(ratios, DARKEST)), 1.0) if ratios.size else 0.0
 
 
 def _block_means(p: Image, valid: NDArray[np.bool_]) -> tuple[Image, tuple[int, int]]:
@@ -99,13 +154,13 @@ def _block_means(p: Image, valid: NDArray[np.bool_]) -> tuple[Image, tuple[int, 
     step_v, step_u = (-(-n // BLOCKS) for n in p.shape[1:])
     at_v, at_u = (np.arange(0, n, step) for n, step in zip(p.shape[1:], (step_v, step_u), strict=True))
     means = np.empty((len(p), at_v.size, at_u.size), np.float32)
+
+    def summed(image: NDArray[Any]) -> NDArray[np.float64]:
+        return np.add.reduceat(np.add.reduceat(image, at_v, axis=0, dtype=np.float64), at_u, axis=1)
+
+    half = summed(np.ones(p.shape[1:], np.bool_)) / 2
     for mean, reading, seen in zip(means, p, valid, strict=True):
-        signal = np.where(seen, np.exp(-reading), 0)
-        total, counted, pixels = (
-            np.add.reduceat(np.add.reduceat(a, at_v, axis=0, dtype=np.float64), at_u, axis=1)
-            for a in (signal, seen, np.ones_like(seen))
-        )
-        mean[...] = total / np.maximum(counted, pixels / 2)
+        mean[...] = summed(np.where(seen, np.exp(-reading), 0)) / np.maximum(summed(seen), half)
     return means, (step_v, step_u)
 
 

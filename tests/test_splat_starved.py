@@ -46,8 +46,9 @@ def scan_of(p, noise=NOISE, seed=0, whole=False) -> Scan:
 
 
 def bounds_of(scan, scatter=0.0):
+    given = scatter if isinstance(scatter, Scatter) else Scatter(floor=scatter)
     p, clamped = line_integrals(scan, slice(None))
-    weights = weights_and_bounds(scan, p.numpy(), ~clamped.numpy(), Scatter(floor=scatter), Below.of(scan).noise)
+    weights = weights_and_bounds(scan, p.numpy(), ~clamped.numpy(), given, Below.of(scan).noise)
     return p.numpy(), weights
 
 
@@ -70,6 +71,22 @@ def test_scatter_takes_its_share_of_a_bound():
     assert (weights < 0).mean() > 0.99  # 1000 photons, 3 % of noise
     np.testing.assert_allclose(p[weights < 0], -math.log(starved.DOUBT * 0.01), atol=0.5)
     assert not (bounds_of(scan)[1] < 0).any()  # without it they are readings
+
+
+def test_a_reading_is_restated_with_the_mean_scatter_in_place_of_its_own():
+    source = np.random.default_rng(2).uniform(0.01, 0.03, (8, 16, 20)).astype(np.float32)
+    source[3] *= 2  # views differ
+    scatter = Scatter(floor=0.002, gain=0.5, source=source, step=(2, 2))
+    own = np.stack([scatter.of(view, (32, 40)) for view in range(8)])
+    true = np.broadcast_to(np.linspace(0.1, 4.0, 40), GEOMETRY.shape).copy()
+    true[:, :3] = 15
+    scan = scan_of(-np.log(np.exp(-true) + own), noise=0.0)
+    p, weights = bounds_of(scan, scatter)
+    read, share = weights > 0, (scan.counts.numpy() - DARK) / I0 - own
+    assert read[:, 3:].all() and (weights[:, :3] < 0).mean() > 0.99
+    np.testing.assert_allclose(np.exp(-p)[read], (share + scatter.mean)[read], rtol=1e-4)
+    allowed = np.maximum(share, 0) + starved.UNSEEN / I0 + starved.DOUBT * own
+    np.testing.assert_allclose(np.exp(-p)[weights < 0], allowed[weights < 0], rtol=1e-4)
 
 
 def test_what_is_dead_or_not_finite_says_nothing():
