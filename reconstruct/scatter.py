@@ -79,7 +79,7 @@ def scatter_of(p: Image, valid: NDArray[np.bool_], geometry: Geometry, i0: float
     sigma = (0.0, *(gap / (d * k) for d, k in zip(geometry.d_detector, step, strict=True)))
     gain, constant, source = 0.0, 0.0, np.zeros_like(means)
     for _ in range(ROUNDS):
-        primary = np.clip(means - gain * source - constant, FAINTEST, 1)
+        primary: Image = np.clip(means - gain * source - constant, FAINTEST, 1).astype(np.float32)
         source = _blurred(-np.log(primary) * primary, sigma)
         both = np.stack([source[is_open], np.ones(excess.size)], 1, dtype=np.float64)
         gain, constant = optimize.nnls(both, excess)[0].tolist()
