@@ -22,7 +22,7 @@ from ctsim.beam.quadrature import full_rule
 from ctsim.beam.spectrum import spectrum
 from ctsim.benchmarks.cli import guarded
 from ctsim.benchmarks.engine.table import Table, simple
-from ctsim.benchmarks.tools.page import headed, of_suite, told
+from ctsim.benchmarks.tools.page import headed, of_suite, rows_of
 from ctsim.materials import attenuation
 from ctsim.phantoms.scene import Scene
 from ctsim.reconstruct.splat.fast import Settings, reconstruct
@@ -69,7 +69,7 @@ def main(arguments: list[str]) -> int:
 
 def page(scenes: Sequence[Scene]) -> str:
     """Return the page: how it was made, and a row for each scene."""
-    return headed(TITLE, __doc__, CAPTION, table(told(scenes, row)).markdown())
+    return headed(TITLE, __doc__, CAPTION, table(rows_of(scenes, row)).markdown())
 
 
 def table(rows: Sequence[Sequence[str]]) -> Table:

@@ -35,7 +35,7 @@ def headed(title: str, doc: str | None, caption: str, table: str) -> str:
     return f"# {title}\n\n{made}\n\n{caption}\n\n{table}"
 
 
-def told(scenes: Sequence[Scene], row: Callable[[Scene], list[str]]) -> list[list[str]]:
+def rows_of(scenes: Sequence[Scene], row: Callable[[Scene], list[str]]) -> list[list[str]]:
     """Return the row of each scene, whose name is told at its start."""
     rows = []
     for scene in scenes:

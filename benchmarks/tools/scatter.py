@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ctsim import score_volume, simulate_scene
 from ctsim.benchmarks.cli import guarded
 from ctsim.benchmarks.engine.table import Table, simple
-from ctsim.benchmarks.tools.page import headed, of_suite, told
+from ctsim.benchmarks.tools.page import headed, of_suite, rows_of
 from ctsim.phantoms.scene import Scene
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reconstruct.scatter import scatter_of
@@ -52,7 +52,7 @@ def main(arguments: list[str]) -> int:
 
 def page(scenes: Sequence[Scene]) -> str:
     """Return the page: how it was made, and a row for each scene."""
-    return headed(TITLE, __doc__, CAPTION, table(told(scenes, row)).markdown())
+    return headed(TITLE, __doc__, CAPTION, table(rows_of(scenes, row)).markdown())
 
 
 def table(rows: Sequence[Sequence[str]]) -> Table:

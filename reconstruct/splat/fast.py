@@ -60,10 +60,10 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     `passes` null makes them 3 and 9, or fewer, at least one, where the passes over a level times its views times its
     voxels would be more than 6e10, minutes of two cores. `tv` is stronger in the first passes and on coarser levels.
     The finest grid is at most as fine as the detector's pixels at the isocentre. `response` "tube" is a tube behind
-    `filtration`, seen by a scintillator. `readout` "hardened" is by the object's own water; `Volume.at_energy` gives
-    the volume at any energy. `scatter` null has it found, with its course over the panel, from the pixels that no
-    shadow reaches (`scatter_of`); a number is the same everywhere, and 0 is for scans whose open pixels are brighter
-    than their open field for another reason.
+    `filtration`, seen by a scintillator; null has it found, on grids of at least 32 voxels along x and y. `readout`
+    "hardened" is by the object's own water; `Volume.at_energy` gives the volume at any energy. `scatter` null has it
+    found, with its course over the panel, from the pixels that no shadow reaches (`scatter_of`); a number is the same
+    everywhere, and 0 is for scans whose open pixels are brighter than their open field for another reason.
     """
 
     passes: Annotated[tuple[Passes, Passes] | None, about("over the views: on each coarser level, on the finest")] = (
