@@ -19,6 +19,7 @@ from ctsim.geometry import few_views
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.filters import Filter
 from ctsim.reconstruct.log import line_integrals
+from ctsim.reconstruct.primary import primary
 from ctsim.reconstruct.projector import forward_columns
 from ctsim.reconstruct.settings import keywords
 from ctsim.types import Scan, Status, Volume
@@ -42,6 +43,7 @@ class Settings(Filter, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 @keywords(Settings)
+@primary
 def bhc_poly(scan: Scan, settings: Settings) -> Volume:
     """Reconstruct `scan` less a polynomial in metal and tissue length that is fitted to what metal adds to it.
 

@@ -8,7 +8,6 @@ within the field of view that some ray meets are unknowns; all others are and st
 import math
 from typing import Annotated, Any, Literal
 
-import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from ctsim.geometry import Geometry
 from ctsim.reconstruct.beyond import field_radius, seen_beyond
 from ctsim.reconstruct.fdk import ramp
 from ctsim.reconstruct.log import NO_SIGNAL, is_blind, line_integrals
+from ctsim.reconstruct.primary import Readings
 from ctsim.reconstruct.projector import Views, adjoint_columns, forward_columns
 from ctsim.reconstruct.settings import about
 from ctsim.reconstruct.watch import Stopwatch
@@ -33,7 +33,7 @@ Count = Annotated[int, about("iterations over all views", ge=1, le=100_000)]
 WORST = 1.5  # a relative residual that no fit of pure noise reaches: one view fitted to another's gives √2
 
 
-class Iterations(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Iterations(Readings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What all iterative methods are given; a method adds its own and may set other defaults.
 
     `weights` of the rays is "none" (all 1), "trace" (0 in the trace of the metal that `ctsim.baselines.metal.auto_mask`

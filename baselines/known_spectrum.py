@@ -29,6 +29,7 @@ from ctsim.reconstruct.beam import DetectorTable, Given, TubeTable, check_tables
 from ctsim.reconstruct.fdk import fdk_stream
 from ctsim.reconstruct.filters import Filter
 from ctsim.reconstruct.log import count_floor, how_it_ended, is_blind, line_integrals
+from ctsim.reconstruct.primary import primary
 from ctsim.reconstruct.projector import forward_columns
 from ctsim.reconstruct.redundancy import ray_weights
 from ctsim.reconstruct.settings import about, keywords
@@ -125,6 +126,7 @@ class Known(Filter, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 @keywords(Known)
+@primary
 def water_precorrection(scan: Scan, settings: Known) -> Volume:
     """Reconstruct `scan` by FDK of line integrals that a table for water made linear in its length.
 
@@ -151,6 +153,7 @@ class Ibhc(Known, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 @keywords(Ibhc)
+@primary
 def ibhc(scan: Scan, settings: Ibhc) -> Volume:
     """Reconstruct `scan` and repeat, each time with P + mono − poly of the water, bone and metal found in the volume.
 

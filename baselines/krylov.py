@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from ctsim.baselines.iterative import Count, Course, Iterations, System, finish, weighted_dot, weighted_norm
+from ctsim.reconstruct.primary import primary
 from ctsim.reconstruct.settings import keywords
 from ctsim.types import Scan, Volume
 
@@ -16,6 +17,7 @@ class Cgls(Iterations, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 @keywords(Cgls)
+@primary
 def cgls(scan: Scan, settings: Cgls) -> Volume:
     """Reconstruct by CGLS; stopping early is the only regularisation, and values may be negative.
 

@@ -18,6 +18,7 @@ from ctsim.reconstruct.fdk import add_fdk
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.filters import Filter
 from ctsim.reconstruct.log import finite_or_not
+from ctsim.reconstruct.primary import primary
 from ctsim.reconstruct.settings import about, keywords
 from ctsim.types import Scan, Status, Volume
 
@@ -43,6 +44,7 @@ class Bridging(Filter, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 @keywords(Bridging)
+@primary
 def reconstruct(scan: Scan, settings: Bridging) -> Volume:
     """Reconstruct `scan` with the metal trace interpolated; keywords are those of `Bridging`.
 

@@ -20,6 +20,7 @@ from ctsim.baselines.metal import Trace, find_metal, reinsert
 from ctsim.baselines.prior import NO_BODY, Prior, choose_prior
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.filters import Filter
+from ctsim.reconstruct.primary import primary
 from ctsim.reconstruct.projector import forward_columns
 from ctsim.reconstruct.settings import about, keywords
 from ctsim.types import Scan, Status, Volume
@@ -81,6 +82,7 @@ class Settings(Bridging, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 @keywords(Settings)
+@primary
 def reconstruct(scan: Scan, settings: Settings) -> Volume:
     """Reconstruct `scan` with the metal trace interpolated after normalisation by a prior; keywords as `Settings`.
 

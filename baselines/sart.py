@@ -22,6 +22,7 @@ from ctsim.baselines.iterative import (
     weighted_dot,
 )
 from ctsim.baselines.kernels.sart_cpu import move
+from ctsim.reconstruct.primary import primary
 from ctsim.reconstruct.settings import about, keywords
 from ctsim.types import Scan, Volume
 
@@ -56,6 +57,7 @@ class Sirt(Sart, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 @keywords(Sart)
+@primary
 def sart(scan: Scan, settings: Sart) -> Volume:
     """Reconstruct by SART, one view at a time; keywords are those of `Sart`.
 
@@ -66,12 +68,14 @@ def sart(scan: Scan, settings: Sart) -> Volume:
 
 
 @keywords(OsSart)
+@primary
 def os_sart(scan: Scan, settings: OsSart) -> Volume:
     """Reconstruct by OS-SART: as `sart`, a subset of the views at a time; keywords are those of `OsSart`."""
     return _run(scan, settings, min(settings.subsets, scan.geometry.n_views))
 
 
 @keywords(Sirt)
+@primary
 def sirt(scan: Scan, settings: Sirt) -> Volume:
     """Reconstruct by SIRT: as `sart`, with all views at once; the residual in the norm W M falls in each iteration."""
     return _run(scan, settings, 1)

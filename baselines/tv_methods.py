@@ -20,6 +20,7 @@ from ctsim.baselines.iterative import (
 )
 from ctsim.baselines.metal import water_value
 from ctsim.baselines.sart import Passes, Positivity
+from ctsim.reconstruct.primary import primary
 from ctsim.reconstruct.settings import about, keywords
 from ctsim.reconstruct.tv import Denoiser, axis_ratios, descend, total_variation
 from ctsim.types import Scan, Volume
@@ -68,6 +69,7 @@ class AwPcsd(Descent, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 @keywords(FistaTv)
+@primary
 def fista_tv(scan: Scan, settings: FistaTv) -> Volume:
     """Minimise ½‖A x − p‖²_W + τ TV(x) by FISTA; keywords are those of `FistaTv`.
 
@@ -103,6 +105,7 @@ def fista_tv(scan: Scan, settings: FistaTv) -> Volume:
 
 
 @keywords(AsdPocs)
+@primary
 def asd_pocs(scan: Scan, settings: AsdPocs) -> Volume:
     """Lower TV subject to ‖A x − p‖_W ≤ ε ‖p‖_W and x ≥ 0, by SART passes and steepest descent in turn.
 
@@ -139,6 +142,7 @@ def asd_pocs(scan: Scan, settings: AsdPocs) -> Volume:
 
 
 @keywords(AwPcsd)
+@primary
 def awpcsd(scan: Scan, settings: AwPcsd) -> Volume:
     """Lower adaptive-weighted TV with steps that follow the data residual, between SART passes.
 

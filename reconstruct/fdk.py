@@ -16,6 +16,7 @@ from ctsim.geometry import Geometry
 from ctsim.reconstruct.filters import RAMP, Filter, filter_rows, padded_length, ramp_response
 from ctsim.reconstruct.kernels.backproject_cpu import backproject
 from ctsim.reconstruct.log import LineIntegrals, how_it_ended, is_blind
+from ctsim.reconstruct.primary import primary
 from ctsim.reconstruct.redundancy import RayWeights, ray_weights
 from ctsim.reconstruct.settings import keywords
 from ctsim.types import Scan, Volume
@@ -38,6 +39,7 @@ def ramp(scan: Scan, settings: Plain) -> Volume:
 
 
 @keywords(Settings)
+@primary
 def reconstruct(scan: Scan, settings: Settings) -> Volume:
     """Reconstruct `scan` by FDK without any correction; keywords are those of `Settings`.
 

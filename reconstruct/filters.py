@@ -2,12 +2,12 @@
 
 from typing import Annotated, Any, Literal, cast
 
-import msgspec
 import numba
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from ctsim.reconstruct.primary import Readings
 from ctsim.reconstruct.settings import about, names_of, value_of
 
 Window = Annotated[Literal["ram-lak", "shepp-logan", "cosine", "hamming", "hann"], about("window of the ramp filter")]
@@ -15,7 +15,7 @@ WINDOWS = names_of(Window)
 Cutoff = Annotated[float, about("frequency where the filter ends", "of the Nyquist frequency", gt=0, le=1)]
 
 
-class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Filter(Readings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The filter of a method that ends in filtered backprojection.
 
     The defaults were chosen on the suite `tune` by `ctsim.benchmarks.tools.tune_filter`.

@@ -49,6 +49,10 @@ class Scatter:
         """The mean over all blocks."""
         return self.floor + (0.0 if self.source is None else self.gain * float(self.source.mean(dtype=np.float64)))
 
+    def details(self) -> dict[str, object]:
+        """Return what a result says of its scatter: the mean, the gain and the constant, over the open field."""
+        return {"scatter": self.mean, "scatter_kernel": {"gain": self.gain, "floor": self.floor}}
+
     def of(self, view: int, shape: tuple[int, int]) -> Image:
         """Return the scatter of a view's pixels, [v, u], by straight lines between the middles of the blocks."""
         if self.source is None:

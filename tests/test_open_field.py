@@ -215,7 +215,8 @@ def test_the_fit_undoes_scatter_that_it_finds_itself(stored):
 
 @pytest.mark.parametrize("scatter", [-0.1, float("inf"), float("nan")])
 def test_scatter_that_makes_no_sense_is_refused(stored, scatter):
-    with pytest.raises(InputError, match=r"scatter: expected a number within 0 to 100 \(of the open field\)"):
+    expected = r"scatter: expected 'found' or a number within 0 to 100 \(of the open field\)"
+    with pytest.raises(InputError, match=expected):
         reconstruct(stored.scan, scatter=scatter)
 
 

@@ -1,7 +1,5 @@
 """The page of scatter that splats find."""
 
-import math
-
 import msgspec
 import numpy as np
 import pytest
@@ -17,28 +15,34 @@ def test_what_is_off_is_of_the_mean_where_it_is_asked_for():
     assert scatter.off(found, true, np.zeros(3, bool)) == "n/a"
 
 
-def test_a_row_says_what_was_found_and_how_it_fares(monkeypatch):
+def test_a_page_says_what_was_found_and_how_methods_fare(monkeypatch):
     """Few passes and a constant, of which the true amount is known: the row is made as the page makes it."""
-    asked, reconstruct = [], scatter.reconstruct
+    asked, find = [], scatter.find
 
-    def quick(scan, settings):
-        asked.append((settings.scatter, float(scan.counts.double().mean())))
-        return reconstruct(scan, msgspec.structs.replace(settings, passes=(0, 1), fineness=1.0))
+    def quick(name, told):
+        asked.append((name, told["scatter"]))
+        return find(name, {**told, "passes": [0, 1], "fineness": 1.0} if name == "splat" else told)
 
-    monkeypatch.setattr(scatter, "reconstruct", quick)
+    monkeypatch.setattr(scatter, "find", quick)
     scene = next(scene for scene in load("scatter") if scene.name == "lung-Fe-constant")
     small = {
         "n_voxel": (16, 16, 16), "n_detector": (48, 48), "n_views": 12, "scatter": {"level": 1, "fraction": 0.05}
     }  # fmt: skip
     scanner = msgspec.convert({**msgspec.to_builtins(scene.scanner), **small}, type(scene.scanner))
     text = scatter.page([msgspec.structs.replace(scene, scanner=scanner)])
-    assert [given for given, _ in asked] == [0.0, None, 0.0]
-    assert asked[0][1] == asked[1][1] > asked[2][1]  # the true scatter was taken off the last
-    cells = [cell.strip() for cell in text.splitlines()[-1].split("|")[1:-1]]
-    assert len(cells) == len(scatter.HEAD) and cells[0] == scene.name
-    assert float(cells[1]) == pytest.approx(50, rel=0.05) and float(cells[2]) == pytest.approx(50, rel=0.1)
-    assert all(abs(float(cell.removesuffix(" %"))) < 10 for cell in cells[3:7] if cell != "n/a")
-    assert all(math.isfinite(float(cell)) for cell in cells[7:])
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if scene.name in line]
+    (found, psnr, core) = rows[-3:]
+    assert [len(row) for row in (found, psnr, core)] == [len(scatter.HEAD), len(scatter.PSNR), len(scatter.CORES)]
+    assert [float(cell) for cell in found[1:4]] == pytest.approx([50, 50, 50], rel=0.1)
+    assert all(abs(float(cell.removesuffix(" %"))) < 10 for cell in found[4:] if cell != "n/a")
+    told = [given for name, given in asked if name == "fdk"]
+    assert told[0] == told[3] == 0 and told[1] == pytest.approx(0.05, rel=0.1) and told[2] == "found"
+    assert [name for name, _ in asked] == [name for name in scatter.METHODS for _ in scatter.TOLD]
+    for k in range(0, len(psnr) - 1, 4):  # a constant is a constant, however it is found, and worth knowing
+        left, constant, field, true = map(float, psnr[1 + k : 5 + k])
+        assert constant == pytest.approx(field, abs=0.2) and true == pytest.approx(field, abs=1)
+        assert left != field
+    assert all(0 < float(cell) < 2 for cell in core[1:])
 
 
 def test_more_than_a_folder_is_refused():

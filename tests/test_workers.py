@@ -209,6 +209,7 @@ def test_a_cluster_scores_the_same_though_a_worker_is_killed(serial, cluster, tm
 def test_a_clusters_worker_runs_methods_apart_within_a_time_limit(serial, cluster, tmp_path):
     address, client = cluster
     client.run(set_mark, str(serial / "mark"))
+    workers = set(client.nthreads())  # the one that follows a killed one may still be starting
     flags = ("--scheduler", address, "--scene", "bare")
     assert score(serial / "data", tmp_path / "results", *flags, "--isolate") == 0
     found = scores(tmp_path / "results")
@@ -220,7 +221,7 @@ def test_a_clusters_worker_runs_methods_apart_within_a_time_limit(serial, cluste
     assert main([*map(str, words)]) == 1
     (hung,) = records_of(tmp_path / "hung")
     assert (hung.status, hung.reason) == ("timeout", "did not end within 2 s")
-    assert len(client.nthreads()) == 2  # no worker was lost over it
+    assert workers and workers <= set(client.nthreads())  # none was lost over it
 
 
 def test_a_scene_that_fails_on_a_cluster_ends_the_command_with_a_traceback(cluster, tmp_path):

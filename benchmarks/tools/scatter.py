@@ -1,16 +1,15 @@
-"""How well splats find the scatter of a scan, and what it is worth to know it.
+"""How well the scatter of a scan is found, and what it is worth to know it.
 
     python -m ctsim.benchmarks.tools.scatter docs/measured
 
-Each scene of the suite `scatter` is simulated with its scatter stored, and reconstructed three times: with scatter left
-in the readings, with what is found, and with the true scatter taken off. The page is written to the folder, or printed
-without one.
+Each scene of the suite `scatter` is simulated with its scatter stored, and reconstructed by splats, FDK, LIMAR and NMAR
+four times: with scatter left in the readings, less one constant, less what is found, and less the true scatter. The
+page is written to the folder, or printed without one.
 """
 
 import dataclasses
 import sys
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,31 +17,40 @@ from numpy.typing import NDArray
 
 from ctsim import score_volume, simulate_scene
 from ctsim.benchmarks.cli import guarded
-from ctsim.benchmarks.engine.table import Table, simple
+from ctsim.benchmarks.engine.table import simple
+from ctsim.benchmarks.methods import find
+from ctsim.benchmarks.studies.methods.attempt import scan_for
+from ctsim.benchmarks.studies.methods.records import METAL
 from ctsim.benchmarks.tools.page import headed, of_suite, rows_of
+from ctsim.dataset.truth import ScanWithTruth
 from ctsim.phantoms.scene import Scene
-from ctsim.reconstruct.log import line_integrals
-from ctsim.reconstruct.scatter import scatter_of
-from ctsim.reconstruct.splat.fast import Settings, reconstruct
+from ctsim.reconstruct.primary import scatter_in, without_scatter
+from ctsim.reconstruct.scatter import Scatter
 from ctsim.types import Scan
 
+Image = NDArray[np.float32]
 NAME = "scatter.md"
-TITLE = "Scatter that splats find"
+TITLE = "Scatter found in scans"
 SUITE = "scatter"
 BANDS = (("dark", 0.0, 0.05), ("medium", 0.05, 0.3), ("bright", 0.3, 0.95), ("open", 0.999, np.inf))
 """Names of bands of the primary over the open field, and their ends."""
+METHODS = ("splat", "fdk", "limar", "nmar")
+LEFT, CONSTANT, FOUND, TRUE = TOLD = ("0", "constant", "found", "true")
 CAPTION = (
     "True: the mean scatter of all readings over the open field, by Monte Carlo unless the scene's name says constant. "
     "Found: what `scatter_of` finds in the counts alone, and by how much it is off where the primary is below 0.05 of "
-    "the open field (dark), up to 0.3 (medium), up to 0.95 (bright), and where nothing is in the way (open). PSNR3D of "
-    "tissue (dB) and the attenuation in the metal's core over the true one: with scatter left in the readings (0), "
-    "with what is found, and with the true mean scatter taken off the counts, whose noise stays. The width of the "
-    "kernel was chosen on these scenes."
+    "the open field (dark), up to 0.3 (medium), up to 0.95 (bright), and where nothing is in the way (open). Constant: "
+    "the mean of what is found where nothing is in the way, taken for all pixels. The width of the kernel was chosen "
+    "on these scenes."
 )
-HEAD = (
-    *("scene", "true (1e-3)", "found (1e-3)", *(name for name, *_ in BANDS)),
-    *("0: PSNR3D", "core", "found: PSNR3D", "core", "true: PSNR3D", "core"),
+FARED = (
+    "By what is taken off the readings: nothing (0), the constant, what is found, and the true mean scatter. Noise "
+    "stays. Splats model what is left of a reading; for the others at least a tenth of each reading is kept."
 )
+CORE = "Attenuation in the metal's core over the true one, for the methods that do not copy it from FDK."
+HEAD = ("scene", "true (1e-3)", "found (1e-3)", "constant (1e-3)", *(name for name, *_ in BANDS))
+PSNR = ("scene", *(f"{method}: {told}" for method in METHODS for told in TOLD))
+CORES = PSNR[: 1 + 2 * len(TOLD)]
 
 
 def main(arguments: list[str]) -> int:
@@ -51,46 +59,57 @@ def main(arguments: list[str]) -> int:
 
 
 def page(scenes: Sequence[Scene]) -> str:
-    """Return the page: how it was made, and a row for each scene."""
-    return headed(TITLE, __doc__, CAPTION, table(rows_of(scenes, row)).markdown())
-
-
-def table(rows: Sequence[Sequence[str]]) -> Table:
-    """Return the table of rows of cells."""
-    return simple(HEAD, [list(cells) for cells in rows], numbers=HEAD[1:])
+    """Return the page: how it was made, how well scatter is found, and how methods fare, a row for each scene."""
+    rows = rows_of(scenes, row)
+    text, start = [], 1
+    for head, above in (
+        (HEAD, ""),
+        (PSNR, f"## PSNR3D of tissue (dB)\n\n{FARED}\n\n"),
+        (CORES, f"## Core\n\n{CORE}\n\n"),
+    ):
+        end = start + len(head) - 1
+        cells = [[cells[0], *cells[start:end]] for cells in rows]
+        text.append(above + simple(head, cells, numbers=head[1:]).markdown())
+        start = end
+    return headed(TITLE, __doc__, CAPTION, "\n".join(text))
 
 
 def row(scene: Scene) -> list[str]:
-    """Simulate a scene, find its scatter, reconstruct it three times, and return its cells."""
+    """Simulate a scene, find its scatter, reconstruct it by all methods, and return the cells of all tables."""
     stored = simulate_scene(scene)
     scan = stored.scan
     primary, both = (np.exp(-stored.array(name)) for name in ("scatter_free", "noise_free"))
-    true, found = both - primary, found_in(scan)
-
-    def fared(of: Scan, **settings: Any) -> list[str]:
-        scores = score_volume(reconstruct(of, Settings(**settings)), stored)
-        psnr, core = scores["tissue"].values["psnr3d"], scores["metal"].values["core_ratio"]
-        return [f"{psnr:.2f}", "n/a" if core is None else f"{core:.2f}"]
-
+    true, found = both - primary, image_of(scatter_in(scan, "found"), scan)
+    is_open = primary > BANDS[-1][1]
+    constant = float(found[is_open].mean(dtype=np.float64)) if is_open.any() else 0.0
+    fared = [fares(stored, name, told, constant, true) for name in METHODS for told in TOLD]
     return [
         scene.name,
-        f"{1e3 * true.mean():.2f}",
-        f"{1e3 * found.mean():.2f}",
+        *(f"{1e3 * mean:.2f}" for mean in (true.mean(), found.mean(), constant)),
         *(off(found, true, (primary > low) & (primary <= high)) for _, low, high in BANDS),
-        *fared(scan, scatter=0.0),
-        *fared(scan),
-        *fared(without(scan, true), scatter=0.0),
+        *(psnr for psnr, _ in fared),
+        *(core for _, core in fared[: len(CORES) - 1]),
     ]
 
 
-def found_in(scan: Scan) -> NDArray[np.float32]:
-    """Return the scatter over the open field that is found in a scan, [view, v, u]."""
-    p, clamped = line_integrals(scan, slice(None))
-    scatter = scatter_of(p.numpy(), ~clamped.numpy(), scan.geometry, scan.i0)
+def fares(stored: ScanWithTruth, name: str, told: str, constant: float, true: Image) -> tuple[str, str]:
+    """Reconstruct a scan by a method that is told this of its scatter; return PSNR3D and the core's ratio."""
+    method = find(name, {"scatter": {CONSTANT: constant, FOUND: "found"}.get(told, 0.0)})
+    scan = scan_for(method, stored, METAL)
+    if told == TRUE:
+        field = Scatter(floor=0, gain=1, source=true)
+        scan = unfloored(scan, true) if name == "splat" else without_scatter(scan, field)
+    scores = score_volume(method.reconstruct(scan), stored)
+    psnr, core = scores["tissue"].values["psnr3d"], scores["metal"].values["core_ratio"]
+    return f"{psnr:.2f}", "n/a" if core is None else f"{core:.2f}"
+
+
+def image_of(scatter: Scatter, scan: Scan) -> Image:
+    """Return scatter over the open field, [view, v, u]."""
     return np.stack([scatter.of(view, scan.geometry.n_detector) for view in range(scan.geometry.n_views)])
 
 
-def off(found: NDArray[np.float32], true: NDArray[np.float32], where: NDArray[np.bool_]) -> str:
+def off(found: Image, true: Image, where: NDArray[np.bool_]) -> str:
     """Return by how much the mean of what was found differs from the true one, as a table shows it."""
     if not where.any():
         return "n/a"
@@ -98,7 +117,7 @@ def off(found: NDArray[np.float32], true: NDArray[np.float32], where: NDArray[np
     return f"{100 * (float(found[where].mean(dtype=np.float64)) / mean - 1):+.0f} %"
 
 
-def without(scan: Scan, scatter: NDArray[np.float32]) -> Scan:
+def unfloored(scan: Scan, scatter: Image) -> Scan:
     """Return the scan with its true mean scatter, over the open field, taken off the counts."""
     open_field = scan.flat.numpy() - scan.dark
     counts = scan.counts.numpy().astype(np.float32) - scatter * open_field

@@ -3,9 +3,8 @@
 import math
 from typing import Annotated
 
-import msgspec
-
 from ctsim.reconstruct.beam import DetectorTable, TubeTable, check_tables
+from ctsim.reconstruct.primary import Readings
 from ctsim.reconstruct.settings import about
 
 Energy = Annotated[float, about("", "keV", gt=0, le=1000)]
@@ -15,8 +14,8 @@ Seconds = Annotated[
 ]
 
 
-class Common(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is known of the beam (for the response "known"), and how long a fit may take."""
+class Common(Readings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Scatter, what is known of the beam (for the response "known"), and how long a fit may take."""
 
     tube: TubeTable = None
     detector: DetectorTable = None

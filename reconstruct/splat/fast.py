@@ -20,7 +20,7 @@ from ctsim.geometry import Geometry, few_views
 from ctsim.reconstruct.beam import detected, refuse_beam
 from ctsim.reconstruct.beyond import seen_beyond
 from ctsim.reconstruct.log import finite_or_not, how_it_ended, line_integrals
-from ctsim.reconstruct.scatter import Scatter, scatter_of
+from ctsim.reconstruct.primary import Scattered, scatter_in
 from ctsim.reconstruct.settings import about, keywords
 from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
 from ctsim.reconstruct.splat.common import Common, Energy
@@ -50,7 +50,6 @@ Image = NDArray[np.float32]
 
 
 Passes = Annotated[int, msgspec.Meta(ge=0, le=1000)]
-Excess = Annotated[float, msgspec.Meta(ge=0, le=100)]
 Filter = Annotated[float, msgspec.Meta(ge=FILTER[0], le=FILTER[2])]
 
 
@@ -61,8 +60,8 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     voxels would be more than 6e10, minutes of two cores. `tv` is stronger in the first passes and on coarser levels.
     The finest grid is at most as fine as the detector's pixels at the isocentre. `response` "tube" is a tube behind
     `filtration`, seen by a scintillator; null has it found, on grids of at least 32 voxels along x and y. `readout`
-    "hardened" is by the object's own water; `Volume.at_energy` gives the volume at any energy. `scatter` null has it
-    found, with its course over the panel, from the pixels that no shadow reaches (`scatter_of`); a number is the same
+    "hardened" is by the object's own water; `Volume.at_energy` gives the volume at any energy. `scatter` "found" is
+    what the pixels tell that no shadow reaches (`scatter_of`), with its course over the panel; a number is the same
     everywhere, and 0 is for scans whose open pixels are brighter than their open field for another reason.
     """
 
@@ -75,7 +74,7 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     response: Annotated[Literal["tube", "known"], about("beam: assumed, or known from tube and detector")] = "tube"
     filtration: Annotated[Filter | None, about("filtration behind the assumed tube; null: found", "mm Al")] = None
     readout: Annotated[Energy | Literal["hardened"], about("energy at which the volume is read")] = "hardened"
-    scatter: Annotated[Excess | None, about("scatter in every reading; null: estimated", "of the open field")] = None
+    scatter: Scattered = "found"
 
     def __post_init__(self) -> None:
         Common.__post_init__(self)
@@ -100,7 +99,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     stopwatch = Stopwatch(limit=settings.seconds)
     p, clamped = line_integrals(scan, slice(None))
     valid = ~clamped.numpy()
-    scatter = _scatter(scan, p.numpy(), valid, settings)
+    scatter = scatter_in(scan, settings.scatter)
     finest = finer(scan.geometry, settings.fineness)
     below = Below.of(scan)
     weights = weights_and_bounds(scan, p.numpy(), valid, scatter, below.noise)
@@ -113,8 +112,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     details: dict[str, Any] = {
         "response": response.described(),
         **({} if filtration is None else {"filtration": filtration.described()}),
-        "scatter": scatter.mean,
-        "scatter_kernel": {"gain": scatter.gain, "floor": scatter.floor},
+        **scatter.details(),
         "clamped_pixels": int(clamped.sum()),
         "grid": list(finest.n_voxel),
         "splats": 0 if fit is None else len(fit.lattice),
@@ -147,12 +145,6 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         details=details,
         at_energy=functools.partial(_at_energy, rho, response),
     )
-
-
-def _scatter(scan: Scan, p: Image, valid: NDArray[np.bool_], settings: Settings) -> Scatter:
-    if settings.scatter is not None:
-        return Scatter(floor=settings.scatter)
-    return scatter_of(p, valid, scan.geometry, scan.i0)
 
 
 def _filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtration | None:

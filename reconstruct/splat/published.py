@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ctsim.errors import InputError
 from ctsim.geometry import few_views
 from ctsim.reconstruct.log import NO_SIGNAL, finite_or_not, is_blind
+from ctsim.reconstruct.primary import primary
 from ctsim.reconstruct.settings import keywords
 from ctsim.reconstruct.splat.adam import Array
 from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
@@ -33,12 +34,14 @@ BETTER = 1e-3  # share by which held-out views must be met better to count
 
 
 @keywords(Settings)
+@primary
 def paper(scan: Scan, settings: Settings) -> Volume:
     """Reconstruct by the polychromatic method, attenuation in 1/mm; keywords are those of `Settings`."""
     return fit_published(scan, settings)
 
 
 @keywords(Baseline)
+@primary
 def r2(scan: Scan, settings: Baseline) -> Volume:
     """Reconstruct by R²-Gaussian, attenuation in 1/mm; keywords are those of `Baseline`."""
     return fit_published(scan, settings)

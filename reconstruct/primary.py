@@ -1,0 +1,81 @@
+"""Scans without their scatter, for methods that have no model of it.
+
+The scatter is taken off the counts before a method looks at them. Where next to nothing would remain a share of the
+reading is kept, as the logarithm of what noise leaves there would be wild; Siewerdsen et al., Med. Phys. 33, 2006,
+doi:10.1118/1.2148916, limit it for the same reason.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Annotated, Literal, TypeVar
+
+import msgspec
+import numpy as np
+import torch
+
+from ctsim.reconstruct.log import LineIntegrals
+from ctsim.reconstruct.scatter import Scatter, scatter_of
+from ctsim.reconstruct.settings import about
+from ctsim.types import Scan, Volume
+
+KEPT = 0.1  # of a reading, at least
+
+
+Excess = Annotated[float, msgspec.Meta(ge=0, le=100)]
+Scattered = Annotated[
+    Literal["found"] | Excess, about("scatter in every reading; found: by the open pixels", "of the open field")
+]
+
+
+class Readings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is done to the readings of a scan before a method sees them: `scatter` is taken off, unless it is 0.
+
+    "found" is what `ctsim.reconstruct.scatter.scatter_of` finds, with its course over the panel; a number is the same
+    everywhere.
+    """
+
+    scatter: Scattered = 0.0
+
+
+S = TypeVar("S", bound=Readings)
+
+
+def scatter_in(scan: Scan, scattered: Literal["found"] | float) -> Scatter:
+    """Return the scatter that a setting stands for: what is found in the scan, or a constant over the open field."""
+    if scattered != "found":
+        return Scatter(floor=float(scattered))
+    p, clamped = LineIntegrals(scan).of(slice(None))
+    return scatter_of(p, ~clamped, scan.geometry, scan.i0)
+
+
+def without_scatter(scan: Scan, scatter: Scatter) -> Scan:
+    """Return the scan with scatter taken off its counts, which are then float32; itself where there is none.
+
+    At least a tenth of each reading is kept. Noise stays what it was.
+    """
+    if scatter.mean == 0:
+        return scan
+    open_field, dark = scan.flat.numpy() - np.float32(scan.dark), np.float32(scan.dark)
+    counts = scan.counts.numpy().astype(np.float32)
+    for view, image in enumerate(counts):
+        signal = image - dark
+        image -= np.minimum(scatter.of(view, image.shape) * open_field, (1 - KEPT) * np.maximum(signal, 0))
+    return dataclasses.replace(scan, counts=torch.from_numpy(counts))
+
+
+def primary(function: Callable[[Scan, S], Volume]) -> Callable[[Scan, S], Volume]:
+    """Hand a method of a scan and settings the scan without the scatter that its settings tell.
+
+    Where that is not 0, details of the volume hold the scatter's mean, gain and constant, as those of splats do.
+    """
+
+    @functools.wraps(function)
+    def method(scan: Scan, settings: S) -> Volume:
+        if settings.scatter == 0:
+            return function(scan, settings)
+        scatter = scatter_in(scan, settings.scatter)
+        volume = function(without_scatter(scan, scatter), settings)
+        return dataclasses.replace(volume, details=volume.details | scatter.details())
+
+    return method
