@@ -6,6 +6,7 @@ are the same numbers.
 
 import dataclasses
 import functools
+from collections.abc import Collection
 from typing import Any, Literal
 
 import numpy as np
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 
 from ctsim.benchmarks.methods import Method, find
 from ctsim.benchmarks.scores.judge import Judge, Twin
-from ctsim.benchmarks.scores.score import NOT_ASKED, Score
+from ctsim.benchmarks.scores.projection import held_out, with_floor
+from ctsim.benchmarks.scores.score import NOT_ASKED, PROJECTION, PROTOCOLS, Score
 from ctsim.benchmarks.studies.methods.attempt import Outcome, array_of, check_volume, checked, scan_for
 from ctsim.benchmarks.studies.methods.records import METAL
 from ctsim.benchmarks.suites import load, select
@@ -89,31 +91,44 @@ def score_volume(
     *,
     twin: Volume | NDArray[Any] | None = None,
     variant: Literal["metal", "metal_free"] = "metal",
+    protocols: str | Collection[str] = PROTOCOLS,
 ) -> dict[str, Score]:
-    """Score a volume under every protocol that applies: protocol -> `Score`, the same numbers as `run-benchmark`.
+    """Score a volume under those `protocols` that apply: name -> `Score`, the same numbers as `run-benchmark`.
 
     `twin` is the same method's volume of `scan.metal_free`, which the protocol `artefact` compares with. To score that
     volume itself, name the `variant` "metal_free". An array is [z, y, x] in 1/mm. The truth of the last scan is kept
-    for the next call.
+    for the next call. Most of the work is to simulate views for the protocol `projection`: without it scores take
+    seconds.
 
     Raises
     ------
     InputError
-        Where a volume is not finite or not on the scan's grid, and where `scan` is a twin.
+        Where a volume is not finite or not on the scan's grid, where `scan` is a twin, and for an unknown protocol.
     """
+    protocols = (protocols,) if isinstance(protocols, str) else protocols
+    if unknown := [name for name in protocols if name not in PROTOCOLS]:
+        raise InputError(f"protocols: expected names among {', '.join(PROTOCOLS)}, got {unknown[0]!r}")
     if scan.is_twin:
         raise InputError('expected the scan with metal: score its twin\'s volume with variant="metal_free"')
     values, at_50kev = _arrays(volume, scan)
     pair = Twin(reason=NOT_ASKED) if scan.metal_free is not None else Twin()
     if twin is not None:
         pair = Twin(values=_arrays(twin, scan)[0])
-    return _judge(scan).scores(values, variant, pair, at_50kev)
+    judge = _judge_with_views(scan) if variant == METAL and PROJECTION in protocols else _judge(scan)
+    found = judge.scores(values, variant, pair, at_50kev)
+    return {name: score for name, score in found.items() if name in protocols}
 
 
 @functools.lru_cache(maxsize=1)
 def _judge(scan: ScanWithTruth) -> Judge:
-    """Load what a scan's volumes are scored with; simulating its held-out views is most of the work."""
-    return Judge.of(scan)
+    """Load what a scan's volumes are scored with, but for the views that no method saw."""
+    return Judge.of(scan, "no view was simulated")
+
+
+@functools.lru_cache(maxsize=1)
+def _judge_with_views(scan: ScanWithTruth) -> Judge:
+    judge = _judge(scan)
+    return dataclasses.replace(judge, views=with_floor(held_out(scan), judge.truth))
 
 
 def _arrays(

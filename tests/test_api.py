@@ -12,9 +12,10 @@ from conftest import SMALLEST
 from run_records import run_jobs
 
 import ctsim
+from ctsim import api
 from ctsim.api import find_scene, new_scene, reconstruct_scan, score_volume
 from ctsim.benchmarks import methods
-from ctsim.benchmarks.scores.score import NOT_ASKED
+from ctsim.benchmarks.scores.score import NOT_ASKED, PROTOCOLS
 from ctsim.benchmarks.studies.methods import plan
 from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
@@ -99,6 +100,25 @@ def test_an_array_made_elsewhere_is_scored(simulated):
     volume = reconstruct_scan(simulated)
     found = score_volume(volume.values.numpy().astype(np.float64), simulated)
     assert found == score_volume(volume, simulated) and found["artefact"].note == NOT_ASKED
+
+
+def test_only_the_protocols_that_are_asked_for_cost_work(simulated, monkeypatch):
+    """Views that no method saw are simulated for `projection` alone."""
+    volume, asked, held_out = reconstruct_scan(simulated), [], api.held_out
+    whole = score_volume(volume, simulated)
+    assert set(whole) == set(PROTOCOLS)
+    monkeypatch.setattr(api, "held_out", lambda scan: asked.append(scan) or held_out(scan))
+    api._judge_with_views.cache_clear()
+    for names in (("tissue",), ("metal", "soft"), ()):
+        assert score_volume(volume, simulated, protocols=names) == {name: whole[name] for name in names}
+    assert not asked
+    assert score_volume(volume, simulated, protocols="tissue") == {"tissue": whole["tissue"]}
+    assert score_volume(volume, simulated, protocols=["projection"]) == {"projection": whole["projection"]}
+    assert len(asked) == 1
+    with pytest.raises(InputError, match=r"protocols: expected names among paper, tissue.*got 'tisue'"):
+        score_volume(volume, simulated, protocols=("tissue", "tisue"))
+    with pytest.raises(InputError, match="got 'tisue'"):
+        score_volume(volume, simulated, protocols="tisue")
 
 
 def test_volumes_that_cannot_be_scored_are_refused(simulated):

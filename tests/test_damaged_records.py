@@ -152,7 +152,7 @@ def test_a_damaged_file_is_read_or_refused(kind, tmp_path, caplog):
     ours, theirs = tmp_path / "ours", tmp_path / "theirs"
     for folder in (ours, theirs):
         folder.mkdir()
-    for _ in range(300):
+    for _ in range(100 if kind == "pareto" else 300):  # its tables are fitted
         bad = changed(line, rng)
         (theirs / name).write_bytes(b"\n".join([line, bad, line][: rng.randint(2, 3)]) + b"\n"[: rng.randrange(2)])
         (ours / name).unlink(missing_ok=True)

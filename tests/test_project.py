@@ -246,7 +246,7 @@ def response(materials=MATERIALS):
 @pytest.mark.slow
 @pytest.mark.parametrize(("tolerance", "views"), [(math.inf, 2), (0.2, 1)])
 def test_intensities_equal_the_reference(tolerance, views):
-    tracer, g, r = Tracer.of(blobs(solids=INSERTS)), geometry(n_detector=(6, 9), n_views=2, pixel=6.0), response()
+    tracer, g, r = Tracer.of(blobs(solids=INSERTS)), geometry(n_detector=(5, 7), n_views=2, pixel=7.5), response()
     shape = g.n_detector
     everywhere = np.tile(np.array([0, shape[1]]), (shape[0], 1))
     extra = np.random.default_rng(0).uniform(0, 1, shape).astype(np.float32)

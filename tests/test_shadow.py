@@ -40,7 +40,7 @@ def test_no_ray_that_meets_a_primitive_lies_outside_its_shadow(kind):
         pose = GEOMETRY.pose(view)
         cast = shadow.cast(pose, GEOMETRY.n_detector, shadow.primitive_corners(prims))
         source, centre, e_u, e_v = pose.reshape(4, 3)
-        step = 3 if kind == TORUS else 1  # its reference solves a quartic a ray
+        step = 7 if kind == TORUS else 1  # its reference solves a quartic a ray
         # pixel centres and corners, since both are asked for
         columns = range(view % step, n_u, step)
         for v, u, shift in ((v, u, s) for v in range(n_v) for u in columns for s in (0.0, -0.5, 0.5)):
@@ -50,7 +50,7 @@ def test_no_ray_that_meets_a_primitive_lies_outside_its_shadow(kind):
                 if intersect(prim, *source, *towards, np.empty(4)):
                     assert cast[v, p, 0] <= u + shift <= cast[v, p, 1]
                     met[v, p, u] |= shift == 0
-    assert met.sum() > (100 if kind == TORUS else 300)
+    assert met.sum() > (40 if kind == TORUS else 300)
 
 
 def test_the_shadow_of_a_slanted_rod_is_a_narrow_band():

@@ -154,7 +154,8 @@ def test_dense_metal_is_not_hollow_and_is_said_to_be_uncertain(tmp_path, monkeyp
     with_bounds = reconstruct(stored.scan)
     monkeypatch.setattr(starved, "WEIGHT", 1e-12)
     without = reconstruct(stored.scan)
-    core = [score_volume(volume, stored)["metal"].values["core_ratio"] for volume in (with_bounds, without)]
+    scores = [score_volume(volume, stored, protocols="metal")["metal"] for volume in (with_bounds, without)]
+    core = [score.values["core_ratio"] for score in scores]
     assert core[0] > 2 * core[1]  # 0.52 and 0.18
     assert "metal is thinner than the grid" in with_bounds.details["limitation"]
 

@@ -75,6 +75,8 @@ class Metric:
 
 NO_REFERENCE = "no_reference"
 """The protocol of measured scans, which have no truth."""
+PROJECTION = "projection"
+"""The protocol of views that no method saw."""
 KERMA = "kerma"  # a scan's air kerma, not a run's cost, but tables show it there
 _IMAGE = {"psnr3d": Metric("PSNR3D (dB)", 2, "max"), "ssim3d": Metric("SSIM3D", 3, "max")}
 
@@ -124,7 +126,7 @@ COLUMNS: dict[str, dict[str, Metric]] = {
         "rmse_near": Metric("RMSE ≤ 5 mm (HU)", 1, "min"),
         "rmse_far": Metric("RMSE > 5 mm (HU)", 1, "min"),
     },
-    "projection": {
+    PROJECTION: {
         "noise_free/body": Metric("RMSE P", 4, "min"),
         "noise_free/outside": Metric("RMSE P, outside trace", 4, "min"),
         "noise_free/trace": Metric("RMSE P, in trace", 3, "min"),
@@ -168,6 +170,12 @@ COLUMNS: dict[str, dict[str, Metric]] = {
     },
 }
 """The metrics that tables show of each protocol, in order."""
+
+PROTOCOLS = (
+    *("paper", "tissue", "aligned", "aligned_50kev", "metal"),
+    *("soft", "structure", PROJECTION, "artefact"),
+)
+"""The protocols that one volume of a simulated scan is scored under."""
 
 NEED_TRUTH = tuple(protocol for protocol in COLUMNS if protocol not in (NO_REFERENCE, "cost"))
 """The protocols that a scan without truth is not scored under."""

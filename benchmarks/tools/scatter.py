@@ -99,7 +99,7 @@ def fares(stored: ScanWithTruth, name: str, told: str, constant: float, true: Im
     if told == TRUE:
         field = Scatter(floor=0, gain=1, source=true)
         scan = unfloored(scan, true) if name == "splat" else without_scatter(scan, field)
-    scores = score_volume(method.reconstruct(scan), stored)
+    scores = score_volume(method.reconstruct(scan), stored, protocols=("tissue", "metal"))
     psnr, core = scores["tissue"].values["psnr3d"], scores["metal"].values["core_ratio"]
     return f"{psnr:.2f}", "n/a" if core is None else f"{core:.2f}"
 
