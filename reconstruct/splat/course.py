@@ -15,7 +15,8 @@ from ctsim.reconstruct.splat.level import Data, carve, coarser, refined
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import Response
 
-EMPTY = 0.05  # times water: a voxel of the coarser volume below that holds no splat
+EMPTY, AGAIN = 0.05, 0.3
+"""Times water: a voxel of the coarser volume below the first is empty, and what one in the shadows begins with anew."""
 SMALLEST = 24  # voxels along an axis below which there is no coarser level
 PASSES, MOST = (3, 9), 6e10
 """Passes over each coarser grid and the finest; fewer, at least one, where all of a grid would meet more voxels."""
@@ -74,7 +75,11 @@ class Course:
             start = np.where(support, thin, np.float32(0))
         else:
             start = refined(before.volume(), level.geometry)
-            support = start > EMPTY * water
+            held = start > EMPTY * water
+            # streaks of thick metal bite pieces off the object on a coarse grid; outside the shadows there is nothing
+            lost = carve(level, self.met) & ~held
+            start[lost] = AGAIN * water
+            support = held | lost
         if not support.any():
             return None
         return self._fit(k, support, start)
