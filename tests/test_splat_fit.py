@@ -19,7 +19,7 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.reconstruct.fdk import reconstruct as fdk
-from ctsim.reconstruct.splat import fast
+from ctsim.reconstruct.splat import course, fast
 from ctsim.reconstruct.splat.checkpoint import Checkpoint
 from ctsim.reconstruct.splat.course import passes_over
 from ctsim.reconstruct.splat.curve import MATERIALS, MaterialCurve
@@ -181,6 +181,24 @@ def test_it_beats_fdk_with_and_without_metal(small):
     for scan in (small.scan, small.metal_free.scan):
         ours, theirs = (tissue_score(f(scan).values.numpy(), truth).values["rmse"] for f in (reconstruct, fdk))
         assert ours < 0.6 * theirs  # measured: 0.52 and 0.53
+
+
+@pytest.mark.slow
+def test_what_a_coarse_fit_lost_within_the_shadows_comes_back(small, monkeypatch):
+    """Streaks of thick metal emptied parts of a cup on coarse grids; here a third of the object is taken."""
+    whole, refine = reconstruct(small.scan).values.numpy(), course.refined
+
+    def bitten(values, fine):
+        values = refine(values, fine)
+        values[:, :, : values.shape[2] // 3] = 0
+        return values
+
+    monkeypatch.setattr(course, "refined", bitten)
+    again = reconstruct(small.scan).values.numpy()
+    third = np.s_[:, :, : whole.shape[2] // 3]
+    assert again[third].sum() == pytest.approx(whole[third].sum(), rel=0.02)
+    truth = truth_of(small)
+    assert tissue_score(again, truth).values["psnr3d"] > tissue_score(whole, truth).values["psnr3d"] - 0.3
 
 
 @pytest.mark.slow
