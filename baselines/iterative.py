@@ -38,7 +38,7 @@ class Iterations(Readings, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     `weights` of the rays is "none" (all 1), "trace" (0 in the trace of the metal that `ctsim.baselines.metal.auto_mask`
     finds in FDK's volume, else 1), "exp(-l)" (the share of photons that came through a line integral l, hence the
-    inverse variance of l up to a factor), or a tensor [view, v, u] of one's own.
+    inverse variance of l up to a factor, where no scatter was taken off), or a tensor [view, v, u] of one's own.
     """
 
     iterations: Count = 10

@@ -6,7 +6,7 @@ are the same numbers.
 
 import dataclasses
 import functools
-from collections.abc import Collection
+from collections.abc import Iterable
 from typing import Any, Literal
 
 import numpy as np
@@ -91,7 +91,7 @@ def score_volume(
     *,
     twin: Volume | NDArray[Any] | None = None,
     variant: Literal["metal", "metal_free"] = "metal",
-    protocols: str | Collection[str] = PROTOCOLS,
+    protocols: str | Iterable[str] = PROTOCOLS,
 ) -> dict[str, Score]:
     """Score a volume under those `protocols` that apply: name -> `Score`, the same numbers as `run-benchmark`.
 
@@ -105,8 +105,8 @@ def score_volume(
     InputError
         Where a volume is not finite or not on the scan's grid, where `scan` is a twin, and for an unknown protocol.
     """
-    protocols = (protocols,) if isinstance(protocols, str) else protocols
-    if unknown := [name for name in protocols if name not in PROTOCOLS]:
+    protocols = {protocols} if isinstance(protocols, str) else set(protocols)
+    if unknown := sorted(protocols - set(PROTOCOLS)):
         raise InputError(f"protocols: expected names among {', '.join(PROTOCOLS)}, got {unknown[0]!r}")
     if scan.is_twin:
         raise InputError('expected the scan with metal: score its twin\'s volume with variant="metal_free"')

@@ -113,7 +113,8 @@ class Scan:
     `flat` [v, u] float32 is the open-field image and `dark` the pedestal, both in counts. `e_max` is
     the highest photon energy (keV); `i0` the photons per open pixel and view. `metal` [z, y, x], not 0 in metal,
     is the true mask, there only for methods that declare to be given it. `name` is that of the scene, "" where it has
-    none; that of a metal-free twin ends in "/metal_free".
+    none; that of a metal-free twin ends in "/metal_free". `floor` is the smallest signal, in counts above the pedestal,
+    whose logarithm is taken; None is half a photon, and of whole counts at least half a count.
 
     Raises
     ------
@@ -130,8 +131,11 @@ class Scan:
     e_max: float = 90.0
     metal: "torch.Tensor | None" = None
     name: str = ""
+    floor: float | None = None
 
     def __post_init__(self) -> None:
+        if self.floor is not None and not 0 < self.floor < math.inf:
+            raise InputError(f"floor: expected a number of counts above 0, got {self.floor!r}")
         check_readings(self.dark, self.i0, self.e_max)
         _check_array("counts", self.counts, self.geometry.shape, READINGS)
         _check_array("flat", self.flat, self.geometry.n_detector, READINGS)

@@ -15,9 +15,11 @@ NO_SIGNAL = "no pixel has signal: every reading is at the floor of the logarithm
 def count_floor(scan: Scan) -> float:
     """Return the smallest signal, in counts above the pedestal, whose logarithm is taken.
 
-    Half a photon's worth (mean open field / (2 i0)), and at least half a count where counts are integers:
-    below that a reading says no more than "nothing seen".
+    Where the scan does not say, half a photon's worth (mean open field / (2 i0)), and at least half a count where
+    counts are integers: below that a reading says no more than "nothing seen".
     """
+    if scan.floor is not None:
+        return scan.floor
     half_photon = 0.5 * (float(scan.flat.double().mean()) - scan.dark) / scan.i0
     half_count = 0.0 if scan.counts.is_floating_point() else 0.5
     floor = max(half_photon, half_count)

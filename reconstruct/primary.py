@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import torch
 
-from ctsim.reconstruct.log import LineIntegrals
+from ctsim.reconstruct.log import LineIntegrals, count_floor
 from ctsim.reconstruct.scatter import Scatter, scatter_of
 from ctsim.reconstruct.settings import about
 from ctsim.types import Scan, Volume
@@ -46,22 +46,26 @@ def scatter_in(scan: Scan, scattered: Literal["found"] | float) -> Scatter:
     if scattered != "found":
         return Scatter(floor=float(scattered))
     p, clamped = LineIntegrals(scan).of(slice(None))
-    return scatter_of(p, ~clamped, scan.geometry, scan.i0)
+    return scatter_of(p, np.logical_not(clamped, out=clamped), scan.geometry, scan.i0)
 
 
 def without_scatter(scan: Scan, scatter: Scatter) -> Scan:
     """Return the scan with scatter taken off its counts, which are then float32; itself where there is none.
 
-    At least a tenth of each reading is kept. Noise stays what it was.
+    At least a tenth of each reading is kept, and the floor of the logarithm; what was below it stays. Noise stays what
+    it was.
     """
     if scatter.mean == 0:
         return scan
     open_field, dark = scan.flat.numpy() - np.float32(scan.dark), np.float32(scan.dark)
-    counts = scan.counts.numpy().astype(np.float32)
+    counts, floor = scan.counts.numpy().astype(np.float32), count_floor(scan)
+    least = np.float32(1.01 * floor)  # above the floor: a reading that was seen is seen
     for view, image in enumerate(counts):
         signal = image - dark
-        image -= np.minimum(scatter.of(view, image.shape) * open_field, (1 - KEPT) * np.maximum(signal, 0))
-    return dataclasses.replace(scan, counts=torch.from_numpy(counts))
+        with np.errstate(invalid="ignore"):  # of infinite readings
+            room = np.maximum(signal - np.maximum(np.float32(KEPT) * signal, least), 0)
+        image -= np.minimum(scatter.of(view, image.shape) * open_field, room)
+    return dataclasses.replace(scan, counts=torch.from_numpy(counts), floor=floor)
 
 
 def primary(function: Callable[[Scan, S], Volume]) -> Callable[[Scan, S], Volume]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, optimize, stats
+from scipy import ndimage, optimize
 
 from ctsim.geometry import Geometry
 
@@ -111,7 +111,8 @@ def _steadied(means: Image, noise: float) -> Image:
     if not always.any():
         return np.ones((len(means), 1, 1), np.float32)
     levels = np.median(means[:, always], axis=1).astype(np.float64)
-    usual = float(np.mean(stats.trimboth(levels, TRIMMED)))
+    cut = int(TRIMMED * len(levels))
+    usual = float(np.mean(np.partition(levels, (cut, len(levels) - cut - 1))[cut : len(levels) - cut]))
     unsteady = (np.abs(levels - usual) > noise) & (levels > 0)  # less is scatter's own course as well
     return np.asarray(np.where(unsteady, usual / np.where(unsteady, levels, 1), 1), np.float32)[:, None, None]
 

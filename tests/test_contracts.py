@@ -10,6 +10,8 @@ import torch
 from ctsim.benchmarks.methods import TABLE, find
 from ctsim.benchmarks.studies.methods.attempt import scan_for
 from ctsim.dataset.store import list_scans, open_scan
+from ctsim.reconstruct.primary import without_scatter
+from ctsim.reconstruct.scatter import Scatter
 from ctsim.types import Status
 
 SHORT = {name: {"steps": 100} for name in ("splat-paper", "splat-r2")}  # of 20 000 and 30 000
@@ -41,6 +43,17 @@ def test_a_method_gives_a_finite_volume_of_the_scans_grid(name, stored):
     water = stored.reference("effective")[stored.labels == 1]
     measured = volume.values.numpy()[stored.labels == 1]
     assert np.median(water) / 2 < np.median(measured) < 2 * np.median(water)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in TABLE if "scatter" in find(name).params and name != "splat"])
+def test_scatter_is_taken_off_once(name, stored):
+    """`splat` has it in its model; for all others it leaves the counts before anything looks at them."""
+    short, scan = SHORT.get(name, {}), scan_for(find(name), stored, "metal")
+    volume = find(name, short | {"scatter": 0.02}).reconstruct(scan)
+    again = find(name, short).reconstruct(without_scatter(scan, Scatter(floor=0.02)))
+    assert torch.equal(volume.values, again.values) and volume.details["scatter"] == 0.02
+    assert not torch.equal(volume.values, find(name, short).reconstruct(scan).values)
 
 
 @pytest.mark.slow

@@ -59,6 +59,25 @@ def test_readings_without_a_signal_stay_as_they_are():
     assert bool((left[0, 0, 4:] < scan.counts[0, 0, 4:]).all())
 
 
+def test_what_was_below_the_floor_of_whole_counts_stays_and_no_other_falls_below():
+    """Half a count, where 1e7 photons would allow 0.0025: as float32 alone these readings would be a P of 16.8."""
+    scan = scan_of(np.full(GEOMETRY.shape, 0.3), np.uint16)
+    scan.counts[0, 0, :4] = torch.tensor([90, 91, 92, 100], dtype=torch.uint16)
+    before, clamped = line_integrals(scan, slice(None))
+    for scatter, changed in ((1e-9, False), (0.1, True)):
+        after, mask = line_integrals(without_scatter(scan, Scatter(floor=scatter)), slice(None))
+        assert torch.equal(mask, clamped) and after[0, 0, 0] == before[0, 0, 0]
+        assert torch.allclose(after, before, atol=1e-4, rtol=0) != changed
+        assert bool((after <= torch.log((scan.flat - DARK) / 0.5) + 1e-5).all())
+
+
+def test_infinite_readings_stay_unseen():
+    scan = scan_of(np.full(GEOMETRY.shape, 0.3))
+    scan.counts[0, 0, 0], scan.counts[0, 0, 1] = torch.inf, -torch.inf
+    clamped = line_integrals(without_scatter(scan, Scatter(floor=0.1)), slice(None))[1]
+    assert bool(clamped[0, 0, :2].all()) and int(clamped.sum()) == 2
+
+
 def test_whole_counts_keep_what_lies_between_them_and_the_scan_its_own():
     scan = scan_of(np.full(GEOMETRY.shape, 0.3), np.uint16)
     before = scan.counts.clone()

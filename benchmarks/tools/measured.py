@@ -78,9 +78,9 @@ PAGES: dict[str, Page] = {
         explained="splats.md",
     ),
     "scatter": Page(
-        title="Scatter that splats find",
+        title="Scatter found in scans",
         command="python -m ctsim.benchmarks.tools.scatter docs/measured",
-        sources=(*SIMULATOR, "reconstruct/", "benchmarks/scores/", f"{SUITES}scatter.toml"),
+        sources=(*METHODS, "benchmarks/scores/", f"{SUITES}scatter.toml"),
         explained="splats.md",
     ),
     "methods": Page(

@@ -98,8 +98,10 @@ def carve(data: Data, open_below: float) -> NDArray[np.bool_]:
     A voxel is empty where a view has its shadow and p of the pixels around that lies less than `open_below` above that
     of a ray that met nothing. Pixels without weight say nothing.
     """
-    p = np.where(data.weights > 0, data.p - np.float32(data.open), np.inf)
-    near = np.asarray(ndimage.maximum_filter(p, (1, 3, 3))) > open_below
+    near = np.empty(data.p.shape, np.bool_)
+    for shadow, p, weights in zip(near, data.p, data.weights, strict=True):  # a view at a time: p is large
+        met = np.where(weights > 0, p - np.float32(data.open), np.inf)
+        shadow[...] = np.asarray(ndimage.maximum_filter(met, (3, 3))) > open_below
     z, y, x = data.geometry.voxel_centres()
     state = np.zeros(data.geometry.n_voxel, np.int8)
     carve_cpu.carve(data.geometry.pose_array(), near, z, y, x, state)
