@@ -28,7 +28,9 @@ class Course:
     """The levels of a fit, coarsest first, and the passes over each.
 
     `met` is how far p of a ray that met something lies above that of open ones; `tv` is the denoising of the finest
-    level; `exact` is how splats are projected.
+    level; `exact` is how splats are projected. `again` is whether a voxel that a coarser fit emptied begins anew where
+    no view shows it to be empty: streaks of thick metal bite pieces off the object. Few passes do not empty it once
+    more, so trials go without.
     """
 
     levels: list[Data]
@@ -38,6 +40,7 @@ class Course:
     met: float
     tv: float
     exact: bool
+    again: bool = True
 
     def go(self, proceed: Callable[[Fit, bool, float], bool], fit: Fit | None = None) -> Fit | None:
         """Fit level by level while `proceed(fit, whole, share of the work)`, from a `fit` on that has begun.
@@ -75,11 +78,11 @@ class Course:
             start = np.where(support, thin, np.float32(0))
         else:
             start = refined(before.volume(), level.geometry)
-            held = start > EMPTY * water
-            # streaks of thick metal bite pieces off the object on a coarse grid; outside the shadows there is nothing
-            lost = carve(level, self.met) & ~held
-            start[lost] = AGAIN * water
-            support = held | lost
+            support = start > EMPTY * water
+            if self.again:
+                lost = carve(level, self.met) & ~support
+                start[lost] = AGAIN * water
+                support |= lost
         if not support.any():
             return None
         return self._fit(k, support, start)

@@ -160,7 +160,8 @@ def _filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtratio
     trial = msgspec.structs.replace(settings, passes=TRIAL)
 
     def fit_of(value: float) -> Fit | None:
-        return _course(few, settings.make_response(scan.e_max, value), trial).go(lambda fit, whole, share: True)
+        course = _course(few, settings.make_response(scan.e_max, value), trial, again=False)
+        return course.go(lambda fit, whole, share: True)
 
     return found(fit_of)
 
@@ -282,7 +283,7 @@ def _summed(weights: tuple[float, float], rho: Image) -> Image:
     return np.float32(weights[0]) * rho[0] + np.float32(weights[1]) * rho[1]
 
 
-def _course(levels: list[Data], response: Response, settings: Settings) -> Course:
+def _course(levels: list[Data], response: Response, settings: Settings, again: bool = True) -> Course:
     data = levels[-1]
     met = max(OPEN / math.sqrt(_open_photons(data)), LEAST_OPEN)
     return Course(
@@ -293,6 +294,7 @@ def _course(levels: list[Data], response: Response, settings: Settings) -> Cours
         met=met,
         tv=settings.tv,
         exact=settings.exact,
+        again=again,
     )
 
 
