@@ -104,7 +104,7 @@ def test_every_file_of_the_packages_is_in_the_wheel(wheel):
 
 
 USED = """
-import importlib, pkgutil, sys
+import importlib, pkgutil
 import ctsim
 
 for module in pkgutil.walk_packages(ctsim.__path__, "ctsim."):
@@ -114,15 +114,15 @@ for module in pkgutil.walk_packages(ctsim.__path__, "ctsim."):
         importlib.import_module(module.name)
     except ModuleNotFoundError as error:  # of an extra
         assert not error.name.startswith("ctsim"), module.name
-scan = ctsim.open_scan(sys.argv[1])
+scan = ctsim.open_scan({scan!r})
 print(ctsim.__file__, float(ctsim.reconstruct_scan(scan, "fdk").values.median()))
 """
 
 
 @pytest.mark.slow
 def test_an_installed_ctsim_imports_and_reconstructs(project, site, smallest, monkeypatch):
-    """`test_docs` runs the README's Python; here all of it is there. Kernels run as Python: compiling takes minutes."""
+    """`test_docs` runs the README's Python; this finds missing modules. Kernels run as Python, uncompiled."""
     monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
     (scan,) = list_scans(smallest)
-    where, water = run(project, site, USED.replace("sys.argv[1]", repr(str(scan)))).split()
+    where, water = run(project, site, USED.format(scan=str(scan))).split()
     assert where == str(site / "ctsim" / "__init__.py") and 0.01 < float(water) < 0.1

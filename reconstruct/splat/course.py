@@ -16,7 +16,7 @@ from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import Response
 
 EMPTY, AGAIN = 0.05, 0.3
-"""Times water: a voxel of the coarser volume below the first is empty, and what one in the shadows begins with anew."""
+"""Times water: below the first a voxel of the coarser volume is empty; within the shadows it begins at the second."""
 SMALLEST = 24  # voxels along an axis below which there is no coarser level
 PASSES, MOST = (3, 9), 6e10
 """Passes over each coarser grid and the finest; fewer, at least one, where all of a grid would meet more voxels."""
@@ -28,9 +28,9 @@ class Course:
     """The levels of a fit, coarsest first, and the passes over each.
 
     `met` is how far p of a ray that met something lies above that of open ones; `tv` is the denoising of the finest
-    level; `exact` is how splats are projected. `again` is whether a voxel that a coarser fit emptied begins anew where
-    no view shows it to be empty: streaks of thick metal bite pieces off the object. Few passes do not empty it once
-    more, so trials go without.
+    level; `exact` is how splats are projected. `again` is whether a voxel that a coarser fit emptied begins again
+    where no view shows it to be empty: streaks of thick metal bite pieces off the object. The few passes of a trial do
+    not empty the air again, so trials go without.
     """
 
     levels: list[Data]

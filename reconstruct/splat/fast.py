@@ -97,9 +97,9 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     Details hold the volumes "rho_a" and "rho_b" under "densities", and under "grid" the voxels of the finest lattice.
     """
     stopwatch = Stopwatch(limit=settings.seconds)
+    scatter = scatter_in(scan, settings.scatter)  # first: it takes line integrals of its own, which are then gone
     p, clamped = line_integrals(scan, slice(None))
     valid = ~clamped.numpy()
-    scatter = scatter_in(scan, settings.scatter)
     finest = finer(scan.geometry, settings.fineness)
     below = Below.of(scan)
     weights = weights_and_bounds(scan, p.numpy(), valid, scatter, below.noise)
