@@ -4,6 +4,7 @@ from collections.abc import Iterable
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from ctsim.geometry import Geometry
 from ctsim.tracer.project import Response, Tracer, path_lengths, transmit
@@ -12,6 +13,7 @@ from ctsim.tracer.voxelise import metal_mask
 from ctsim.types import Phantom
 
 NOT_ON_GRID = "no metal on the reconstruction grid"
+PIECES = 4  # of metal that are looked at first
 SHOWN = 0.01  # of a pixel's signal: less than 10 000 photons tell from noise
 
 
@@ -56,12 +58,19 @@ def _solids(phantom: Phantom) -> Phantom:
 
 
 def _on_grid(solids: Phantom, tracer: Tracer, geometry: Geometry) -> bool:
-    """Look for a voxel of metal in the part of the grid around the metal."""
+    """Look for a voxel of metal, first around the middles of some pieces, which mostly hold it."""
+    middles = [p.centre[::-1] for s in solids.solids if s.metal for p in s.primitives][:PIECES]
     corners = primitive_corners(tracer.prims[tracer.metal]).reshape(-1, 3)[:, ::-1]  # z, y, x
+    places = [np.array([middle]) for middle in middles] + [corners]
+    return any(_in_box(solids, geometry, points) for points in places)
+
+
+def _in_box(solids: Phantom, geometry: Geometry, points: NDArray[np.float64]) -> bool:
+    """Look for a voxel of metal in the box of voxels around points [k, 3] (z, y, x)."""
     first, n_voxel, off = [], [], []
     for k, centres in enumerate(geometry.voxel_centres()):
         reach = geometry.d_voxel[k]
-        low, high = np.searchsorted(centres, [corners[:, k].min() - reach, corners[:, k].max() + reach])
+        low, high = np.searchsorted(centres, [points[:, k].min() - reach, points[:, k].max() + reach])
         if low == high:
             return False
         first.append(low)

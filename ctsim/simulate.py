@@ -23,31 +23,15 @@ from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.montecarlo.series import ScatterSeries, scatter_series
 from ctsim.montecarlo.transport import Source
-from ctsim.plan import Plan, all_rays, density_levels
+from ctsim.plan import Plan, density_levels
 from ctsim.readout import TWIN, Image, Moments, Readout, panel_of
+from ctsim.signals import Part, Signals, compact, share_rays
 from ctsim.tracer.kernels.raytrace_cpu import STRIP
-from ctsim.tracer.project import Response, Tracer, path_lengths, transmit
-from ctsim.tracer.shadow import join, row_spans
 from ctsim.tracer.voxelise import body_attenuation, body_labels, cover_of, label_volume, metal_mask, painted
 from ctsim.types import Phantom, Scanner
 
 Scattered = Sequence[ScatterSeries | None]
 REFERENCE_KEV = 50.0  # centre of 10–90 keV
-
-
-def compact(phantom: Phantom, materials: tuple[str, ...]) -> Phantom:
-    """Return the phantom with its labels renumbered to `materials`, which must hold all that occur."""
-    if materials == phantom.materials:
-        return phantom
-    table = np.array([materials.index(m) if m in materials else 0 for m in phantom.materials], np.uint8)
-    return Phantom(
-        labels=table[phantom.labels],
-        materials=materials,
-        d_voxel=phantom.d_voxel,
-        off_origin=phantom.off_origin,
-        density=phantom.density,
-        solids=phantom.solids,
-    )
 
 
 def undivided(phantom: Phantom, plan: Plan) -> Phantom:
@@ -104,6 +88,12 @@ def _fold(plan: Plan, phantom: Phantom) -> NDArray[np.float32] | None:
     return fold
 
 
+def part_of(plan: Plan, phantom: Phantom, scanner: Scanner) -> Part:
+    """Return what decides whether a scan is a variant of another one."""
+    beam = _beam(plan, scanner)
+    return Part(plan=plan, phantom=phantom, scanner=scanner, layer=beam.layer, layer_material=beam.layer_material)
+
+
 def scatter_of(plan: Plan, phantom: Phantom, scanner: Scanner) -> Scattered:
     """Follow photons through the phantom and, where there is a twin, without its metal; None at levels other than 3."""
     body = compact(phantom, plan.materials)
@@ -127,27 +117,31 @@ def scatter_of(plan: Plan, phantom: Phantom, scanner: Scanner) -> Scattered:
 class Simulator:
     """One scan being simulated; holds what the views share.
 
-    `scatter` is that of `scatter_of` where it is known already, as of a body that scatters alike.
+    `scatter` is that of `scatter_of` where it is known already, as of a body that scatters alike. `signals` are those
+    that the scan shares with its variants, and its place among these (`ctsim.signals.share_rays`).
     """
 
-    def __init__(self, plan: Plan, phantom: Phantom, scanner: Scanner, scatter: Scattered | None = None) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        phantom: Phantom,
+        scanner: Scanner,
+        scatter: Scattered | None = None,
+        signals: tuple[Signals, int] | None = None,
+    ) -> None:
         self.plan, self.scanner, self.geometry = plan, scanner, scanner.geometry
         self.beam = _beam(plan, scanner)
         self.fold = _fold(plan, phantom)
-        body = compact(phantom, plan.materials)
-        layer, rays = self.beam.layer_material, all_rays(scanner)
-        self.tracer = Tracer.of(body, skip=plan.settings.skip, extra=layer, geometry=rays)
-        self.bare = self.tracer.without_metal()
-        self.response = Response.of(plan.rule, self.tracer.materials)
-        self.metal = np.array([any(s.metal and s.material == m for s in body.solids) for m in self.tracer.materials])
+        ((self.signals, self.variant),) = (
+            share_rays([part_of(plan, phantom, scanner)]) if signals is None else [signals]
+        )
+        self.metal = np.array([any(s.metal and s.material == m for s in phantom.solids) for m in plan.materials])
         self.names = {o.name for o in plan.outputs}
         self.readout = Readout(scanner, plan.stream_id)
         self.panel = self.readout.panel
         beam = self.beam
         opened = beam.open1, beam.open1 if beam.gain is None else beam.open1 * beam.gain
         self.opened, self.lit_open = opened if self.panel is None else map(self.panel.spread, opened)
-        self.lengths = np.zeros((len(self.tracer.materials), *self.geometry.n_detector), np.float32)
-
         self.scatter = scatter_of(plan, phantom, scanner) if scatter is None else scatter
         self.largest = self._largest_p() if scanner.noise.model == "tigre" else [math.nan] * 2
 
@@ -158,7 +152,7 @@ class Simulator:
 
     def view(self, k: int) -> dict[str, NDArray]:
         """Everything the plan wants of view k. With lag, views come in order."""
-        scan, twin, spans = self._signals(k)
+        scan, twin, spans = self.signals.moments(k, self.variant)
         lit = self._lit(scan, k, 0)
         out = self._images(scan, lit)
         out["counts"], drawn = self.readout.counts(lit, k, largest=self.largest[0])
@@ -173,65 +167,16 @@ class Simulator:
 
     def expected(self, k: int) -> list[Moments]:
         """Return the noise-free moments of what reaches the detector in view k of the scan, and of its twin if any."""
-        signals = [moments for moments in self._signals(k)[:2] if moments is not None]
+        signals = [moments for moments in self.signals.moments(k, self.variant)[:2] if moments is not None]
         return [self._lit(moments, k, which) for which, moments in enumerate(signals)]
-
-    def _signals(self, k: int) -> tuple[Moments, Moments | None, NDArray[np.int64] | None]:
-        """Noise-free moments of the scan and of its twin, and the columns of each row in which these can differ."""
-        spot = self.plan.spot
-        if spot is None or not spot.offsets.any():
-            return self._seen(self.geometry, k)
-        geometry = spot.geometry(self.geometry, k)
-        twins = 2 if "metal_free/counts" in self.names else 1
-        sums, spans = np.zeros((twins, 2, *self.geometry.n_detector)), None
-        for j, weight in enumerate(spot.weights):
-            *images, found = self._seen(geometry, j)
-            sums += weight * np.stack([pair for pair in images if pair is not None])
-            spans = found if spans is None or found is None else join(spans, found)
-        scan, *twin = sums.astype(np.float32)
-        return (scan[0], scan[1]), (twin[0][0], twin[0][1]) if twin else None, spans
-
-    def _cross(self, geometry: Geometry, k: int) -> None:
-        """Fill `lengths` with what the central rays of a view cross but for solids."""
-        self.tracer.background(geometry, k, self.lengths)  # serves the scan, its twin and the path lengths
-        if self.beam.layer is not None:
-            self.lengths[-1] += self.beam.layer
-
-    def _seen(self, geometry: Geometry, k: int) -> tuple[Moments, Moments | None, NDArray[np.int64] | None]:
-        """Return what `_signals` does, of a point source."""
-        self._cross(geometry, k)
-        scan = self._transmit(self.tracer, geometry, k)
-        if "metal_free/counts" not in self.names:
-            return scan, None, None
-        if not self.plan.settings.skip:
-            return scan, self._transmit(self.bare, geometry, k), None
-        # only pixels in the metal's shadow can differ
-        shape = geometry.n_detector
-        spans = row_spans(self.tracer.shadows(geometry.pose(k), shape)[:, self.tracer.metal], shape[1])
-        return scan, self._transmit(self.bare, geometry, k, (scan[0].copy(), scan[1].copy(), spans)), spans
 
     def _largest_p(self) -> list[float]:
         """Largest P that is read without noise in all views: of the scan and of its twin."""
         largest = [0.0, 0.0]
         for k in range(self.geometry.n_views):
-            for which, moments in enumerate(self._signals(k)[:2]):
-                if moments is not None:
-                    largest[which] = max(largest[which], largest_p(self._lit(moments, k, which)[0]))
+            for which, lit in enumerate(self.expected(k)):
+                largest[which] = max(largest[which], largest_p(lit[0]))
         return largest
-
-    def _transmit(
-        self, tracer: Tracer, geometry: Geometry, k: int, out: tuple[Image, Image, NDArray] | None = None
-    ) -> tuple[Image, Image]:
-        return transmit(
-            tracer,
-            geometry,
-            k,
-            self.response,
-            subrays=self.plan.settings.subrays,
-            edge_tolerance=self.plan.settings.edge_tolerance,
-            background=self.lengths,
-            out=out,
-        )
 
     def _lit(self, moments: Moments, k: int, which: int) -> Moments:
         """Return the moments of what reaches the detector in view k of the scan (0) or its twin (1), with scatter."""
@@ -274,15 +219,13 @@ class Simulator:
         energies = self.plan.truth.mono_kev
         if not wanted and not energies:
             return {}
-        if self.plan.spot is not None:
-            self._cross(self.geometry, k)  # the rays from the spot's centre
-        lengths = path_lengths(self.tracer, self.geometry, k, self.lengths)[: len(self.plan.materials)]
-        metal = lengths[self.metal[: len(lengths)]].sum(0)
+        lengths = self.signals.paths(k)[: len(self.plan.materials)]
+        metal = lengths[self.metal].sum(0)
         all_paths = {"trace": (metal > 0).astype(np.uint8), "metal_path": metal, "paths": self._told(lengths)[1:]}
         out: dict[str, NDArray] = {name: all_paths[name] for name in wanted}
         twin = None
         if "metal_free/counts" in self.names and energies:
-            twin = path_lengths(self.bare, self.geometry, k, self.lengths)
+            twin = self.signals.paths(k, twin=True)
         for energy in energies:
             mu = np.array([0.0, *(attenuation(m, np.array([energy]))[0] for m in self.plan.materials[1:])])
             out[f"mono_{energy:g}kev"] = np.tensordot(mu, lengths, 1).astype(np.float32)
@@ -305,16 +248,21 @@ def threads_of_view(geometry: Geometry) -> Iterator[None]:
 
 
 def simulate_views(
-    plan: Plan, phantom: Phantom, scanner: Scanner, first_view: int = 0, scatter: Scattered | None = None
+    plan: Plan,
+    phantom: Phantom,
+    scanner: Scanner,
+    first_view: int = 0,
+    scatter: Scattered | None = None,
+    signals: tuple[Signals, int] | None = None,
 ) -> Iterator[tuple[int, dict[str, NDArray]]]:
-    """Yield (view, images by output name) from `first_view` on; `scatter` is that of `scatter_of`, where it is known.
+    """Yield (view, images by output name) from `first_view` on; `scatter` and `signals` as `Simulator` takes them.
 
     Line-integral images (noise_free, scatter_free, mono_…) are P = −ln(signal/open), float32 [v, u];
     metal_path and paths are mm; trace is 1 where the central ray meets metal.
     """
     if first_view == scanner.geometry.n_views:
         return  # a pass over all views, as TIGRE's noise takes, would be for nothing
-    simulator = Simulator(plan, phantom, scanner, scatter)
+    simulator = Simulator(plan, phantom, scanner, scatter, signals)
     for k in range(max(0, first_view - simulator.frames), first_view):
         simulator.view(k)  # light of earlier views comes in later ones
     for k in range(first_view, scanner.geometry.n_views):

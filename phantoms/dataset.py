@@ -4,12 +4,14 @@ import contextlib
 import functools
 import hashlib
 import operator
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from ctsim.beam.spectrum import spectrum
 from ctsim.dataset.manifest import About
@@ -19,9 +21,11 @@ from ctsim.detector.response import response
 from ctsim.errors import InputError
 from ctsim.notes import metal_share
 from ctsim.phantoms.scene import Scene, build, individual, scene_id, scene_to_toml, stream_id
+from ctsim.phantoms.variants import build_all
 from ctsim.phantoms.vary import Drawn
 from ctsim.plan import Plan, disk_estimate, make_plan
-from ctsim.simulate import Scattered, scan_info, scatter_of, simulate_views, truth_volumes
+from ctsim.signals import Signals, share_rays
+from ctsim.simulate import Scattered, part_of, scan_info, scatter_of, simulate_views, truth_volumes
 from ctsim.types import Phantom, Scanner
 
 FEW_TISSUES = 7  # air among them: what recipes have, mostly
@@ -30,6 +34,32 @@ Watch = Callable[[Iterable[Any], int, int], Iterable[Any]]
 
 Writer = SceneWriter | MemoryWriter
 """Takes a scene view by view, then its truth."""
+
+
+@dataclass(slots=True, kw_only=True)
+class _Job:
+    """A scene on its way to its writer."""
+
+    scene: Scene
+    phantom: Phantom
+    scanner: Scanner
+    plan: Plan
+    writer: Writer = field(init=False)
+
+    @staticmethod
+    def of(scene: Scene, phantom: Phantom) -> "_Job":
+        scanner = scene.resolve()
+        return _Job(scene=scene, phantom=phantom, scanner=scanner, plan=_plan(scene, phantom, scanner))
+
+    @property
+    def n_views(self) -> int:
+        return self.scanner.geometry.n_views
+
+    def views(self, scatter: Scattered, signals: tuple[Signals, int]) -> Iterator[tuple[int, dict[str, NDArray]]]:
+        """Simulate the views that the writer lacks."""
+        return simulate_views(
+            self.plan, self.phantom, self.scanner, self.writer.first_view, scatter=scatter, signals=signals
+        )
 
 
 def plan_scene(scene: Scene) -> Plan:
@@ -60,21 +90,46 @@ def make_scene(
     InputError
         Where another scene is in the way, the disk is full or memory is short.
     """
-    with _memory(scene.name):
-        phantom, scanner = build(scene), scene.resolve()
-        plan = _plan(scene, phantom, scanner)
-        for note in plan.notes:
-            tell(note)
-        with SceneWriter(
-            out,
-            scene.name,
-            scene_id=scene_id(scene),
-            plan_hash=plan_hash(plan),
-            stacks=_stacks(plan, scanner),
-            force=force,
-        ) as writer:
-            _simulate(writer, scene, plan, phantom, scanner, watch)
-            return writer.finish(about(scene, phantom, scanner) if scene.drawn else None)
+
+    def watch_one(name: str, views: Iterable[Any], first: int, n: int) -> Iterable[Any]:
+        return watch(views, first, n)
+
+    return make_scenes((scene,), out, force=force, watch=watch_one, tell=lambda name, note: tell(note))[0]
+
+
+def make_scenes(
+    scenes: Sequence[Scene],
+    out: Path,
+    *,
+    force: bool = False,
+    watch: Callable[[str, Iterable[Any], int, int], Iterable[Any]] = lambda name, views, first, n: views,
+    tell: Callable[[str, str], object] = lambda name, note: None,
+) -> list[Path]:
+    """Simulate scenes view by view at the same time, and return their folders: see `make_scene`.
+
+    Scenes that differ in metal, beam, noise and dose alone share the work on their rays (`ctsim.signals.same_rays`).
+    Each is, to the last bit, what it is when it is made alone. `watch` and `tell` get the name of the scene first.
+    """
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_memory(" to ".join(dict.fromkeys((scenes[0].name, scenes[-1].name)))))
+        jobs = [_Job.of(scene, phantom) for scene, phantom in zip(scenes, build_all(scenes), strict=True)]
+        writers = []
+        for job in jobs:
+            for note in job.plan.notes:
+                tell(job.scene.name, note)
+            writer = SceneWriter(
+                out,
+                job.scene.name,
+                scene_id=scene_id(job.scene),
+                plan_hash=plan_hash(job.plan),
+                stacks=_stacks(job.plan, job.scanner),
+                force=force,
+            )
+            job.writer = stack.enter_context(writer)
+            writers.append(writer)
+        _simulate(jobs, watch)
+        told = [about(job.scene, job.phantom, job.scanner) if job.scene.drawn else None for job in jobs]
+        return [writer.finish(one) for writer, one in zip(writers, told, strict=True)]
 
 
 def about(scene: Scene, phantom: Phantom, scanner: Scanner) -> About:
@@ -100,10 +155,10 @@ def simulate_scene(scene: Scene) -> SimulatedScan:
     Raises InputError where memory is short.
     """
     with _memory(scene.name):
-        phantom, scanner = build(scene), scene.resolve()
-        plan = _plan(scene, phantom, scanner)
-        writer = MemoryWriter(scene.name, scene_id=scene_id(scene), stacks=_stacks(plan, scanner))
-        _simulate(writer, scene, plan, phantom, scanner)
+        job = _Job.of(scene, build(scene))
+        writer = MemoryWriter(scene.name, scene_id=scene_id(scene), stacks=_stacks(job.plan, job.scanner))
+        job.writer = writer
+        _simulate([job])
         return writer.finish()
 
 
@@ -114,15 +169,24 @@ def _stacks(plan: Plan, scanner: Scanner) -> tuple[Stack, ...]:
 
 
 def _simulate(
-    writer: Writer, scene: Scene, plan: Plan, phantom: Phantom, scanner: Scanner, watch: Watch = lambda views, *_: views
+    jobs: Sequence[_Job],
+    watch: Callable[[str, Iterable[Any], int, int], Iterable[Any]] = lambda name, views, first, n: views,
 ) -> None:
-    """Simulate the views that the writer lacks, and the truth."""
-    scatter = scatter_of(plan, phantom, scanner)
-    views = simulate_views(plan, phantom, scanner, first_view=writer.first_view, scatter=scatter)
-    for view, arrays in watch(views, writer.first_view, scanner.geometry.n_views):
-        writer.put(view, arrays)
-    _write_truth(writer, plan, phantom, scanner, scatter)
-    writer.write_text("scene.toml", scene_to_toml(scene))
+    """Simulate the views that the writers lack, of all scenes in step, and the truth."""
+    scatter = [scatter_of(job.plan, job.phantom, job.scanner) for job in jobs]
+    shared = share_rays([part_of(job.plan, job.phantom, job.scanner) for job in jobs])
+    views = [
+        iter(watch(job.scene.name, job.views(*known), job.writer.first_view, job.n_views))
+        for job, *known in zip(jobs, scatter, shared, strict=True)
+    ]
+    for k in range(min(job.writer.first_view for job in jobs), max(job.n_views for job in jobs)):
+        for job, its in zip(jobs, views, strict=True):
+            if job.writer.first_view <= k < job.n_views:
+                job.writer.put(*next(its))
+    for job, its, scattered in zip(jobs, views, scatter, strict=True):
+        next(its, None)  # the last view is done
+        _write_truth(job.writer, job.plan, job.phantom, job.scanner, scattered)
+        job.writer.write_text("scene.toml", scene_to_toml(job.scene))
 
 
 def _write_truth(writer: Writer, plan: Plan, phantom: Phantom, scanner: Scanner, scatter: Scattered) -> None:

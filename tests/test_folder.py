@@ -188,7 +188,7 @@ def test_a_table_of_scans_of_different_code_is_remarked_upon(made, suite, other_
 
 def test_a_worker_of_other_code_is_refused(whole, suite, tmp_path):
     (scene,) = (s for s in load(suite) if s.name == "bare")
-    job = command.SceneJob(scene=scene, out=tmp_path / "data", force=False, code="v2")
+    job = command.SceneJob(scenes=(scene,), out=tmp_path / "data", force=False, code="v2")
     with pytest.raises(InputError, match="bare: a worker runs other code of the simulator than make-dataset"):
         command.do(job)
     assert not (tmp_path / "data").exists()
@@ -200,8 +200,8 @@ def test_a_worker_does_not_wait_for_ever_for_a_lock_of_which_nothing_is_known(su
         raise locks.Busy("another process", certain=len(tried) > 3)
 
     scene, tried = load(suite)[1], []
-    job = command.SceneJob(scene=scene, out=tmp_path, force=False, code=sources.source_hash())
-    monkeypatch.setattr(command, "make_scene", busy)
+    job = command.SceneJob(scenes=(scene,), out=tmp_path, force=False, code=sources.source_hash())
+    monkeypatch.setattr(command, "make_scenes", busy)
     monkeypatch.setattr(command.time, "sleep", lambda _: None)
     monkeypatch.setattr(command, "PATIENCE", 2 * command.TICK)
     with pytest.raises(locks.Busy):
@@ -320,6 +320,8 @@ class Killed(BaseException):
 
 class KilledOnce:
     """A pool whose worker is killed in its first job, when the scene is in place but not in the index."""
+
+    workers = 1
 
     def __enter__(self):
         return self

@@ -15,7 +15,7 @@ import pytest
 from ctsim.detector.noise import Noise, detect, pixel_pattern
 from ctsim.geometry import Geometry
 from ctsim.rng import stream_key
-from ctsim.tracer.kernels.raytrace_cpu import _signal
+from ctsim.tracer.kernels.ray_cpu import signal
 from ctsim.tracer.project import Tracer, path_lengths
 from ctsim.types import Phantom
 
@@ -42,7 +42,8 @@ def measure() -> dict[str, np.ndarray]:
     lengths, mu, w1, w2 = rays()
     n = lengths.shape[1]
     s1, s2 = np.empty((2, n), np.float32)
-    _signal(lengths, n, mu, w1, w2, np.empty(n, np.float32), s1, s2)
+    rules = mu[None], w1[None], w2[None], np.array([w1.size])
+    signal(lengths, n, rules, 0, np.empty(n, np.float32), s1, s2)
     found = {"s1": s1, "s2": s2}
     geometry = Geometry(
         dso=200.0,

@@ -220,7 +220,7 @@ def test_a_wrong_name_among_thousands_is_answered_with_the_nearest_and_their_num
 @pytest.mark.parametrize(
     ("where", "flags"),
     [
-        ("ctsim.phantoms.dataset.build", []),
+        ("ctsim.phantoms.variants.build", []),
         ("ctsim.phantoms.dataset.build", ["--dry-run"]),
         ("ctsim.phantoms.dataset.make_plan", []),
         ("ctsim.phantoms.dataset.simulate_views", []),

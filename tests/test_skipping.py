@@ -23,7 +23,7 @@ from ctsim.phantoms.scene import build
 from ctsim.scatter import Scatter, open_fraction
 from ctsim.simulate import Simulator
 from ctsim.tracer.bricks import MIXED
-from ctsim.tracer.project import Tracer, transmit
+from ctsim.tracer.project import Tracer, transmit_all
 
 pytestmark = pytest.mark.slow
 
@@ -92,11 +92,11 @@ def test_every_case_is_measured_and_stays_within_what_is_stated(run):
 
 def test_a_pixel_that_is_off_by_a_thousandth_is_found(here, tmp_path, monkeypatch, capsys):
     def off(tracer, *given, **more):
-        found = transmit(tracer, *given, **more)
-        found[0][5, 7] *= 1.001 if tracer.skip else 1.0
+        found = transmit_all(tracer, *given, **more)
+        found[0][:, 5, 7] *= 1.001 if tracer.skip else 1.0
         return found
 
-    monkeypatch.setattr("ctsim.simulate.transmit", off)
+    monkeypatch.setattr("ctsim.signals.transmit_all", off)
     given = [str(tmp_path), "--case", "rays", "--size", "small", "--repeats", "1"]
     assert skipping.main(given) == 1
     assert "| NO |" in capsys.readouterr().out
@@ -121,14 +121,14 @@ def test_a_twin_that_keeps_metal_on_open_detector_is_found(here, tmp_path, monke
 
     def leaving(tracer, geometry, view, response, *, background, out=None, **rays):
         before = None if out is None else [image.copy() for image in out[:2]]
-        found = transmit(tracer, geometry, view, response, background=background, out=out, **rays)
+        found = transmit_all(tracer, geometry, view, response, background=background, out=out, **rays)
         if before is not None:
             empty = background[1:].sum(0) == 0
             for image, old in zip(found, before, strict=True):
-                image[empty] = old[empty]
+                image[:, empty] = old[:, empty]
         return found
 
-    monkeypatch.setattr("ctsim.simulate.transmit", leaving)
+    monkeypatch.setattr("ctsim.signals.transmit_all", leaving)
     given = [str(tmp_path), "--case", "twin", "--case", "rays", "--size", "small", "--repeats", "1"]
     assert skipping.main(given) == 1
     capsys.readouterr()

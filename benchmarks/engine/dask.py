@@ -74,6 +74,11 @@ class Cluster:
             for future in done:
                 yield running.pop(future), self._answer(future)
 
+    @property
+    def workers(self) -> int:
+        """How many workers there are now, at least 1."""
+        return max(1, self._workers())
+
     def _workers(self) -> int:
         try:
             return len(self._client.nthreads())

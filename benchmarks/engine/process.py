@@ -260,6 +260,11 @@ class Lost:
 class Jobs(Protocol):
     """Runs several jobs at once."""
 
+    @property
+    def workers(self) -> int:
+        """How many, or at least 1 where workers come and go."""
+        ...
+
     def answers(self, function: Function, jobs: Sequence[Any]) -> Answers:
         """Yield (number of a job, what `function(job)` returned or `Lost`) as jobs end, None when nothing happened.
 
@@ -277,6 +282,11 @@ class Pool:
         self._processes = [Process(threads) for _ in range(n)]
         self._idle = list(self._processes)
         self._busy: dict[connection.Connection, tuple[Process, int]] = {}
+
+    @property
+    def workers(self) -> int:
+        """How many processes there are."""
+        return len(self._processes)
 
     def __enter__(self) -> Self:
         return self

@@ -31,8 +31,9 @@ from ctsim.dataset.manifest import Manifest, mend_index, read_index, verify
 from ctsim.dataset.sources import source_hash
 from ctsim.errors import InputError
 from ctsim.human import human_bytes, human_time
-from ctsim.phantoms.dataset import disk_bytes, make_scene, plan_scene
+from ctsim.phantoms.dataset import disk_bytes, make_scenes, plan_scene
 from ctsim.phantoms.scene import Scene, scene_id
+from ctsim.phantoms.variants import MOST, families
 
 T = TypeVar("T")
 _SPARE = 64 * 2**20  # bytes left free for the file system's own needs
@@ -121,9 +122,9 @@ def _of_other_code(scenes: tuple[Scene, ...], there: dict[str, Manifest], out: P
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class SceneJob:
-    """A scene to make, as it travels to a worker."""
+    """Scenes to make together, as they travel to a worker."""
 
-    scene: Scene
+    scenes: tuple[Scene, ...]
     out: Path
     force: bool
     code: str
@@ -154,30 +155,34 @@ def _make_all(scenes: list[Scene], out: Path, options: Flags) -> None:
             _make_here(scenes, out, options.force)
             return
         where, code = out.resolve(), source_hash()
-        jobs = [SceneJob(scene=s, out=where, force=options.force, code=code) for s in scenes]
+        most = min(MOST, -(-len(scenes) // pool.workers))  # no worker is to be idle
+        jobs = [SceneJob(scenes=f, out=where, force=options.force, code=code) for f in families(scenes, most)]
         _make_apart(jobs, pool)
 
 
 def _make_here(scenes: list[Scene], out: Path, force: bool) -> None:
-    """Make scenes one after another in this process; one that another process has finished meanwhile is there."""
+    """Make families of scenes one after another; a scene that another process has finished meanwhile is there."""
     views = {scene.name: scene.resolve().geometry.n_views for scene in scenes}
+    titles = {scene.name: f"{number}/{len(scenes)} {scene.name}" for number, scene in enumerate(scenes, 1)}
     with Bar(sum(views.values()), "view") as bar:
-        for number, scene in enumerate(scenes, 1):
-            title, before = f"{number}/{len(scenes)} {scene.name}", bar.done
-            if not force and is_complete(out, scene.name, scene_id(scene)):
+        for family in families(scenes):
+            done = bar.done
+            there = [s for s in family if not force and is_complete(out, s.name, scene_id(s))]
+            for scene in there:
                 say(f"{scene.name}: already complete")
-            else:
-                watch = functools.partial(_watch, bar, scene.name, title)
-                make_scene(scene, out, force=force, watch=watch, tell=functools.partial(_note, scene.name))
-            bar.at(before + views[scene.name], title)
+            if todo := [scene for scene in family if scene not in there]:
+                make_scenes(todo, out, force=force, watch=functools.partial(_watch, bar, titles), tell=_note)
+            for scene in family:
+                done += views[scene.name]
+                bar.at(done, titles[scene.name])
 
 
-def _watch(bar: Bar, name: str, title: str, views: Iterable[T], first: int, n_views: int) -> Iterable[T]:
+def _watch(bar: Bar, titles: dict[str, str], name: str, views: Iterable[T], first: int, n_views: int) -> Iterable[T]:
     """Show a scene's views on the bar."""
     if first:
         say(f"{name}: goes on from view {first} of {n_views}")
         bar.at(bar.done + first)
-    return bar.over(views, title)
+    return bar.over(views, titles[name])
 
 
 def _note(name: str, text: str) -> None:
@@ -191,36 +196,40 @@ def say(text: str) -> None:
 
 def _make_apart(jobs: list[SceneJob], pool: Jobs) -> None:
     """Make scenes on workers with one progress bar, which counts the views that workers have on disk."""
-    views = [job.scene.resolve().geometry.n_views for job in jobs]
-    left = set(range(len(jobs)))
-    with Bar(sum(views), "view") as bar:
+    views = {scene.name: scene.resolve().geometry.n_views for job in jobs for scene in job.scenes}
+    left = set(views)
+    with Bar(sum(views.values()), "view") as bar:
         for answer in pool.answers(do, jobs):
             ended = ""
             if answer is not None:
                 number, end = answer
-                name = jobs[number].scene.name
+                names = [scene.name for scene in jobs[number].scenes]
                 if isinstance(end, Lost):
-                    raise InputError(f"{name}: {end.reason}, as happens when memory is short; expected fewer workers")
-                for note in end:
+                    where = ", ".join(names)
+                    raise InputError(f"{where}: {end.reason}, as happens when memory is short; expected fewer workers")
+                for name, note in end:
                     _note(name, note)
-                left.discard(number)
-                ended = f"{len(jobs) - len(left)}/{len(jobs)} {name}"
+                left.difference_update(names)
+                ended = f"{len(views) - len(left)}/{len(views)} {', '.join(names)}"
             noted = {name: progress.views for name, progress in unfinished(jobs[0].out).items()}
-            bar.at(sum(noted.get(jobs[k].scene.name, 0) if k in left else n for k, n in enumerate(views)), ended)
+            bar.at(sum(noted.get(name, 0) if name in left else n for name, n in views.items()), ended)
 
 
-def do(job: SceneJob) -> tuple[str, ...]:
-    """Be the worker: make a scene unless it is there, after any process that makes it just now; return its notes.
+def do(job: SceneJob) -> tuple[tuple[str, str], ...]:
+    """Be the worker: make the scenes that are not there, after any process that makes one just now.
+
+    Returns notes, each with the name of its scene.
 
     Raises InputError where this process has other code than the command, and where the scene's lock stays that a
     process of another machine has, which may have been killed.
     """
-    name, waited, notes = job.scene.name, 0.0, list[str]()
+    waited, notes = 0.0, list[tuple[str, str]]()
     if source_hash() != job.code:
+        name = job.scenes[0].name
         raise InputError(f"{name}: a worker runs other code of the simulator than make-dataset; restart the workers")
-    while job.force or not is_complete(job.out, name, scene_id(job.scene)):
+    while todo := [s for s in job.scenes if job.force or not is_complete(job.out, s.name, scene_id(s))]:
         try:
-            make_scene(job.scene, job.out, force=job.force, tell=notes.append)
+            make_scenes(todo, job.out, force=job.force, tell=lambda name, note: notes.append((name, note)))
             break
         except Busy as error:
             if not error.certain and waited >= PATIENCE:

@@ -127,6 +127,39 @@ class Response:
         )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Responses:
+    """Responses of several variants of a scan to the same materials: mu [variant, material, node], w1 [variant, node].
+
+    Variant j has the first `nodes[j]` nodes.
+    """
+
+    mu: NDArray[np.float32]
+    w1: NDArray[np.float32]
+    w2: NDArray[np.float32]
+    nodes: NDArray[np.int64]
+    edge_mu: NDArray[np.float64]
+
+    @staticmethod
+    def of(responses: Sequence[Response]) -> "Responses":
+        """Put responses side by side."""
+        most = max(r.w1.size for r in responses)
+
+        def padded(part: NDArray[np.float32]) -> NDArray[np.float32]:
+            return np.pad(part, [(0, 0)] * (part.ndim - 1) + [(0, most - part.shape[-1])])
+
+        return Responses(
+            mu=np.stack([padded(r.mu) for r in responses]),
+            w1=np.stack([padded(r.w1) for r in responses]),
+            w2=np.stack([padded(r.w2) for r in responses]),
+            nodes=np.array([r.w1.size for r in responses]),
+            edge_mu=np.stack([r.edge_mu for r in responses]),
+        )
+
+
+Images = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+
 def transmit(
     tracer: Tracer,
     geometry: Geometry,
@@ -137,7 +170,7 @@ def transmit(
     edge_tolerance: float = 0.03,
     background: NDArray[np.float32] | None = None,
     out: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]] | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> Images:
     """Measure one view without noise: signal and second moment relative to the open field, each [v, u].
 
     The signal is Σ w1·exp(−Σ μ·L) averaged over the pixel; the variance of one photon-noise draw is the
@@ -146,22 +179,46 @@ def transmit(
     if known, plus what else the rays cross. `subrays` and `edge_tolerance` are those of `ctsim.settings.Simulation`.
     `out` = (signal, second moment, spans) writes all of those columns of given images, and no others.
     """
+    settings = {"subrays": subrays, "edge_tolerance": edge_tolerance}
+    images = None if out is None else (out[0][None], out[1][None], out[2])
+    m1, m2 = transmit_all(
+        tracer, geometry, view, Responses.of([response]), background=background, out=images, **settings
+    )
+    return m1[0], m2[0]
+
+
+def transmit_all(
+    tracer: Tracer,
+    geometry: Geometry,
+    view: int,
+    responses: Responses,
+    *,
+    subrays: int = 34,
+    edge_tolerance: float = 0.03,
+    background: NDArray[np.float32] | None = None,
+    out: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]] | None = None,
+) -> Images:
+    """Measure one view of several variants along the same rays, each [variant, v, u]: see `transmit`.
+
+    Each variant gets, to the last bit, what `transmit` gives it.
+    """
     shape, pose = geometry.n_detector, geometry.pose(view)
     if out is None:
-        m1, m2 = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        images = len(responses.nodes), *shape
+        m1, m2 = np.empty(images, np.float32), np.empty(images, np.float32)
         spans = np.tile(np.array([0, shape[1]]), (shape[0], 1))
     else:
         m1, m2, spans = out
     most = subrays if len(tracer.prims) else 1
-    raytrace_cpu.transmit_view(
+    raytrace_cpu.transmit_variants(
         tracer.bricks[:5],
         _solids(tracer, pose, shape),
         pose,
         work_order(-(-shape[0] // raytrace_cpu.STRIP)),
         spans,
         tracer.background(geometry, view) if background is None else background,
-        (response.mu, response.w1, response.w2),
-        (response.edge_mu, EDGE_THRESHOLD, STEP_THRESHOLD, most, edge_tolerance),
+        (responses.mu, responses.w1, responses.w2, responses.nodes),
+        (responses.edge_mu, EDGE_THRESHOLD, STEP_THRESHOLD, most, edge_tolerance),
         tracer.skip,
         m1,
         m2,

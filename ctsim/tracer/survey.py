@@ -19,6 +19,7 @@ from ctsim.tracer.shadow import row_spans
 
 VIEWS, PIXELS = 8, 48
 WINDOWS, WINDOW, FINER = 8, 8, 16  # windows, pixels along a window's side, finer pixels along a pixel's side
+FINER_RAYS = 8  # of a finer pixel: those that an edge crosses are a sixteenth of a pixel's signal
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +110,7 @@ def _finer(
     pose[6:] /= FINER
     fine = _with_poses(geometry, pose[None], (n_v * FINER, n_u * FINER))
     under = np.ascontiguousarray(background[:, *window].repeat(FINER, 1).repeat(FINER, 2))
-    rays, _ = transmit(tracer, fine, 0, response, subrays=64, background=under)
+    rays, _ = transmit(tracer, fine, 0, response, subrays=FINER_RAYS, background=under)
     return rays.reshape(n_v, FINER, n_u, FINER).mean((1, 3), dtype=np.float64)
 
 

@@ -13,7 +13,7 @@ from numba import njit
 from ctsim.kernels.laws_cpu import E_MIN, PER_STEP, uniform
 from ctsim.kernels.once import compiled_once
 from ctsim.tracer.kernels.bricks_cpu import CELLS, CODE_BITS, MIXED, SIDE, walk
-from ctsim.tracer.kernels.raytrace_cpu import _paint
+from ctsim.tracer.kernels.ray_cpu import paint
 from ctsim.tracer.kernels.solids_cpu import intersect
 
 FARTHEST = 1e30
@@ -174,7 +174,7 @@ def depth(volume, prims, mu, energy, ray, work):
                 hits[hit, 0], hits[hit, 1], hits[hit, 2] = enter, leave, prims[p, 1]
                 hit += 1
     if hit > 0:
-        _paint(hits, hit, pieces, n, covered, painted)
+        paint(hits, hit, pieces, n, covered, painted)
         for m in range(1, lengths.size):
             lengths[m] = max(lengths[m] - covered[m], 0.0) + painted[m]
     tau = 0.0

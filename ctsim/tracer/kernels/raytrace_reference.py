@@ -14,6 +14,7 @@ from ctsim.tracer.bricks import SIDE
 from ctsim.tracer.kernels.solids_reference import inside, intersect
 
 GOLDEN = 0.6180339887498949
+RUNGS = [2, 4, 8, *(17 * 2**k for k in range(20))]
 
 
 def _label_volume(bricks):
@@ -107,7 +108,10 @@ def _n_subrays(solids, pose, u, v, edge):
     corners = [_ray(pose, u + du, v + dv) for du in (-0.5, 0.5) for dv in (-0.5, 0.5)]
     tau, hits = zip(*(_thickness(prims, ray, edge_mu) for ray in (centre, *corners)), strict=True)
     change, threshold = max(tau) - min(tau), begins if len(set(hits[1:])) > 1 else smooth
-    return max(2, int(most * min(1.0, (1 + change) / 8.5))) if change > threshold else 1
+    if change <= threshold:
+        return 1
+    share = max(2, int(most * min(1.0, (1 + change) / 8.5)))
+    return min(min(RUNGS, key=lambda n: abs(math.log(n / share))), 16 * most)
 
 
 def _uncertainty(signal, thickness, bounds):
@@ -156,7 +160,8 @@ def transmit_view(bricks, solids, pose, order, spans, background, rule, edge, sk
                 excess = _uncertainty(rays[0], rays[2], bounds) / tolerance if n > 1 else 0.0
                 if excess <= 1 or n == 16 * most:
                     break
-                n = min(int(n * min(max(excess, 1.2) ** (4 / 3), 4.0)) + 1, 16 * most)
+                more = int(n * min(max(excess, 1.2) ** (4 / 3), 4.0)) + 1
+                n = min(*(n for n in RUNGS if n >= more), 16 * most)
             m1[row, column], m2[row, column] = np.mean(rays[0]), np.mean(rays[1])
 
 

@@ -47,17 +47,17 @@ def trim(background, span, near, skip):
 
 
 @njit(cache=True, error_model="numpy")
-def fill_open(rule, span, columns, m1, m2):
-    """Write the open field's signal to a row's columns of `span` outside `columns`.
+def fill_open(rules, j, span, columns, m1, m2):
+    """Write the open field's signal of variant j to a row's columns of `span` outside `columns`.
 
-    The images may hold another scan. Weights are summed in the order of `raytrace_cpu._signal`, so that a skipped ray
+    The images may hold another scan. Weights are summed in the order of `ray_cpu.signal`, so that a skipped ray
     equals a traced one.
     """
-    _, w1, w2 = rule
+    _, w1, w2, nodes = rules
     open1, open2 = np.float32(0), np.float32(0)
-    for k in range(w1.size):
-        open1 += w1[k]
-        open2 += w2[k]
+    for k in range(nodes[j]):
+        open1 += w1[j, k]
+        open2 += w2[j, k]
     for u in range(span[0], span[1]):
         if u < columns[0] or u >= columns[1]:
             m1[u], m2[u] = open1, open2

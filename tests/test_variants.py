@@ -1,0 +1,174 @@
+"""Scenes of one body: built once, traced once, and each what it is alone."""
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from ctsim.phantoms import dataset
+from ctsim.phantoms.body_volume import CtVolume
+from ctsim.phantoms.dataset import make_scene, make_scenes
+from ctsim.phantoms.recipes import BUILDERS
+from ctsim.phantoms.scene import Scene, build, parse_suite
+from ctsim.phantoms.variants import build_all, families
+from ctsim.settings import Truth
+from ctsim.signals import Part, same_rays, share_rays
+from ctsim.simulate import part_of
+from ctsim.tracer.project import Tracer
+
+TABLE = """
+[[scene]]
+name = "body"
+count = 5
+scans_each = 5
+phantom = {{ recipe = "lung", n_voxel = [24, 24, 24] }}
+truth = {{ trace = true, mono_kev = [60.0], metal_path = true, paths = true, noise_free = true }}
+scanner = {{ preset = "ideal", n_views = 7, n_detector = [20, 24], n_voxel = [16, 16, 16]{more} }}
+
+[scene.vary]
+phantom.metal = ["Fe", "Ti", "Au"]
+scanner.tube.kvp = [80, 120]
+scanner.i0 = {{ log = [1e3, 1e6] }}
+"""
+MORE = {
+    "a point": "",
+    "light that spreads and comes late": ", detector = { blur = { fwhm = 0.4 }, lag = [{ share = 0.1, decay = 0.5 }] }",
+    "a calibrated pattern": ", noise = { fixed_pattern = 0.02, adc_bits = 14 }",
+}
+
+
+def scenes(more: str = "", **changes: object) -> tuple[Scene, ...]:
+    return tuple(msgspec.structs.replace(s, **changes) for s in parse_suite(TABLE.format(more=more)))
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Hash every file of a data folder but its index and what tells of the time taken."""
+    found = sorted(p for p in folder.rglob("*") if p.is_file() and p.parent != folder and p.suffix != ".json")
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in found}
+
+
+def part(scene: Scene) -> Part:
+    return part_of(dataset.plan_scene(scene), build(scene), scene.resolve())
+
+
+@pytest.mark.parametrize("more", MORE.values(), ids=MORE.keys())
+def test_scenes_made_together_are_what_they_are_alone(tmp_path, more):
+    many = scenes(more)
+    assert len({s.phantom.metal for s in many}) > 1 and len({s.scanner.tube.kvp for s in many}) > 1
+    make_scenes(many, tmp_path / "together")
+    for scene in many:
+        make_scene(scene, tmp_path / "alone")
+    assert digests(tmp_path / "together") == digests(tmp_path / "alone")
+    assert len(digests(tmp_path / "alone")) > 60
+
+
+def test_rays_of_variants_are_traced_once(tmp_path, monkeypatch):
+    real, traced = Tracer.background, []
+
+    def counted(self, geometry, view, out=None):
+        traced.append(view)
+        return real(self, geometry, view, out)
+
+    many = scenes(truth=Truth())
+    monkeypatch.setattr(Tracer, "background", counted)
+    jobs = [part(scene) for scene in many]
+    traced.clear()
+    shared = share_rays([replace(j, phantom=p) for j, p in zip(jobs, build_all(many), strict=True)])
+    assert len({id(signals) for signals, _ in shared}) == 1
+    for k in range(7):
+        for signals, place in shared:
+            signals.moments(k, place)
+    assert traced == list(range(7))
+
+
+def test_doses_share_their_signals():
+    """The rays of one beam and metal are measured once, however many doses there are."""
+    first = scenes()[0]
+    beam = first.scanner.tube
+    many = [
+        msgspec.structs.replace(s, phantom=first.phantom, scanner=msgspec.structs.replace(s.scanner, tube=beam))
+        for s in scenes()
+    ]
+    phantoms = build_all(many)
+    parts = [replace(part(s), phantom=p) for s, p in zip(many, phantoms, strict=True)]
+    ((signals, _), *others) = share_rays(parts)
+    assert len(signals.responses.nodes) == 1
+    assert all(other is signals for other, _ in others)
+    assert len({s.scanner.i0 for s in many}) == 5
+
+
+CHANGES = {
+    "another insert": {"phantom": {"insert_mm": 3.0}},
+    "another size": {"phantom": {"size": 61.0}},
+    "other texture": {"phantom": {"texture": 0.05}},
+    "no metal": {"phantom": {"metal": "none"}},
+    "another detector": {"scanner": {"n_detector": (21, 24)}},
+    "a focal spot": {"scanner": {"tube": {"focal_spot": {"size": [0.5, 0.5]}}}},
+    "other sub-rays": {"simulation": {"subrays": 20}},
+    "another seed": {"seed": 5},
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
+def test_scenes_that_differ_in_more_share_nothing(change):
+    one = scenes()[0]
+    told = msgspec.to_builtins(one)
+    for key, value in change.items():
+        told[key] = told[key] | value if isinstance(value, dict) else value
+    other = msgspec.convert(told, Scene)
+    a, b = (replace(part(s), phantom=p) for s, p in zip((one, other), build_all((one, other)), strict=True))
+    assert not same_rays(a, b)
+    assert same_rays(a, a)
+
+
+DRAWN = [kind for kind in BUILDERS if kind is not CtVolume]
+
+
+@pytest.mark.parametrize("kind", DRAWN, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_metal_of_another_name_is_all_that_another_metal_changes(kind, seed):
+    """For every recipe, among them those with a second metal of the same name."""
+    names = ["Fe", "Ti", "CoCr", "Au", "Fe"]
+    made = [Scene(name=f"s{k}", seed=seed, phantom=kind(metal=m, n_voxel=(20, 20, 20))) for k, m in enumerate(names)]
+    for scene, phantom in zip(made, build_all(made), strict=True):
+        alone = build(scene)
+        assert phantom.materials == alone.materials and phantom.solids == alone.solids
+        assert np.array_equal(phantom.labels, alone.labels)
+        assert (phantom.d_voxel, phantom.off_origin) == (alone.d_voxel, alone.off_origin)
+
+
+def test_families_are_neighbours_of_one_body():
+    two = scenes() + tuple(msgspec.structs.replace(s, name=f"x{s.name}", seed=9) for s in scenes())
+    assert [[s.name for s in f] for f in families(two)] == [[s.name for s in two[:5]], [s.name for s in two[5:]]]
+    assert [len(f) for f in families(two, 2)] == [2, 2, 1, 2, 2, 1]
+
+
+def test_scenes_that_were_interrupted_at_different_views_go_on(tmp_path, monkeypatch):
+    many = scenes(MORE["light that spreads and comes late"])[:3]
+    make_scenes(many, tmp_path / "whole")
+
+    def stopping(view: int):
+        def watch(name: str, views: Iterable, first: int, n: int) -> Iterable:
+            for k, arrays in views:
+                if k == view:
+                    raise KeyboardInterrupt
+                yield k, arrays
+
+        return watch
+
+    for scene, view in zip(many, (2, 5), strict=False):
+        with pytest.raises(KeyboardInterrupt):
+            make_scenes((scene,), tmp_path / "parts", watch=stopping(view))
+    began = {}
+
+    def watch(name: str, views: Iterable, first: int, n: int) -> Iterable:
+        began[name] = first
+        return views
+
+    make_scenes(many, tmp_path / "parts", watch=watch)
+    assert list(began.values()) == [2, 5, 0]
+    assert digests(tmp_path / "parts") == digests(tmp_path / "whole")
