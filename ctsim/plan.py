@@ -1,37 +1,28 @@
 """What a scene needs, what it does not, and what that costs: decided once, printed, then obeyed.
 
-A short survey (`ctsim.tracer.survey`) tells how thick the materials are that are met, hence how many energies
-reach the tolerance, how long a view takes on this machine and how good the edges of the inserts are.
+What the rays meet, hence how many energies reach the tolerance and how long a view takes here, comes from `ctsim.look`.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import msgspec
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from ctsim.beam.dose import Dose, dose_of
-from ctsim.beam.quadrature import EnergyRule, energy_rule, full_rule
+from ctsim.beam.quadrature import EnergyRule
 from ctsim.beam.spectrum import Spectrum, spectrum
-from ctsim.beam.spot import SubSources, magnification, sub_sources
+from ctsim.beam.spot import SubSources
 from ctsim.detector.panel import response as lag_response
-from ctsim.detector.response import response
-from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.human import human_bytes, human_time
-from ctsim.materials import attenuation, nominal
+from ctsim.look import Looked, density_levels, look
 from ctsim.montecarlo.series import expected_histories
-from ctsim.notes import metal_notes
 from ctsim.scatter import open_fraction
 from ctsim.settings import Simulation, Truth
-from ctsim.tracer.project import Response, Tracer
-from ctsim.tracer.shadow import box_corners, primitive_corners
-from ctsim.tracer.survey import survey, trial
 from ctsim.types import Phantom, Scanner
 
-THICKNESS_MARGIN = 1.1  # a coarse survey can miss the thickest ray
 # a draw and core, a byte, a voxel of a scan's labels and references (4.4 s for 2 scans of 256³)
 NOISE_SECONDS, WRITE_SECONDS, VOLUME_SECONDS = 40e-9, 1e-9, 130e-9
 HISTORY_SECONDS = 1.3e-6  # a core and photon of scatter by Monte Carlo: 0.8 (broccoli) to 1.8 (a head of water)
@@ -58,17 +49,13 @@ class Output:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
+class Plan(Looked):
     """The work for one scan. `seconds` is an estimate for this machine, the only entry that differs between runs.
 
-    `materials` are the ones that rays meet, air first; `tissues` names for each the one that it is a level of density
-    of, mostly itself. In P = −ln(signal/open), `error` is the greatest found of the
-    energy quadrature and `edge_error` is the largest found in eight windows at edges of inserts, in one view (see
-    `ctsim.tracer.survey`); `scatter_error` is the RMS error of scatter by Monte Carlo over its mean, None for other
-    scatter; `scatter_fraction` is the constant of level 1, whose error is not known. `spot` holds the points of a focal
-    spot of finite size; `edge_error` is that of each point. `l0` is the median water-equivalent path of the body in mm.
-    `memory_bytes` estimates the arrays; Python and its libraries take a quarter of a gigabyte more. `notes` are those
-    of `ctsim.notes`.
+    `error` is the greatest error of P = −ln(signal/open) found of the energy quadrature; `scatter_error` is the RMS
+    error of scatter by Monte Carlo over its mean, None for other scatter; `scatter_fraction` is the constant of level
+    1, whose error is not known. `memory_bytes` estimates the arrays; Python and its libraries take a quarter of a
+    gigabyte more.
     """
 
     stream_id: str
@@ -76,22 +63,15 @@ class Plan:
     truth: Truth
     stages: tuple[Stage, ...]
     outputs: tuple[Output, ...]
-    materials: tuple[str, ...]
-    tissues: tuple[str, ...]
-    rule: EnergyRule
     spectrum: Spectrum
     dose: Dose
-    l0: float
     scatter_fraction: float
     scatter_error: float | None
-    edge_error: float
-    spot: SubSources | None
     n_rays: int
     seconds: float
     flops: float
     disk_bytes: int
     memory_bytes: int
-    notes: tuple[str, ...] = ()
 
     @property
     def error(self) -> float:
@@ -158,124 +138,50 @@ class Plan:
         return "\n".join(f"  {key:7s} {value}" for key, value in told)
 
 
-def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth: Truth, stream_id: str) -> Plan:
-    """Decide what simulating this scan takes; `stream_id` names its noise streams."""
-    present = present_materials(phantom) if simulation.skip else phantom.materials
-    if len(present) == 1 and not phantom.solids:
-        raise InputError("the scene is empty: its labels are all air and it has no solids")
-    source, tracer = spectrum(scanner.tube), Tracer.of(phantom, geometry=all_rays(scanner))
-    found = survey(tracer, scanner.geometry)
-    a1, _ = response(scanner.detector, source.energies)
-    if not (source.weights * a1).any():
-        raise InputError("detector: no photon of the tube's spectrum is detected; check threshold, thickness and kvp")
-    mean_energy = float(np.average(source.energies, weights=source.weights * a1))
-    rule = _rule(phantom, scanner, simulation, source, found.lengths)
-    _check_bowtie(scanner, rule)
+def make_plan(
+    phantom: Phantom,
+    scanner: Scanner,
+    simulation: Simulation,
+    truth: Truth,
+    stream_id: str,
+    like: Looked | None = None,
+) -> Plan:
+    """Decide what simulating this scan takes; `stream_id` names its noise streams.
+
+    `like` is the plan of a scan that differs in dose, noise and name alone: what was found for it holds here, too.
+    """
     twin = _has_twin(phantom, truth)
-    seen = Response.of(rule, tracer.materials)
-    tried = trial(tracer, scanner.geometry, seen, settings=simulation, twin=twin)
-    levels = density_levels(phantom)
-    tissues = tuple(levels[m][0] for m in present)
+    looked = like or look(phantom, scanner, simulation, twin=twin)
+    present, tissues = looked.materials, looked.tissues
     outputs = _outputs(any(s.metal for s in phantom.solids), scanner, truth, len(set(tissues)))
-    spot = _spot(tracer, scanner, simulation)
     n_rays, n_voxels = int(np.prod(scanner.geometry.shape)), int(np.prod(scanner.geometry.n_voxel))
     draws = n_rays * (2 if twin else 1) * (scanner.noise.model != "none")
     disk = _disk_bytes(outputs, scanner.geometry, twin)
     scatter_error = simulation.scatter_error if scanner.scatter.level == 3 else None
     photons = 0 if scatter_error is None else expected_histories(scanner.geometry, scatter_error)
     passes = 2 if scanner.noise.model == "tigre" else 1  # the first finds the scan's largest P
-    passes *= 1 if spot is None else len(spot.weights)
+    passes *= 1 if looked.spot is None else len(looked.spot.weights)
     return Plan(
         stream_id=stream_id,
         settings=simulation,
         truth=truth,
-        stages=_stages(phantom, scanner, truth, tissues, rule) + _blurs(scanner, spot),
+        stages=_stages(phantom, scanner, truth, tissues, looked.rule) + _blurs(scanner, looked.spot),
         outputs=outputs,
-        materials=present,
-        tissues=tissues,
-        rule=rule,
-        spectrum=source,
+        **{item.name: getattr(looked, item.name) for item in fields(Looked)},
+        spectrum=spectrum(scanner.tube),
         dose=dose_of(scanner.tube, scanner.geometry, scanner.i0),
-        l0=found.median_path(phantom.materials, mean_energy),
         scatter_fraction=open_fraction(scanner.scatter, scanner.geometry),
         scatter_error=scatter_error,
-        edge_error=tried.edge_error,
-        spot=spot,
         n_rays=n_rays,
-        seconds=passes * scanner.geometry.n_views * tried.seconds
+        seconds=passes * scanner.geometry.n_views * looked.view_seconds
         + draws * NOISE_SECONDS / numba.get_num_threads()
         + n_voxels * (2 if twin else 1) * VOLUME_SECONDS
         + photons * (2 if twin else 1) * HISTORY_SECONDS / numba.get_num_threads()
         + disk * WRITE_SECONDS,
-        flops=float(n_rays) * len(rule.energies) * (2 * len(present) + 16),
+        flops=float(n_rays) * len(looked.rule.energies) * (2 * len(present) + 16),
         disk_bytes=disk,
         memory_bytes=_memory_bytes(phantom, scanner.geometry) + _lag_bytes(scanner, outputs),
-        notes=metal_notes(phantom, scanner.geometry, seen, simulation.subrays),
     )
-
-
-def all_rays(scanner: Scanner) -> Geometry | None:
-    """Return the geometry if its rays are all there are; None where a focal spot has more than one point."""
-    spread = scanner.tube.focal_spot is not None or scanner.tube.off_focal is not None
-    return None if spread else scanner.geometry
-
-
-def _rule(
-    phantom: Phantom, scanner: Scanner, simulation: Simulation, source: Spectrum, lengths: NDArray[np.float32]
-) -> EnergyRule:
-    """Return the energies for the thickest rays of the survey, `lengths` [material, view, v, u]."""
-    if not simulation.skip:
-        return full_rule(source, scanner.detector)
-    levels, along = density_levels(phantom), dict[str, NDArray[np.float64]]()
-    for k, m in enumerate(phantom.materials):
-        base, share = levels[m]
-        along[base] = along.get(base, 0.0) + share * lengths[k]
-    thickest = {m: THICKNESS_MARGIN * float(np.max(length)) for m, length in along.items()}
-    bowtie = scanner.tube.bowtie
-    if bowtie is not None:
-        thickest[bowtie.material] = thickest.get(bowtie.material, 0.0) + max(bowtie.center, bowtie.edge)
-    met = [m for m in thickest if m != "air"]
-    return energy_rule(source, scanner.detector, met, [thickest[m] for m in met], simulation.tolerance)
-
-
-def _spot(tracer: Tracer, scanner: Scanner, simulation: Simulation) -> SubSources | None:
-    """Return the points of the focal spot for the part of the object that is nearest to the source."""
-    tube, tolerance = scanner.tube, simulation.spot_error
-    if tube.focal_spot is None and tube.off_focal is None:
-        return None
-    low, high = tracer.bricks.box[:3], tracer.bricks.box[3:]
-    body = box_corners(low, high)[: int(low[0] <= high[0])]
-    points = np.concatenate([body, primitive_corners(tracer.prims)]).reshape(-1, 3)
-    return sub_sources(tube.focal_spot, magnification(scanner.geometry, points), tolerance, tube.off_focal)
-
-
-def _check_bowtie(scanner: Scanner, rule: EnergyRule) -> None:
-    bowtie = scanner.tube.bowtie
-    if bowtie is None:
-        return
-    # rays slant through it; nothing may vanish in float32, which ends at 1e-38
-    thickest = 2 * max(bowtie.center, bowtie.edge)
-    if np.exp(-attenuation(bowtie.material, rule.energies) * thickest) @ rule.w1 < 1e-30:
-        raise InputError(f"tube.bowtie: {thickest / 2} mm of {bowtie.material} let nothing through")
-
-
-def present_materials(phantom: Phantom) -> tuple[str, ...]:
-    """Materials of the phantom that occur in its labels or solids, air first."""
-    solid = {s.material for s in phantom.solids}
-    # label by label takes a fifth of the time of counting all of them, which makes each a larger integer first
-    return tuple(m for k, m in enumerate(phantom.materials) if k == 0 or m in solid or (phantom.labels == k).any())
-
-
-def density_levels(phantom: Phantom) -> dict[str, tuple[str, float]]:
-    """Return, for each material, the one of the phantom's that it is a level of density of, and its relative density.
-
-    A material of solids is itself, whatever its density.
-    """
-    solid, found = {s.material for s in phantom.solids}, {}
-    for m in phantom.materials:
-        base, share = (m, 1.0) if m in solid else nominal(m)
-        found[m] = (base, share) if base in phantom.materials else (m, 1.0)
-    return found
 
 
 def _has_twin(phantom: Phantom, truth: Truth) -> bool:

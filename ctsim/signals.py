@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.geometry import Geometry
-from ctsim.plan import Plan, all_rays
+from ctsim.look import all_rays
+from ctsim.plan import Plan
 from ctsim.readout import TWIN, Image, Moments
 from ctsim.tracer.project import Response, Responses, Tracer, path_lengths, transmit_all
 from ctsim.tracer.shadow import join, row_spans

@@ -20,10 +20,11 @@ from ctsim.beam.spectrum import bowtie_thickness, heel_factor
 from ctsim.detector.noise import flat_field, largest_p, pixel_pattern
 from ctsim.detector.response import response
 from ctsim.geometry import Geometry
+from ctsim.look import density_levels
 from ctsim.materials import attenuation
 from ctsim.montecarlo.series import ScatterSeries, scatter_series
 from ctsim.montecarlo.transport import Source
-from ctsim.plan import Plan, density_levels
+from ctsim.plan import Plan
 from ctsim.readout import TWIN, Image, Moments, Readout, panel_of
 from ctsim.signals import Part, Signals, compact, share_rays
 from ctsim.tracer.kernels.raytrace_cpu import STRIP

@@ -41,9 +41,11 @@ def _without_metal(scene: Scene) -> Any:
 def build_all(scenes: Sequence[Scene]) -> list[Phantom]:
     """Build the phantoms of scenes as `ctsim.phantoms.scene.build` does; those that differ in metal share arrays."""
     built: list[Phantom] = []
-    for k, scene in enumerate(scenes):
-        like = scenes[k - 1] if k else None
-        phantom = _with_metal(built[-1], like, scene) if like is not None and _same_body(like, scene) else None
+    for scene in scenes:
+        alike = [(other, phantom) for other, phantom in zip(scenes, built, strict=False) if _same_body(other, scene)]
+        # the very same phantom rather than one with its metal renamed
+        alike.sort(key=lambda pair: pair[0].phantom.metal != scene.phantom.metal)
+        phantom = _with_metal(alike[0][1], alike[0][0], scene) if alike else None
         built.append(build(scene) if phantom is None else phantom)
     return built
 

@@ -13,8 +13,9 @@ from ctsim.detector.noise import Noise
 from ctsim.detector.response import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.look import present_materials
 from ctsim.materials import attenuation
-from ctsim.plan import make_plan, present_materials
+from ctsim.plan import make_plan
 from ctsim.reconstruct.fdk import fdk
 from ctsim.scatter import Scatter
 from ctsim.settings import Simulation, Truth

@@ -74,7 +74,9 @@ class Tracer:
         shape, pose = geometry.n_detector, geometry.pose(view)
         if out is None:
             out = np.zeros((len(self.materials), *shape), np.float32)
-        if self.columns is not None and _upright(pose):
+        # a single row shares no footprint with others, and bricks of one label are crossed in one step
+        fan = isinstance(self.columns, Columns) and shape[0] == 1
+        if self.columns is not None and _upright(pose) and not fan:
             order = work_order(-(-shape[1] // LANES))
             fill = columns_cpu.fill_view if isinstance(self.columns, Columns) else density_cpu.fill_view
             fill(tuple(self.columns), self.bricks.grid, pose, order, out)

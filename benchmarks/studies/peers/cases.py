@@ -28,11 +28,11 @@ from ctsim.benchmarks.studies.peers.finding import OURS, RTK, SIDES, XCIST, Meas
 from ctsim.benchmarks.studies.peers.libraries import Rtk, Xcist
 from ctsim.benchmarks.studies.peers.poly import poly
 from ctsim.benchmarks.studies.peers.study import Flags
+from ctsim.look import present_materials
 from ctsim.materials import attenuation
 from ctsim.phantoms.bodies import Validation
 from ctsim.phantoms.body_lung import Lung
 from ctsim.phantoms.recipes import build_recipe
-from ctsim.plan import present_materials
 from ctsim.reconstruct.fdk import fdk as ours_fdk
 from ctsim.simulate import compact
 from ctsim.tracer.project import Tracer, path_lengths
