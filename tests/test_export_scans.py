@@ -125,7 +125,9 @@ def read_leap(out):
     """LEAP's load_param: a key and a value a line, angles in degrees with commas."""
     lines = (out / "parameters.cfg").read_text(encoding="utf-8").splitlines()
     g = {key: value for key, _, value in (line.partition(" = ") for line in lines)}
-    assert (g["geometry"], g["detectorType"], float(g["tau"]), float(g["helicalPitch"])) == ("cone", "flat", 0, 0)
+    text = {key for key, value in g.items() if not value.replace(".", "", 1).lstrip("-").isdigit()}
+    assert text == {"geometry", "phis"}  # LEAP 1.26 reads any other value as a number, and wants each of these three
+    assert (g["geometry"], *(float(g[key]) for key in ("tau", "helicalPitch", "tiltAngle"))) == ("cone", 0, 0, 0)
     n, d = (int(g["numRows"]), int(g["numCols"])), (float(g["pixelHeight"]), float(g["pixelWidth"]))
     off = [((k - 1) / 2 - float(g[c])) * size for k, size, c in zip(n, d, ("centerRow", "centerCol"), strict=True)]
     words = {"dso": float(g["sod"]), "dsd": float(g["sdd"]), "n_detector": n, "d_detector": d, "off_detector": off}

@@ -171,7 +171,6 @@ def _leap(folder: Path, scan: Measured) -> None:
         "offsetY": g.off_origin[1],
         "offsetZ": g.off_origin[0],
         "geometry": "cone",
-        "detectorType": "flat",
         "numAngles": g.n_views,
         "numRows": n_v,
         "numCols": n_u,
@@ -183,6 +182,7 @@ def _leap(folder: Path, scan: Measured) -> None:
         "sdd": g.dsd,
         "tau": 0.0,
         "helicalPitch": 0.0,
+        "tiltAngle": 0.0,
         "phis": ", ".join(repr(float(angle)) for angle in angles_to(Library.LEAP, g.angles)),
     }
     text = "".join(f"{key} = {value}\n" for key, value in parameters.items())
