@@ -1,11 +1,13 @@
 """What `run-benchmark skipping` measures of methods and commands; `simulator` and `effects` have the other cases."""
 
 import functools
+import itertools
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -26,7 +28,8 @@ from ctsim.benchmarks.studies.skipping import effects, simulator
 from ctsim.benchmarks.studies.skipping.simulator import Bench, Cases, Pair, largest
 from ctsim.benchmarks.studies.skipping.study import Flags, Skip
 from ctsim.dataset.store import StoredScan, open_scan
-from ctsim.phantoms.scene import scene_to_toml
+from ctsim.phantoms.dataset import make_scenes
+from ctsim.phantoms.scene import Scene, scene_to_toml
 from ctsim.reconstruct.fdk import fdk_stream
 from ctsim.reconstruct.fdk import ramp as fdk
 from ctsim.reconstruct.filters import RAMP
@@ -45,6 +48,11 @@ def made(setup: Bench, *flags: str) -> StoredScan:
     recipe.write_text(scene_to_toml(scene), encoding="utf-8")
     quietly(make_dataset.main, recipe, setup.folder / "data", *flags)
     return open_scan(setup.folder / "data" / scene.name)
+
+
+def stored_arrays(scan: StoredScan) -> list[NDArray[Any]]:
+    """Return all arrays of a scan, mapped and not read."""
+    return [scan.array(name.removesuffix(".tif")) for name in sorted(scan.files) if name.endswith(".tif")]
 
 
 def everything(trace: Trace, choice: Choice | None = None) -> torch.Tensor:
@@ -134,17 +142,45 @@ def rows(setup: Bench) -> Iterator[Pair]:
         )
 
 
+def variants(setup: Bench) -> Iterator[Pair]:
+    """Yield scans of one body made together, which share its building and its rays, and made one after another."""
+    scene = setup.scene()
+
+    def scans(metals: tuple[str, ...], voltages: tuple[float, ...], doses: int) -> tuple[Scene, ...]:
+        found = []
+        for number, (metal, kvp, k) in enumerate(itertools.product(metals, voltages, range(doses))):
+            tube = msgspec.structs.replace(scene.resolve().tube, kvp=kvp)
+            scanner = msgspec.structs.replace(scene.scanner, tube=tube, i0=5e4 * 2**k)
+            phantom = msgspec.structs.replace(scene.phantom, metal=metal)
+            found.append(msgspec.structs.replace(scene, name=f"s{number}", scanner=scanner, phantom=phantom))
+        return tuple(found)
+
+    def arrays(groups: Iterable[Sequence[Scene]]) -> list[NDArray[Any]]:
+        folders = [folder for group in groups for folder in make_scenes(group, setup.folder / "variants", force=True)]
+        return [array for folder in folders for array in stored_arrays(open_scan(folder))]
+
+    for what, many in {
+        "rays of 8 doses": scans(("Fe",), (90.0,), 8),
+        "rays of 2 metals, each at 2 voltages and 2 doses": scans(("Fe", "Ti"), (90.0, 120.0), 2),
+    }.items():
+        yield Pair(
+            scene=scene.name,
+            what=f"{what}: traced once for 8 scans of one body",
+            skipping=functools.partial(arrays, [many]),
+            whole=functools.partial(arrays, [(one,) for one in many]),
+            unit="any array",
+            note="8 scans with twins, built, planned and written",
+        )
+
+
 def stored_scan(setup: Bench) -> Iterator[Pair]:
     """Yield make-dataset of a scan that exists, and of the scan made again."""
-    stored = made(setup)
-    names = sorted(name.removesuffix(".tif") for name in stored.files if name.endswith(".tif"))
 
     def arrays(*flags: str) -> list[NDArray[Any]]:
-        found = made(setup, *flags)
-        return [found.array(name) for name in names]  # mapped, not read
+        return stored_arrays(made(setup, *flags))
 
     yield Pair(
-        scene=stored.name,
+        scene=made(setup).name,
         what="make-dataset of a scan that is there",
         skipping=arrays,
         whole=functools.partial(arrays, "--force"),
@@ -170,7 +206,13 @@ def recorded_run(setup: Bench) -> Iterator[Pair]:
     )
 
 
-CASES: Cases = {"metal-free": metal_free, "rows": rows, "scan": stored_scan, "record": recorded_run}
+CASES: Cases = {
+    "variants": variants,
+    "metal-free": metal_free,
+    "rows": rows,
+    "scan": stored_scan,
+    "record": recorded_run,
+}
 
 
 def measure(task: Task, given: Flags) -> list[Skip]:
