@@ -10,8 +10,8 @@ from scipy import ndimage
 
 from ctsim.errors import InputError
 from ctsim.geometry import Triple
-from ctsim.io.formats import open_volume
 from ctsim.io.volumefile import VolumeFile
+from ctsim.phantoms.ct_headers import digest_at, volume_at
 
 ALIKE = 1e-3
 """Largest relative difference of a stated spacing to the file's: it is half a voxel over 500 of them."""
@@ -45,7 +45,7 @@ def settle(path: str, spacing: Triple | None, rescale: tuple[float, float] | Non
     Raises InputError where something is stated by neither, or differently by both, and for a file that cannot be read.
     """
     try:
-        file = open_volume(Path(path))
+        file = volume_at(Path(path))
     except InputError as error:
         raise InputError(f"path: {error}") from None
     found = file.spacing or spacing
@@ -68,7 +68,7 @@ def settle(path: str, spacing: Triple | None, rescale: tuple[float, float] | Non
 def digest_of(file: VolumeFile) -> str:
     """Return the SHA-256 of a volume's files. Raises InputError where one cannot be read."""
     try:
-        return file.digest()
+        return digest_at(file)
     except InputError as error:
         raise InputError(f"path: {error}") from None
 

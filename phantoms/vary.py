@@ -16,8 +16,7 @@ from typing import Annotated, Any
 import msgspec
 
 from ctsim.errors import InputError
-from ctsim.io.formats import open_volume
-from ctsim.phantoms.ct_file import digest_of
+from ctsim.phantoms.ct_headers import digest_at, volume_at
 from ctsim.phantoms.messages import explain
 
 Table = dict[str, Any]
@@ -180,6 +179,6 @@ def _split(scene: Table, shares: Mapping[str, float], where: str) -> str:
 @functools.lru_cache(4096)
 def _digest(path: str, where: str) -> str:
     try:
-        return digest_of(open_volume(Path(path)))
+        return digest_at(volume_at(Path(path)))
     except InputError as error:
         raise InputError(f"{where}: phantom.path: {error}") from None

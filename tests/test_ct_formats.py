@@ -1,6 +1,8 @@
 """A CT in every format is the same body, and what makes a volume doubtful is refused in one sentence."""
 
+import hashlib
 import itertools
+import os
 import re
 import shutil
 import sys
@@ -14,9 +16,11 @@ from ct_files import SPACING, corner, oblique, stored, write, write_slices
 
 from ctsim.errors import InputError
 from ctsim.io.formats import open_volume
+from ctsim.phantoms import ct_headers
 from ctsim.phantoms.body_volume import TISSUES, CtVolume
+from ctsim.phantoms.dataset import plan_scene
 from ctsim.phantoms.recipes import build_recipe
-from ctsim.phantoms.scene import parse_suite, scene_id
+from ctsim.phantoms.scene import build, parse_suite, scene_id
 
 KINDS = ("dicom", ".nii", ".nii.gz", ".mha", ".mhd", ".nrrd", ".nhdr")
 PLACED = [(order, flips) for order in itertools.permutations(range(3)) for flips in ((False,) * 3, (True, False, True))]
@@ -125,6 +129,32 @@ def test_the_hash_of_a_folder_is_that_of_its_slices_whatever_their_names(tmp_pat
     one.save_as(folder / "z")
     with pytest.raises(InputError, match=r"has the SHA-256 .*, the scene was made of"):
         build_recipe(before, 0)
+
+
+def test_a_scene_parses_and_hashes_each_slice_once(tmp_path, monkeypatch):
+    folder = write_slices(tmp_path / "slices", *stored(corner()))
+    text = f'name = "head"\nphantom = {{ recipe = "ct_volume", path = "{folder}", size = 20.0 }}\n'
+    text += "scanner = { n_voxel = [16, 16, 16], n_detector = [24, 24], n_views = 4 }"
+    parsed, hashed, dcmread, file_digest = [], [], pydicom.dcmread, hashlib.file_digest
+    monkeypatch.setattr(pydicom, "dcmread", lambda *a, **k: parsed.append(1) or dcmread(*a, **k))
+    monkeypatch.setattr(hashlib, "file_digest", lambda *a: hashed.append(1) or file_digest(*a))
+    # as if the slices, written just now, were old; as new ones they are read for every use
+    for settled, times in ((0.0, 1), (3600.0, 3)):
+        monkeypatch.setattr(ct_headers, "SETTLED", settled)
+        (scene,) = parse_suite(text)
+        plan_scene(scene)
+        build(scene)
+        assert (len(parsed), len(hashed)) == (5 * times, 5 * times)
+        parsed.clear(), hashed.clear()
+    # another file under the same name, size and time of change is another file
+    old = (folder / "IM00").stat()
+    one = pydicom.dcmread(folder / "IM00")
+    one.PixelData = bytes(len(one.PixelData))
+    monkeypatch.setattr(ct_headers, "SETTLED", 0.0)
+    one.save_as(folder / "IM00")
+    os.utime(folder / "IM00", ns=(old.st_atime_ns, old.st_mtime_ns))
+    with pytest.raises(InputError, match=r"has the SHA-256 .*, the scene was made of"):
+        build(scene)
 
 
 def test_the_hash_of_a_header_holds_its_data(tmp_path):

@@ -13,6 +13,7 @@ import numpy as np
 import pydicom
 import pydicom.filereader
 from numpy.typing import NDArray
+from pydicom.dataelem import RawDataElement
 from pydicom.uid import UID, ExplicitVRBigEndian, ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
 from ctsim.errors import InputError
@@ -46,7 +47,10 @@ Values = tuple[float, ...]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Slice:
-    """What the header of one slice says: the values of `SAME` by name, its position in mm, its series."""
+    """What the header of one slice says: the values of `SAME` by name, its position in mm, its series.
+
+    Its pixels are `n_bytes` that begin `offset` bytes into the file.
+    """
 
     path: Path
     shared: dict[str, Values]
@@ -54,6 +58,8 @@ class Slice:
     series: str
     description: str
     big_endian: bool
+    offset: int
+    n_bytes: int
 
 
 def open_volume(path: Path) -> VolumeFile:
@@ -98,7 +104,7 @@ def open_volume(path: Path) -> VolumeFile:
 
 def _read_slice(path: Path) -> Slice | None:
     """Return what the header of a slice says; None for another file: no DICOM, or none with an image."""
-    found = _dataset(path, stop_before_pixels=True, specific_tags=[*SAME, *OTHERS])
+    found = _dataset(path)
     if found is None or (found.get("Rows") is None and found.get("Modality") != "CT"):
         return None
     if (modality := found.get("Modality")) != "CT":
@@ -112,6 +118,7 @@ def _read_slice(path: Path) -> Slice | None:
             "expected 0°: resample the series first"
         )
     position = _numbers(path, found, "ImagePositionPatient", 3)
+    offset, n_bytes = _pixels_in(found)
     return Slice(
         path=path,
         shared={key: _numbers(path, found, key, n, optional=key in OPTIONAL) for key, n in SAME.items()},
@@ -119,11 +126,13 @@ def _read_slice(path: Path) -> Slice | None:
         series=str(found.get("SeriesInstanceUID") or ""),
         description=str(found.get("SeriesDescription") or "without a description"),
         big_endian=found.file_meta.TransferSyntaxUID == ExplicitVRBigEndian,
+        offset=offset,
+        n_bytes=n_bytes,
     )
 
 
-def _dataset(path: Path, **options: Any) -> pydicom.FileDataset | None:
-    """Parse a file, of which nothing is decompressed; None for a file that is no DICOM file."""
+def _dataset(path: Path) -> pydicom.FileDataset | None:
+    """Parse what is used of a file, of which nothing is decompressed; None for a file that is no DICOM file."""
     with path.open("rb") as file:
         is_dicom = file.read(132)[128:] == b"DICM" or path.name.lower().endswith((".dcm", ".ima"))
     if path.name == "DICOMDIR" or not is_dicom:
@@ -138,7 +147,7 @@ def _dataset(path: Path, **options: Any) -> pydicom.FileDataset | None:
         raise InputError(
             f"{path} is compressed ({quoted(syntax.name)}), expected plain pixels, as gdcmconv --raw writes"
         )
-    return pydicom.dcmread(io.BytesIO(data), **options)
+    return pydicom.dcmread(io.BytesIO(data), specific_tags=[*SAME, *OTHERS, "PixelData"])
 
 
 def _coding(data: bytes) -> Any:
@@ -147,6 +156,14 @@ def _coding(data: bytes) -> Any:
         io.BytesIO(data[132:]), is_implicit_VR=False, is_little_endian=True, stop_when=lambda tag, *_: tag.group != 2
     )
     return meta.get("TransferSyntaxUID")
+
+
+def _pixels_in(found: pydicom.Dataset) -> tuple[int, int]:
+    """Return where in its file the pixels of a slice begin, and how many bytes they are; none where there are none."""
+    raw = found.get_item("PixelData") if "PixelData" in found else None
+    if not isinstance(raw, RawDataElement) or not raw.value:
+        return 0, 0
+    return raw.value_tell, len(raw.value)
 
 
 def _numbers(path: Path, found: pydicom.Dataset, key: str, count: int, *, optional: bool = False) -> Values:
@@ -215,13 +232,13 @@ def _dtype(one: Slice) -> np.dtype[Any]:
 def _pixels(one: Slice) -> NDArray[Any]:
     """Return the stored values of a slice; bits outside of those that are used are left out."""
     dtype = _dtype(one)
-    found = _dataset(one.path)
-    data = found.get("PixelData") if found is not None else None
     rows, columns = (int(one.shared[key][0]) for key in ("Rows", "Columns"))
     size = rows * columns * dtype.itemsize
-    if not isinstance(data, bytes) or len(data) not in (size, size + size % 2):
-        there = len(data) if isinstance(data, bytes) else "no"
-        raise InputError(f"{one.path} holds {there} bytes of pixels, its header declares {size}")
+    with one.path.open("rb") as file:
+        file.seek(one.offset)
+        data = file.read(one.n_bytes)
+    if len(data) not in (size, size + size % 2):
+        raise InputError(f"{one.path} holds {len(data) or 'no'} bytes of pixels, its header declares {size}")
     values = np.frombuffer(data, dtype, rows * columns).astype(dtype.newbyteorder("=")).reshape(rows, columns)
     stored, high = (int(one.shared[key][0]) for key in ("BitsStored", "HighBit"))
     bits = dtype.itemsize * 8
