@@ -21,7 +21,7 @@ from ctsim.benchmarks.engine.table import html_prose, simple
 from ctsim.benchmarks.studies.methods.records import RunRecord, latest
 from ctsim.benchmarks.studies.methods.tables import tables
 from ctsim.reports import figures, slices
-from ctsim.reports.kept import Case, Kept
+from ctsim.reports.kept import Case, Kept, Measured
 
 PRIMARY, FAILURES = "tissue", "Failures and skips"
 TITLES = {
@@ -47,7 +47,7 @@ class Content:
     title: str
     provenance: str
     records: Sequence[RunRecord]
-    cases: list[Case]
+    cases: list[Case | Measured]
     most: int = 1
     more: dict[str, str]
     missing: str = ""
@@ -98,10 +98,11 @@ def _folded(name: str, part: str) -> str:
 
 def _figures(records: Sequence[RunRecord]) -> str:
     shown = (f"<figure>{figures.svg(figure, label)}</figure>" for label, figure in figures.drawn(records))
-    return f'<div class="figures">{"".join(shown)}</div>'
+    drawn = "".join(shown)
+    return f'<div class="figures">{drawn}</div>' if drawn else ""
 
 
-def _slices(scenes: list[str], cases: list[Case]) -> str:
+def _slices(scenes: list[str], cases: list[Case | Measured]) -> str:
     """Return the controls that all scenes share, then the scenes."""
     labels = dict.fromkeys(kept.record.label for case in cases for kept in case.kept)
     radios = (("both", "volumes and errors"), ("volume", "volumes"), ("error", "errors"))
@@ -114,50 +115,72 @@ def _slices(scenes: list[str], cases: list[Case]) -> str:
         f'<label>{_BOX} name="method" value="{html.escape(label)}" checked>{html.escape(label)}</label>'
         for label in labels
     )
+    said, look = ["Slices normal to z, row 0 at the bottom, in 8 bits over the stated window."], ""
+    if any(isinstance(case, Case) for case in cases):
+        said += [
+            "Errors are volume minus effective-spectrum reference. Slices are cropped to the judged body. Metal is "
+            "outlined, and grey in the errors because it is not judged. Of several seeds of a scene the first is shown."
+        ]
+        ring = f'<label>{_BOX} name="ring" checked>metal outline</label>'
+        look = f'<fieldset class="look">{show}{ring}</fieldset>'
+    if any(isinstance(case, Measured) for case in cases):
+        said += ["Measured scans have no truth: their slices are whole, without errors and without outlines."]
     return (
-        '<p class="caption">Errors are volume minus effective-spectrum reference. Slices normal to z, row 0 at the '
-        "bottom, cropped to the judged body, in 8 bits over the stated window. Metal is outlined, and grey in the "
-        "errors because it is not judged. Of several seeds of a scene the first is shown.</p>"
-        f'<fieldset class="look">{show}'
-        f'<label>{_BOX} name="ring" checked>metal outline</label></fieldset>'
+        f'<p class="caption">{" ".join(said)}</p>{look}'
         f'<details><summary>Methods</summary><fieldset class="look">{boxes}</fieldset></details>' + "".join(scenes)
     )
 
 
-def _scene(case: Case, frame: slices.Frame, done: Callable[[], Any]) -> str:
+def images_a_slice(case: Case | Measured) -> int:
+    """Return how many images a slice has: volumes, and with a truth the reference and the errors."""
+    return 2 * len(case.kept) + 1 if isinstance(case, Case) else len(case.kept)
+
+
+def _scene(case: Case | Measured, frame: slices.Frame, done: Callable[[], Any]) -> str:
     """Return a scene's section: slider, legends, a tile a method, and the images themselves."""
     name = html.escape(case.stored.name)
     start = int(np.argmin(np.abs(np.array(frame.z) - case.at[0])))
-    tiles = [_tile(case, frame, "reference", "<b>reference</b>, effective spectrum", "")]
+    whole = isinstance(case, Measured)
+    tiles = [] if whole else [_tile(case, frame, "reference", "<b>reference</b>, effective spectrum", "")]
     tiles += [_tile(case, frame, str(k), _caption(kept), kept.record.label) for k, kept in enumerate(case.kept)]
     data = json.dumps(_images(case, frame, start, done), separators=(",", ":")).replace("<", "\\u003c")
     return (
-        f'<section class="scene" id="scene-{name}"><h3>{name}</h3>{_step(frame)}<div class="control">'
+        f'<section class="scene" id="scene-{name}"><h3>{name}</h3>{_said(case, frame)}<div class="control">'
         f'<input type="range" autocomplete="off" min="0" max="{len(frame.z) - 1}" value="{start}" '
         f'aria-label="slice of {name}">'
         f"<output></output></div>{_legends(case)}"
-        f'<div class="tiles">{"".join(tiles)}</div><script type="application/json">{data}</script></section>\n'
+        f'<div class="tiles{" bare" * whole}">{"".join(tiles)}</div><script type="application/json">{data}</script>'
+        "</section>\n"
     )
 
 
-def _step(frame: slices.Frame) -> str:
-    """Say which slices are left out, if any are."""
+def _said(case: Case | Measured, frame: slices.Frame) -> str:
+    """Say where the edges of the slices are, and which slices are left out, if any are."""
+    geometry = case.stored.geometry
+    ends = []
+    for axis, part in ((2, frame.columns), (1, frame.rows)):
+        at, half = geometry.voxel_centres()[axis], geometry.d_voxel[axis] / 2
+        ends.append(f"{at[part.start] - half:.1f} … {at[part.stop - 1] + half:.1f} mm".replace("-", "−"))
+    said = "Measured, without truth. " * isinstance(case, Measured)
+    said += f"From left to right x = {ends[0]}, from bottom to top y = {ends[1]}."
     step = frame.z[1] - frame.z[0] if len(frame.z) > 1 else 1
-    return f'<p class="caption">One slice in {step} is here, to keep the file small.</p>' if step > 1 else ""
+    said += f" One slice in {step} is here, to keep the file small." * (step > 1)
+    return f'<p class="caption">{said}</p>'
 
 
-def _tile(case: Case, frame: slices.Frame, row: str, caption: str, label: str) -> str:
-    _, d_y, d_x = case.truth.d_voxel
+def _tile(case: Case | Measured, frame: slices.Frame, row: str, caption: str, label: str) -> str:
+    _, d_y, d_x = case.stored.geometry.d_voxel
     height, width = ((part.stop - part.start) for part in (frame.rows, frame.columns))
     ratio = f'style="aspect-ratio: {width * d_x:.6g} / {height * d_y:.6g}"'
-    ring = '<img class="stencil ring" data-kind="ring" alt="">'
-    only = "" if label else " only"
+    judged = isinstance(case, Case)
+    ring = '<img class="stencil ring" data-kind="ring" alt="">' if judged else ""
+    only = "" if label and judged else " only"
     alt = html.escape(label or "reference")
     frames = (
         f'<div class="frame volume{only}" {ratio}><img class="values" data-kind="volume" data-row="{row}" '
         f'alt="{alt}: volume">{ring}</div>'
     )
-    if label:
+    if label and judged:
         frames += (
             f'<div class="frame error" {ratio}><img class="values" data-kind="error" data-row="{row}" '
             f'alt="{alt}: error"><img class="stencil" data-kind="fill" alt="">{ring}</div>'
@@ -170,18 +193,19 @@ def _tile(case: Case, frame: slices.Frame, row: str, caption: str, label: str) -
 
 def _caption(kept: Kept) -> str:
     record = kept.record
+    status = "" if record.status == OK else f" · {html.escape(record.status)}"
+    if PRIMARY not in record.scores:
+        return f"<b>{html.escape(record.label)}</b>{status}"
     values = record.scores[PRIMARY].values
     psnr, ssim = values["psnr3d"], values["ssim3d"]
     said = "identical" if psnr is None else f"{psnr:.2f} dB"
-    status = "" if record.status == OK else f" · {html.escape(record.status)}"
     said += "" if ssim is None else f" · SSIM3D {ssim:.3f}"
     return f"<b>{html.escape(record.label)}</b> PSNR3D {said}{status}"
 
 
-def _images(case: Case, frame: slices.Frame, start: int, done: Callable[[], Any]) -> dict[str, Any]:
+def _images(case: Case | Measured, frame: slices.Frame, start: int, done: Callable[[], Any]) -> dict[str, Any]:
     """Encode every slice of every volume; `said` is the text next to the slider."""
-    heights, total = case.stored.geometry.voxel_centres()[0], case.truth.metal.shape[0]
-    stencils = [slices.metal_stencils(case, frame, z) for z in frame.z]
+    heights, total = case.stored.geometry.voxel_centres()[0], case.stored.geometry.n_voxel[0]
 
     def encoded(make: Callable[..., slices.Image8], values: Any) -> list[str]:
         found = []
@@ -190,22 +214,30 @@ def _images(case: Case, frame: slices.Frame, start: int, done: Callable[[], Any]
             done()
         return found
 
-    return {
+    found = {
         "z": list(frame.z),
         "said": [f"slice {z} of 0 … {total - 1}, z = {heights[z]:.1f} mm" for z in frame.z],
         "start": start,
-        "volume": {"reference": encoded(slices.volume_image, case.reference)}
-        | {str(k): encoded(slices.volume_image, kept.values) for k, kept in enumerate(case.kept)},
+        "volume": {str(k): encoded(slices.volume_image, kept.values) for k, kept in enumerate(case.kept)},
+    }
+    if isinstance(case, Measured):
+        return found
+    stencils = [slices.metal_stencils(case, frame, z) for z in frame.z]
+    found["volume"]["reference"] = encoded(slices.volume_image, case.reference)
+    return found | {
         "error": {str(k): encoded(slices.error_image, kept.values) for k, kept in enumerate(case.kept)},
         "ring": {"all": [ring for ring, _ in stencils]},
         "fill": {"all": [fill for _, fill in stencils]},
     }
 
 
-def _legends(case: Case) -> str:
+def _legends(case: Case | Measured) -> str:
     """Return the bars of the window and of the error scale, in HU where the scan's water is known."""
-    water = case.look.water
     grey, signed = "#000, #fff", ", ".join(_colours())
+    if isinstance(case, Measured):
+        ends = (f"{case.low:.4g}".replace("-", "−"), f"{case.top:.4g} 1/mm")
+        return f'<div class="legends">{_legend("volumes", grey, ends)}</div>'
+    water = case.look.water
     top, error = case.look.top, case.look.error
     volume = ("0", f"{top:.4g} 1/mm")
     errors = (f"−{error:.4g}", "0", f"+{error:.4g} 1/mm")

@@ -128,7 +128,7 @@ def html_page(results: Path, data: Path | None, command: str) -> str:
         more=more(results, found),
         missing=missing,
     )
-    images = sum(len(slices.frame_of(case, content.most).z) * (2 * len(case.kept) + 1) for case in cases)
+    images = sum(len(slices.frame_of(case, content.most).z) * page.images_a_slice(case) for case in cases)
     with Bar(images, "image") as bar:
         text = page.page(content, bar.advance)
     if (size := len(text.encode())) > LIMIT:

@@ -1,6 +1,6 @@
 """Slices for a page: 8 bits over the stated window, small enough to embed.
 
-Volumes run from 0 to the window's top, errors from minus to plus the error scale.
+Volumes run over the window of their case, errors from minus to plus the error scale.
 PNG keeps every grey; WebP would halve the size and smooth the noise.
 """
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ctsim.benchmarks.scores.metrics import erode
-from ctsim.reports.kept import Case
+from ctsim.reports.kept import Case, Measured
 
 OUTLINE = 200  # points across an image: an outline is one of them wide, however few the voxels are
 RING, UNJUDGED = (255, 176, 0), (140, 140, 140)  # as in the panels
@@ -26,7 +26,7 @@ Image8 = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frame:
-    """Which part of a volume is shown: slices `z`, rows and columns of the judged body."""
+    """Which part of a volume is shown: slices `z`, rows and columns of the case's box."""
 
     z: tuple[int, ...]
     rows: slice
@@ -42,23 +42,17 @@ def quantised(image: NDArray[Any], low: float, high: float) -> Image8:
     return np.rint(np.clip((image - low) / (high - low), 0, 1) * 255).astype(np.uint8)
 
 
-def frame_of(case: Case, most: int) -> Frame:
-    """Choose at most `most` evenly spaced slices through the body, and the slice through the most metal among them."""
-    judged = case.truth.judged
-    z, rows, columns = (np.flatnonzero(judged.any(axis=tuple(a for a in range(3) if a != axis))) for axis in range(3))
-    step = math.ceil(z.size / max(most, 1))
-    first = int(z[0]) + (case.at[0] - int(z[0])) % step
-    chosen = range(first, int(z[-1]) + 1, step)
-    return Frame(
-        z=tuple(chosen),
-        rows=slice(int(rows[0]), int(rows[-1]) + 1),
-        columns=slice(int(columns[0]), int(columns[-1]) + 1),
-    )
+def frame_of(case: Case | Measured, most: int) -> Frame:
+    """Choose at most `most` evenly spaced slices through the case's box, and its slice `at` among them."""
+    z, rows, columns = case.box
+    step = math.ceil((z.stop - z.start) / max(most, 1))
+    first = z.start + (case.at[0] - z.start) % step
+    return Frame(z=tuple(range(first, z.stop, step)), rows=rows, columns=columns)
 
 
-def volume_image(case: Case, values: NDArray[Any], frame: Frame, z: int) -> Image8:
-    """Return a slice of a volume over the window on tissue."""
-    return quantised(frame.cut(values, z), 0.0, case.look.top)
+def volume_image(case: Case | Measured, values: NDArray[Any], frame: Frame, z: int) -> Image8:
+    """Return a slice of a volume over the case's window."""
+    return quantised(frame.cut(values, z), case.low, case.top)
 
 
 def error_image(case: Case, values: NDArray[Any], frame: Frame, z: int) -> Image8:
@@ -99,8 +93,10 @@ def metal_stencils(case: Case, frame: Frame, z: int) -> tuple[str, str]:
     return stencil(ring, RING), stencil(metal, UNJUDGED)
 
 
-def bytes_a_slice(case: Case) -> int:
-    """Estimate the bytes of one slice of every volume, from the one through the most metal."""
+def bytes_a_slice(case: Case | Measured) -> int:
+    """Estimate the bytes of one slice of every volume and error, from the slice `at`."""
     frame, z = frame_of(case, 1), case.at[0]
-    pairs = ((volume_image, k) for k in case.kept), ((error_image, k) for k in case.kept)
-    return sum(len(png(make(case, k.values, frame, z))) for group in pairs for make, k in group)
+    found = [volume_image(case, kept.values, frame, z) for kept in case.kept]
+    if isinstance(case, Case):
+        found += [error_image(case, kept.values, frame, z) for kept in case.kept]
+    return sum(len(png(image)) for image in found)

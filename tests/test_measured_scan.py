@@ -1,10 +1,16 @@
 """A measured scan through run-benchmark: masks are found, protocols skipped by name, and what needs no truth scored."""
 
+import base64
+import io
+import json
+import re
+
 import msgspec
 import numpy as np
 import pytest
 import scan_files
 from closed_scans import BODY, GEOMETRY, METAL, counts_of, line_integrals
+from PIL import Image
 
 from ctsim.benchmarks.importing import Flags
 from ctsim.benchmarks.importing.work import bring
@@ -13,11 +19,13 @@ from ctsim.benchmarks.scores.score import NEED_TRUTH, NO_REFERENCE
 from ctsim.benchmarks.scores.unreferenced import HeldViews, Unreferenced, consistency
 from ctsim.benchmarks.studies.methods import records, study
 from ctsim.benchmarks.studies.methods.study import main
+from ctsim.benchmarks.studies.methods.volumes import map_volume
 from ctsim.benchmarks.submit import Flags as Submitted
 from ctsim.benchmarks.submit.work import submit
 from ctsim.dataset.store import open_scan
 from ctsim.errors import InputError
 from ctsim.reconstruct.fdk import reconstruct as fdk
+from ctsim.reports import report
 
 TRUE = msgspec.structs.replace(GEOMETRY, n_views=96, off_detector=(0.0, 0.0))
 
@@ -47,6 +55,32 @@ def test_a_run_and_its_table(data, tmp_path, capsys):
         assert f"## {protocol}" not in page.splitlines()
     assert "measured, without truth" in screen and "nmar[mask=auto]" in screen
     assert (results / "panels/rods.png").stat().st_size > 10_000
+    assert report.main([str(results), str(data), "--out", str(tmp_path / "page.html")]) == 0
+    check_slices((tmp_path / "page.html").read_text(encoding="utf-8"), results, data)
+
+
+def check_slices(text, results, data):
+    """The page has a slider over every slice of both volumes, in the window of the panel, and says so."""
+    geometry, kept = open_scan(data / "rods").geometry, [r for r in records.read(results) if r.volume]
+    volumes = [map_volume(results / r.volume) for r in kept]
+    low, high = np.percentile(volumes[0], (1.0, 99.5))
+    images = json.loads(re.search(r'<script type="application/json">(.*?)</script>', text, re.S)[1])
+    n = geometry.n_voxel[0]
+    assert images["z"] == list(range(n)) and images["start"] == n // 2
+    assert set(images["volume"]) == {"0", "1"} and "error" not in images
+    for row, volume in enumerate(volumes):
+        shown = np.asarray(Image.open(io.BytesIO(base64.b64decode(images["volume"][str(row)][5]))))
+        # 8 bits over the window, row 0 at the bottom: half a grey of rounding
+        found = low + shown[::-1] / 255 * (high - low)
+        assert np.abs(found - np.clip(volume[5], low, high)).max() <= 0.51 * (high - low) / 255
+    z, half = geometry.voxel_centres()[0][5], geometry.n_voxel[2] * geometry.d_voxel[2] / 2
+    assert images["said"][5] == f"slice 5 of 0 … {n - 1}, z = {z:.1f} mm"
+    said = f"left to right x = −{half:.1f} … {half:.1f} mm"
+    assert said in text and "Measured, without truth" in text and f"{high:.4g} 1/mm" in text
+    assert re.findall(r"<figcaption><b>(.*?)</b>", text) == [r.label for r in kept]
+    for only_with_truth in ('data-kind="error"', 'data-kind="ring"', 'name="show"', "Errors are volume minus"):
+        assert only_with_truth not in text.partition("<script>")[0]
+    assert '<h2 id="figures">' not in text
 
 
 def test_a_measured_scan_is_of_no_code_of_the_simulator(data, smallest, tmp_path, monkeypatch, caplog):

@@ -52,4 +52,5 @@ for number, (_, drawing) in enumerate(figures.drawn(records)):
 
 # %%
 for case in kept.first_cases(DATA, records, RESULTS):
-    show.slices(case, f"results-{case.stored.name}")
+    if isinstance(case, kept.Case):  # the viewer shows errors too, and a measured scan has no truth
+        show.slices(case, f"results-{case.stored.name}")

@@ -15,6 +15,12 @@ CELL, LABEL = 2.6, 1.1  # inches
 WINDOW = (1.0, 99.5)  # percentiles of the first volume
 
 
+def window_of(volume: NDArray[Any]) -> tuple[float, float]:
+    """Return the window (1/mm) of all volumes of a scan, from the first one: there is no truth to choose it by."""
+    low, high = np.percentile(np.nan_to_num(volume), WINDOW)
+    return float(low), float(max(high, low + 1e-9))
+
+
 def draw_bare(title: str, geometry: Geometry, rows: Sequence[tuple[str, NDArray[Any]]]) -> Figure:
     """Draw the slices through the middle of each volume [z, y, x], normal to z and to y, row 0 at the bottom.
 
@@ -23,8 +29,8 @@ def draw_bare(title: str, geometry: Geometry, rows: Sequence[tuple[str, NDArray[
     size = (2 * CELL + LABEL, CELL * len(rows) + 0.8)
     figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.02, h_pad=0.02))
     grid = figure.subplots(len(rows), 2, squeeze=False)
-    low, high = np.percentile(np.nan_to_num(rows[0][1]), WINDOW)
-    window = {"vmin": float(low), "vmax": float(max(high, low + 1e-9))}
+    low, high = window_of(rows[0][1])
+    window = {"vmin": low, "vmax": high}
     image = None
     for axes, (caption, volume) in zip(grid, rows, strict=True):
         for k, axis in enumerate((0, 1)):
