@@ -8,10 +8,11 @@ import pytest
 
 from ctsim.beam.spectrum import Spectrum
 from ctsim.detector.response import Detector
+from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.montecarlo.kernels.transport_reference import single_scatter
-from ctsim.montecarlo.transport import Source, absorbed_energy, scatter_image
+from ctsim.montecarlo.transport import Histories, Source, absorbed_energy, scatter_image
 from ctsim.montecarlo.world import World
 from ctsim.solids import ELLIPSOID, FRUSTUM, Primitive, Solid
 from ctsim.tracer.project import Tracer, path_lengths
@@ -214,3 +215,9 @@ def test_a_focused_grid_stops_what_comes_from_the_side():
     np.testing.assert_allclose(behind.scatter[0, middle], (plain.scatter[0] * share)[middle], rtol=0.1)
     assert behind.scatter[0, 0] == 0 and share.max() > 0.9
     np.testing.assert_array_equal(behind.primary, plain.primary)
+
+
+def test_fewer_histories_than_parts_are_refused():
+    with pytest.raises(InputError, match="histories must be at least 64, got 63"):
+        Histories(key=np.uint64(0), count=63)
+    assert Histories(key=np.uint64(0), count=64).first == 0

@@ -49,12 +49,12 @@ def test_waves_are_found_and_evaluated_exactly(monkeypatch, arc):
         turn = np.cos(2 * np.pi * view) + 0.3 * np.sin(4 * np.pi * view) if arc == 360 else np.cos(3 * np.pi * view)
         return 5 + 0.5 * turn * np.cos(np.pi * u) + np.cos(2 * np.pi * v) * np.cos(3 * np.pi * u)
 
-    def told(world, source, pose, *, cells, histories, key, first=0):
+    def told(world, source, pose, histories, *, cells):
         view = told.view = (told.view + 1) % told.n
         fine = [(np.arange(64 * n) + 0.5) / (64 * n) for n in cells]
         values = field((view + 0.5) / told.n, fine[0][:, None], fine[1]).reshape(cells[0], 64, cells[1], 64)
         images = np.zeros((CHUNKS, PLANES, *cells))
-        images[:, SINGLE] = values.mean((1, 3)) * histories / CHUNKS
+        images[:, SINGLE] = values.mean((1, 3)) * histories.count / CHUNKS
         images[:, SQUARED] = 2 * images[:, SINGLE]
         return images
 

@@ -14,7 +14,7 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.montecarlo.kernels.scoring_cpu import MULTIPLE, SINGLE, SQUARED
 from ctsim.montecarlo.kernels.transport_cpu import CHUNKS
-from ctsim.montecarlo.transport import Source, add_histories
+from ctsim.montecarlo.transport import Histories, Source, add_histories
 from ctsim.montecarlo.world import World
 from ctsim.rng import stream_key
 from ctsim.types import Phantom
@@ -86,10 +86,8 @@ def scatter_series(
     done, wanted = 0, FIRST
     while True:
         for j, pose in enumerate(poses):
-            images = add_histories(
-                world, source, pose, cells=cells, histories=wanted - done, first=done,
-                key=stream_key(stream, "scatter", j),
-            )  # fmt: skip
+            more = Histories(key=stream_key(stream, "scatter", j), count=wanted - done, first=done)
+            images = add_histories(world, source, pose, more, cells=cells)
             parts = images.reshape(2, CHUNKS // 2, *images.shape[1:]).sum(1)
             halves[:, 0, j] += parts[:, SINGLE] + parts[:, MULTIPLE]
             halves[:, 1, j] += parts[:, SQUARED]

@@ -51,6 +51,19 @@ class Source:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Histories:
+    """Photons to follow: `count` histories of a stream of random numbers, from number `first` on."""
+
+    key: np.uint64
+    count: int
+    first: int = 0
+
+    def __post_init__(self) -> None:
+        if self.count < CHUNKS:
+            raise InputError(f"histories must be at least {CHUNKS}, got {self.count}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Image:
     """What reaches the detector, as a share of the open field's signal: float64 [v, u] on cells of the detector.
 
@@ -81,7 +94,8 @@ def scatter_image(
     stream: str = "",
 ) -> Image:
     """Return one view's scatter; `pose` is a row of `Geometry.pose_array`, `cells` (v, u) part the detector."""
-    images = add_histories(world, source, pose, cells=cells, histories=histories, key=stream_key(stream, "scatter", 0))
+    followed = Histories(key=stream_key(stream, "scatter", 0), count=histories)
+    images = add_histories(world, source, pose, followed, cells=cells)
     primary, single, multiple, squared = images.sum(0) / histories
     return Image(
         primary=primary,
@@ -96,18 +110,16 @@ def add_histories(
     world: World,
     source: Source,
     pose: NDArray[np.float64],
+    histories: Histories,
     *,
     cells: tuple[int, int],
-    histories: int,
-    key: np.uint64,
-    first: int = 0,
 ) -> NDArray[np.float64]:
-    """Follow histories of a stream from `first` on; return their sums [part, plane, v, u] times the number of cells.
+    """Follow histories; return their sums [part, plane, v, u] times the number of cells.
 
     The parts are independent; the planes are PRIMARY, SINGLE, MULTIPLE and SQUARED, as in `Image`.
     """
     images = np.zeros((CHUNKS, PLANES, *cells))
-    _run(world, source, pose, histories, key, first, images=images)
+    _run(world, source, pose, histories, images=images)
     images *= cells[0] * cells[1] * source.most / source.open_signal
     images[:, SQUARED] /= source.open_signal
     return images
@@ -127,7 +139,8 @@ def absorbed_energy(
     `regions` is uint8 [z, y, x]; what is absorbed outside the grid counts as region 0.
     """
     deposit = np.zeros((CHUNKS, int(regions.max()) + 1))
-    _run(world, source, pose, histories, stream_key(stream, "dose", 0), 0, deposit=deposit, regions=regions)
+    followed = Histories(key=stream_key(stream, "dose", 0), count=histories)
+    _run(world, source, pose, followed, deposit=deposit, regions=regions)
     parts = deposit * CHUNKS / histories
     return parts.mean(0), parts.std(0, ddof=1) / np.sqrt(CHUNKS)
 
@@ -136,16 +149,12 @@ def _run(
     world: World,
     source: Source,
     pose: NDArray[np.float64],
-    histories: int,
-    key: np.uint64,
-    first: int,
+    histories: Histories,
     *,
     images: NDArray[np.float64] | None = None,
     deposit: NDArray[np.float64] | None = None,
     regions: NDArray[np.uint8] | None = None,
 ) -> None:
-    if histories < CHUNKS:
-        raise InputError(f"histories must be at least {CHUNKS}, got {histories}")
     tables, spectrum = world.tables, source.spectrum
     grid = E_MIN + STEP * np.arange(tables.mu.shape[1])
     if spectrum.e_max > grid[-2]:
@@ -166,7 +175,7 @@ def _run(
         ),
         np.zeros((1, 1, 1), np.uint8) if regions is None else regions,
         (np.cumsum(spectrum.weights), np.array(spectrum.energies), gain, layer, stops),
-        key, first, histories,
+        histories.key, histories.first, histories.count,
         np.zeros((CHUNKS, PLANES, 0, 0)) if images is None else images,
         np.zeros((CHUNKS, 0)) if deposit is None else deposit,
     )  # fmt: skip
