@@ -23,7 +23,7 @@ import torch
 from ctsim.benchmarks.engine.host import Usage
 from ctsim.benchmarks.engine.process import how_it_ended
 from ctsim.errors import InputError
-from ctsim.io.formats import FORMATS, open_volume
+from ctsim.io.volumes.formats import FORMATS, open_volume
 from ctsim.types import Scan, Volume
 
 COMMAND, USAGE = "command", "usage"

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from ctsim.errors import InputError
 from ctsim.geometry import Triple
-from ctsim.io.volumefile import VolumeFile
+from ctsim.io.volumes.volumefile import VolumeFile
 from ctsim.phantoms.ct_headers import digest_at, volume_at
 
 ALIKE = 1e-3

@@ -9,8 +9,8 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ctsim.io.formats import open_volume
-from ctsim.io.volumefile import VolumeFile
+from ctsim.io.volumes.formats import open_volume
+from ctsim.io.volumes.volumefile import VolumeFile
 
 SETTLED = 2.0
 """Seconds after which a change shows: file systems round times, some to 2 s, so a younger file can change unseen."""

@@ -15,7 +15,7 @@ import tifffile
 from ct_files import SPACING, corner, oblique, stored, write, write_slices
 
 from ctsim.errors import InputError
-from ctsim.io.formats import open_volume
+from ctsim.io.volumes.formats import open_volume
 from ctsim.phantoms import ct_headers
 from ctsim.phantoms.body_volume import TISSUES, CtVolume
 from ctsim.phantoms.dataset import plan_scene
@@ -308,7 +308,7 @@ def test_metal_of_the_ct_is_refused_or_replaced_never_kept(tmp_path):
 
 def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch):
     path = write(tmp_path, ".nii", *stored(corner()))
-    for name in ("nibabel", "ctsim.io.nifti"):
+    for name in ("nibabel", "ctsim.io.volumes.nifti"):
         monkeypatch.setitem(sys.modules, name, None) if name == "nibabel" else monkeypatch.delitem(sys.modules, name)
     refused(path, r"this format needs nibabel; pip install 'ctsim\[io\]' installs it")
 

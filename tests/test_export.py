@@ -14,9 +14,9 @@ from ctsim.benchmarks.scores.artefact import effective_attenuation
 from ctsim.dataset.store import open_scan
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.io import dicomwrite, metaimage, nifti
-from ctsim.io.formats import open_volume
-from ctsim.io.placed import Placed
+from ctsim.io.volumes import dicomwrite, metaimage, nifti
+from ctsim.io.volumes.formats import open_volume
+from ctsim.io.volumes.placed import Placed
 from ctsim.materials import attenuation
 
 CENTRE = (10.0, -20.0, 35.5)  # z, y, x

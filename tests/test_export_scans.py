@@ -19,8 +19,8 @@ from ctsim.benchmarks.export.scans import LAYOUTS, Measured, write_scan
 from ctsim.dataset.interop import Library, points_to
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.io import exchange
-from ctsim.io.scanfile import Stated
+from ctsim.io.scans import exchange
+from ctsim.io.scans.scanfile import Stated
 
 GEOMETRY = Geometry(
     dso=400.0,

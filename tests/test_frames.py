@@ -13,8 +13,8 @@ from scipy import ndimage
 
 from ctsim.benchmarks.export import work as export
 from ctsim.benchmarks.make_dataset import main as make_dataset
-from ctsim.io import dicomwrite, metaimage, nifti
-from ctsim.io.placed import Placed
+from ctsim.io.volumes import dicomwrite, metaimage, nifti
+from ctsim.io.volumes.placed import Placed
 from ctsim.phantoms.bodies import Recipe
 from ctsim.phantoms.body_lung import Lung
 from ctsim.phantoms.body_teeth import Teeth

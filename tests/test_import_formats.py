@@ -15,8 +15,8 @@ from ctsim.benchmarks.importing import Flags
 from ctsim.benchmarks.importing.work import bring
 from ctsim.dataset.store import open_scan
 from ctsim.errors import InputError
-from ctsim.io import scans
-from ctsim.io.scanfile import Stated
+from ctsim.io.scans import formats as scans
+from ctsim.io.scans.scanfile import Stated
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.types import Scan
 

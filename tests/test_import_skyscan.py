@@ -16,8 +16,8 @@ from ctsim.benchmarks.importing.settle import water_path
 from ctsim.benchmarks.importing.work import bring
 from ctsim.dataset.store import open_scan
 from ctsim.errors import InputError
-from ctsim.io import scans
-from ctsim.io.scanfile import filters_of
+from ctsim.io.scans import formats as scans
+from ctsim.io.scans.scanfile import filters_of
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.types import Scan
 

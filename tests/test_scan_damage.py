@@ -17,7 +17,7 @@ from test_ct_damage import FILES, ROOM, damaged
 
 from ctsim.benchmarks import cli
 from ctsim.errors import InputError
-from ctsim.io import scans
+from ctsim.io.scans import formats as scans
 
 FEW = msgspec.structs.replace(GEOMETRY, n_views=4)
 P = line_integrals(FEW)

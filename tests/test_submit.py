@@ -13,8 +13,8 @@ from ctsim.benchmarks.submit import Flags
 from ctsim.benchmarks.submit.work import submit
 from ctsim.dataset.store import open_scan
 from ctsim.errors import InputError
-from ctsim.io import metaimage, nifti
-from ctsim.io.placed import Placed
+from ctsim.io.volumes import metaimage, nifti
+from ctsim.io.volumes.placed import Placed
 
 
 @pytest.fixture(scope="module")

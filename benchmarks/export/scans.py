@@ -19,9 +19,9 @@ from ctsim.dataset.durable import replacing
 from ctsim.dataset.interop import Library, angles_to, astra_vectors, projections_to, volume_to
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.io import metaimage
-from ctsim.io.formats import load
-from ctsim.io.placed import Placed
+from ctsim.io.extra import load
+from ctsim.io.volumes import metaimage
+from ctsim.io.volumes.placed import Placed
 
 EVERY = 10
 """R2-Gaussian and NAF want views for tests: every tenth, which is among those for training, too."""
@@ -264,7 +264,7 @@ def _naf(path: Path, scan: Measured) -> None:
 
 def _dxchange(path: Path, scan: Measured) -> None:
     """Write Data Exchange, the HDF5 file of tomographic beamlines: what the detector read, as TomoPy expects it."""
-    load("ctsim.io.exchange", path).write_scan(path, scan.geometry, scan.counts, scan.flat, scan.dark)
+    load("ctsim.io.scans.exchange", path).write_scan(path, scan.geometry, scan.counts, scan.flat, scan.dark)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,8 +14,9 @@ from ctsim.benchmarks.scores.artefact import effective_attenuation
 from ctsim.dataset.arrayfile import read_array
 from ctsim.dataset.store import StoredScan, open_scan
 from ctsim.errors import InputError
-from ctsim.io.formats import FORMATS, load
-from ctsim.io.placed import Placed
+from ctsim.io.extra import load
+from ctsim.io.volumes.formats import FORMATS
+from ctsim.io.volumes.placed import Placed
 from ctsim.materials import attenuation
 from ctsim.reconstruct.log import line_integrals
 

@@ -14,8 +14,8 @@ from ctsim.benchmarks.importing import Flags
 from ctsim.detector.response import Detector, response
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry, few_views
-from ctsim.io.openfield import SAMPLED, open_field
-from ctsim.io.scanfile import ScanFile, filters_of
+from ctsim.io.scans.openfield import SAMPLED, open_field
+from ctsim.io.scans.scanfile import ScanFile, filters_of
 from ctsim.materials import attenuation
 from ctsim.reconstruct.axis import MOST_ROWS, axis_shift
 from ctsim.types import Scan

@@ -17,8 +17,8 @@ from ctsim.benchmarks.importing.settle import Settled, settle
 from ctsim.dataset.writer import SceneWriter, Stack, is_complete
 from ctsim.errors import InputError
 from ctsim.geometry import FARTHEST
-from ctsim.io.scanfile import ScanFile, Stated
-from ctsim.io.scans import open_scan
+from ctsim.io.scans.formats import open_scan
+from ctsim.io.scans.scanfile import ScanFile, Stated
 from ctsim.phantoms.dataset import spectrum_csv
 from ctsim.scaninfo import ScanInfo
 from ctsim.types import Scanner

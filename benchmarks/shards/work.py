@@ -19,7 +19,7 @@ from ctsim.dataset.manifest import IndexLine, read_index
 from ctsim.dataset.store import StoredScan, open_scan
 from ctsim.errors import InputError
 from ctsim.human import human_bytes, human_choice
-from ctsim.io.formats import load
+from ctsim.io.extra import load
 from ctsim.reconstruct.fdk import reconstruct
 from ctsim.reconstruct.log import LineIntegrals
 

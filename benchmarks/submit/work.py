@@ -25,9 +25,9 @@ from ctsim.benchmarks.submit import Flags
 from ctsim.dataset.store import StoredScan, list_scans, open_scan
 from ctsim.errors import InputError
 from ctsim.human import human_choice
-from ctsim.io.formats import open_volume
-from ctsim.io.frame import SKEW
-from ctsim.io.volumefile import VolumeFile
+from ctsim.io.volumes.formats import open_volume
+from ctsim.io.volumes.frame import SKEW
+from ctsim.io.volumes.volumefile import VolumeFile
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.+-]{0,59}")
 

@@ -1,1 +1,1 @@
-"""Volumes of other programs: CT volumes read from, and volumes written to, the formats of medical imaging."""
+"""Files of other programs: CT volumes (`volumes`), measured scans (`scans`), and shards for training."""

@@ -19,7 +19,7 @@ from ctsim.dataset.arrayfile import read_image
 from ctsim.errors import InputError
 from ctsim.geometry import MOST_PIXELS, MOST_VIEWS, Geometry
 from ctsim.io.payload import beside, quoted
-from ctsim.io.scanfile import ScanFile, Stated, filters_of, grid_of, number, read_text, turn, whole
+from ctsim.io.scans.scanfile import ScanFile, Stated, filters_of, grid_of, number, read_text, turn, whole
 
 STEP = 0.0005  # degrees by which a log's Rotation Step is rounded
 TURN = 0.005  # degrees of the camera whose correction moves no pixel of 5000 columns by half of it

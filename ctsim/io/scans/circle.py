@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.io.scanfile import grid_of
+from ctsim.io.scans.scanfile import grid_of
 
 NEAR = 0.5  # pixels: poses that stray less from a circle are taken for one
 

@@ -17,9 +17,9 @@ from pydicom.dataelem import RawDataElement
 from pydicom.uid import UID, ExplicitVRBigEndian, ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
 from ctsim.errors import InputError
-from ctsim.io.frame import Axes, axes_of, unit_vectors
 from ctsim.io.payload import declared, quoted
-from ctsim.io.volumefile import VolumeFile
+from ctsim.io.volumes.frame import Axes, axes_of, unit_vectors
+from ctsim.io.volumes.volumefile import VolumeFile
 
 PLAIN = (ImplicitVRLittleEndian, ExplicitVRLittleEndian, ExplicitVRBigEndian)
 LARGEST = 2**28  # bytes of a file: a slice of 8192² has half of it

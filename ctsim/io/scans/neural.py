@@ -17,8 +17,8 @@ from ctsim.dataset.interop import Library, projections_from
 from ctsim.errors import InputError
 from ctsim.geometry import MOST_VIEWS, Geometry
 from ctsim.io.payload import quoted
-from ctsim.io.plainpickle import LARGEST, load_plain
-from ctsim.io.scanfile import TEXT, ScanFile, Stated
+from ctsim.io.scans.plainpickle import LARGEST, load_plain
+from ctsim.io.scans.scanfile import TEXT, ScanFile, Stated
 
 NAME = "meta_data.json"
 NOTE = "lengths are those of the scene, taken as mm"

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from ctsim.dataset.durable import replacing
 from ctsim.errors import InputError
-from ctsim.io.frame import FROM_RAS, SKEW, Axes, axes_of
 from ctsim.io.payload import declared, inflated, raw
-from ctsim.io.placed import Placed
-from ctsim.io.volumefile import VolumeFile
+from ctsim.io.volumes.frame import FROM_RAS, SKEW, Axes, axes_of
+from ctsim.io.volumes.placed import Placed
+from ctsim.io.volumes.volumefile import VolumeFile
 
 Header = nibabel.Nifti1Header | nibabel.Nifti2Header
 UNITS = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 1e-3}

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ctsim.dataset.arrayfile import decoding
 from ctsim.errors import InputError
-from ctsim.io.formats import load
-from ctsim.io.scanfile import ScanFile, Stated
+from ctsim.io.extra import load
+from ctsim.io.scans.scanfile import ScanFile, Stated
 
 
 class Format(NamedTuple):
@@ -38,13 +38,17 @@ def _has(*ends: str) -> Callable[[Path], bool]:
 
 
 SCANS = {
-    "walnut": Format("scan in the layout of CWI's walnuts", "ctsim.io.walnut", "open_scan", _has(".geom")),
-    "r2": Format("folder of R2-Gaussian", "ctsim.io.neural", "open_r2", _has("meta_data.json")),
-    "skyscan": Format("SkyScan scan", "ctsim.io.skyscan", "open_scan", _has(".log"), lengths=True),
+    "walnut": Format("scan in the layout of CWI's walnuts", "ctsim.io.scans.walnut", "open_scan", _has(".geom")),
+    "r2": Format("folder of R2-Gaussian", "ctsim.io.scans.neural", "open_r2", _has("meta_data.json")),
+    "skyscan": Format("SkyScan scan", "ctsim.io.scans.skyscan", "open_scan", _has(".log"), lengths=True),
     "hdf5": Format(
-        "scan in HDF5", "ctsim.io.exchange", "open_scan", _has(".h5", ".hdf5", ".hdf", ".nxs", ".nx"), lengths=True
+        "scan in HDF5",
+        "ctsim.io.scans.exchange",
+        "open_scan",
+        _has(".h5", ".hdf5", ".hdf", ".nxs", ".nx"),
+        lengths=True,
     ),
-    "naf": Format("pickle of NAF", "ctsim.io.neural", "open_naf", _has(".pickle", ".pkl")),
+    "naf": Format("pickle of NAF", "ctsim.io.scans.neural", "open_naf", _has(".pickle", ".pkl")),
 }
 """name -> format; the first that fits is taken."""
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from ctsim.dataset.durable import replacing
 from ctsim.errors import InputError
-from ctsim.io.frame import axes_of, unit_vectors
 from ctsim.io.payload import beside, declared, inflated, quoted, raw
-from ctsim.io.placed import Placed
-from ctsim.io.volumefile import VolumeFile
+from ctsim.io.volumes.frame import axes_of, unit_vectors
+from ctsim.io.volumes.placed import Placed
+from ctsim.io.volumes.volumefile import VolumeFile
 
 TYPES = {
     "MET_CHAR": "i1",

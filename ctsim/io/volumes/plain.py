@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ctsim.dataset.arrayfile import describe_array, read_array
-from ctsim.io.volumefile import VolumeFile
+from ctsim.io.volumes.volumefile import VolumeFile
 
 
 def open_volume(path: Path) -> VolumeFile:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Triple
-from ctsim.io.frame import Axes
+from ctsim.io.volumes.frame import Axes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +42,7 @@ class VolumeFile:
         return self.rescale is not None or self.dtype.kind == "f" or np.iinfo(self.dtype).min <= -1000
 
     def values(self) -> NDArray[Any]:
-        """Return the stored values as [z, y, x] in the patient's frame (`ctsim.io.frame`)."""
+        """Return the stored values as [z, y, x] in the patient's frame (`ctsim.io.volumes.frame`)."""
         values = self.read()
         return self.axes.turned(values) if self.axes else values
 

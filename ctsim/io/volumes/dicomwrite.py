@@ -17,7 +17,7 @@ from pydicom.valuerep import format_number_as_ds
 
 from ctsim.dataset.durable import put_in_place
 from ctsim.errors import InputError
-from ctsim.io.placed import Placed
+from ctsim.io.volumes.placed import Placed
 
 INTERCEPT = -1024  # HU of the stored value 0, unless the volume has less
 MOST = 2**16 - 1

@@ -18,7 +18,7 @@ from ctsim.dataset.arrayfile import check_size, check_volume
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.io.payload import quoted
-from ctsim.io.scanfile import ScanFile, Stated, grid_of
+from ctsim.io.scans.scanfile import ScanFile, Stated, grid_of
 
 PIECE = 2**28  # bytes of a chunk that is decoded at once
 UNITS = {"mm": 1.0, "m": 1e3, "cm": 10.0, "um": 1e-3, "µm": 1e-3, "nm": 1e-6, "micron": 1e-3, "microns": 1e-3}

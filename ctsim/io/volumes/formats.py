@@ -1,16 +1,15 @@
 """The table of formats: who reads and who writes each of them. Their modules are imported when they are needed."""
 
 import dataclasses
-import importlib
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
 from ctsim.dataset.arrayfile import decoding
 from ctsim.errors import InputError
-from ctsim.io.volumefile import VolumeFile
+from ctsim.io.extra import load
+from ctsim.io.volumes.volumefile import VolumeFile
 
 
 class Format(NamedTuple):
@@ -26,11 +25,15 @@ class Format(NamedTuple):
     ends: tuple[str, ...] = ()
 
 
-DICOM = Format("folder of DICOM slices", (".dcm", ".ima"), "ctsim.io.dicom", "ctsim.io.dicomwrite", ("",))
-NIFTI = Format("NIfTI file", (".nii", ".nii.gz"), "ctsim.io.nifti", "ctsim.io.nifti", (".nii", ".nii.gz"))
-METAIMAGE = Format("MetaImage", (".mha", ".mhd"), "ctsim.io.metaimage", "ctsim.io.metaimage", (".mha",))
-NRRD = Format("NRRD file", (".nrrd", ".nhdr"), "ctsim.io.nrrd")
-PLAIN = Format("TIFF stack or .npy array", (".tif", ".tiff", ".npy"), "ctsim.io.plain")
+DICOM = Format(
+    "folder of DICOM slices", (".dcm", ".ima"), "ctsim.io.volumes.dicom", "ctsim.io.volumes.dicomwrite", ("",)
+)
+NIFTI = Format(
+    "NIfTI file", (".nii", ".nii.gz"), "ctsim.io.volumes.nifti", "ctsim.io.volumes.nifti", (".nii", ".nii.gz")
+)
+METAIMAGE = Format("MetaImage", (".mha", ".mhd"), "ctsim.io.volumes.metaimage", "ctsim.io.volumes.metaimage", (".mha",))
+NRRD = Format("NRRD file", (".nrrd", ".nhdr"), "ctsim.io.volumes.nrrd")
+PLAIN = Format("TIFF stack or .npy array", (".tif", ".tiff", ".npy"), "ctsim.io.volumes.plain")
 FORMATS = {"dicom": DICOM, "nifti": NIFTI, "mha": METAIMAGE, "nrrd": NRRD, "plain": PLAIN}
 
 
@@ -53,11 +56,3 @@ def open_volume(path: Path) -> VolumeFile:
             return volume.read()
 
     return dataclasses.replace(volume, read=read)
-
-
-def load(module: str, path: Path) -> ModuleType:
-    """Import a format's module. Raises InputError where the library that it needs is not installed."""
-    try:
-        return importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        raise InputError(f"{path}: this format needs {error.name}; pip install 'ctsim[io]' installs it") from None

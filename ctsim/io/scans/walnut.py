@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from ctsim.dataset.arrayfile import image_shape, read_image
 from ctsim.errors import InputError
 from ctsim.geometry import MOST_VIEWS
-from ctsim.io.circle import as_circle
 from ctsim.io.payload import beside
-from ctsim.io.scanfile import ScanFile, Stated, read_text
+from ctsim.io.scans.circle import as_circle
+from ctsim.io.scans.scanfile import ScanFile, Stated, read_text
 
 NAME = "scan_geom_corrected.geom"
 

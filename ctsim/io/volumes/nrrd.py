@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.errors import InputError
-from ctsim.io.frame import axes_of
 from ctsim.io.payload import beside, declared, inflated, quoted, raw
-from ctsim.io.volumefile import VolumeFile
+from ctsim.io.volumes.frame import axes_of
+from ctsim.io.volumes.volumefile import VolumeFile
 
 TYPES = {
     **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),

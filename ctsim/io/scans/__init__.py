@@ -1,0 +1,1 @@
+"""Measured scans in the layouts of other programs: one module a layout, and their table (`formats`)."""
