@@ -59,7 +59,7 @@ def same_rays(a: Part, b: Part) -> bool:
         and all_rays(a.scanner) == all_rays(b.scanner)
         and ours.settings == theirs.settings
         and (a.twin, len(a.materials), a.layer_material) == (b.twin, len(b.materials), b.layer_material)
-        and (a.layer is None or np.array_equal(a.layer, b.layer))
+        and (a.layer is None or (b.layer is not None and np.array_equal(a.layer, b.layer)))
         and _shapes(a) == _shapes(b)
     )
     if ours.spot is None or theirs.spot is None:

@@ -191,8 +191,8 @@ def _simulate(
     scatter = [scatter_of(job.plan, job.phantom, job.scanner) for job in jobs]
     shared = share_rays([part_of(job.plan, job.phantom, job.scanner) for job in jobs])
     views = [
-        iter(watch(job.scene.name, job.views(*known), job.writer.first_view, job.n_views))
-        for job, *known in zip(jobs, scatter, shared, strict=True)
+        iter(watch(job.scene.name, job.views(scattered, signals), job.writer.first_view, job.n_views))
+        for job, scattered, signals in zip(jobs, scatter, shared, strict=True)
     ]
     for k in range(min(job.writer.first_view for job in jobs), max(job.n_views for job in jobs)):
         for job, its in zip(jobs, views, strict=True):
