@@ -19,7 +19,7 @@ def specialisations(name):
     return getattr(kernel, "compiled", kernel).signatures
 
 
-@pytest.mark.parametrize("name", ["_corners", "_centres", "_edges", "_measure_strip"])
+@pytest.mark.parametrize("name", ["_corners", "_centres", "measure_edges", "_measure_strip"])
 def test_a_scan_with_its_twin_and_path_lengths_needs_one_specialisation(name):
     plan, _ = run(phantom(), scanner(), truth=EVERYTHING)
     assert any(o.name == "metal_free/counts" for o in plan.outputs)
@@ -32,7 +32,7 @@ def test_no_parallel_loop_holds_the_code_of_rows(name):
     cached = Path(getattr(raytrace_cpu, name).stats.cache_path).glob(f"raytrace_cpu.{name}-*.nbc")
     code = max(cached, key=lambda path: path.stat().st_mtime).read_bytes()
     assert name.encode() in code
-    for inner in (b"walk", b"_edges", b"_intersect_near"):
+    for inner in (b"walk", b"measure_edges", b"_intersect_near"):
         assert inner not in code
 
 
