@@ -77,8 +77,9 @@ def _plan(scene: Scene, phantom: Phantom, scanner: Scanner, like: Plan | None = 
 
 def _same_beam(job: _Job, scene: Scene, scanner: Scanner) -> bool:
     """Say whether a scene differs from another one of its body in dose and noise alone."""
-    dose = msgspec.structs.replace(job.scanner, i0=scanner.i0, noise=scanner.noise)
-    return (job.scene.simulation, job.scene.truth, dose) == (scene.simulation, scene.truth, scanner)
+    parts = operator.attrgetter("geometry", "tube", "detector", "scatter")
+    settings = (job.scene.simulation, job.scene.truth) == (scene.simulation, scene.truth)
+    return settings and parts(job.scanner) == parts(scanner)
 
 
 def make_scene(

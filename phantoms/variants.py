@@ -12,15 +12,22 @@ from ctsim.detector.noise import Noise
 from ctsim.phantoms.scene import Scene, build
 from ctsim.types import Phantom
 
-MOST = 16
-"""Scenes made together: a file each is open for every stack of views."""
+MOST, FILES = 16, 200  # scenes made together, and their stacks of views, a file each, that are open
+STAND_IN = "Re"
+"""A metal that no recipe has of its own: what it is in is the recipe's metal."""
 
 
 def families(scenes: Sequence[Scene], most: int = MOST) -> Iterator[tuple[Scene, ...]]:
     """Divide scenes into runs, of at most `most`, that seem to differ in metal, beam, noise and dose alone."""
     for _, group in itertools.groupby(scenes, _shared):
         alike = tuple(group)
-        yield from (alike[k : k + most] for k in range(0, len(alike), most))
+        size = max(1, min(most, FILES // _stacks(alike[0])))
+        yield from (alike[k : k + size] for k in range(0, len(alike), size))
+
+
+def _stacks(scene: Scene) -> int:
+    """Return the most stacks of views that a scene has."""
+    return 2 * (3 + len(scene.truth.mono_kev)) + 3
 
 
 def _shared(scene: Scene) -> Any:
@@ -28,43 +35,51 @@ def _shared(scene: Scene) -> Any:
     scanner = msgspec.structs.replace(
         scene.scanner, tube=Tube(), noise=Noise(), i0=None, scan_mas=None, scan_kerma=None
     )
-    body = _without_metal(scene)
-    return body, scene.seed, scanner, scene.simulation, scene.truth, scene.metal_in_view
+    tube, noise = scene.resolve().tube, scene.resolve().noise
+    # such noise takes a pass over all views first, in which scenes are not in step
+    alone = scene.name if noise.model == "tigre" else ""
+    rays = tube.focal_spot, tube.off_focal, tube.bowtie, alone
+    return _without_metal(scene), scene.seed, scanner, rays, scene.simulation, scene.truth, scene.metal_in_view
 
 
 def _without_metal(scene: Scene) -> Any:
     """Return the recipe but for what its metal is; whether there is metal stays."""
-    metal = "none" if scene.phantom.metal == "none" else "Fe"
+    metal = "none" if scene.phantom.metal == "none" else STAND_IN
     return msgspec.structs.replace(scene.phantom, metal=metal)
 
 
 def build_all(scenes: Sequence[Scene]) -> list[Phantom]:
     """Build the phantoms of scenes as `ctsim.phantoms.scene.build` does; those that differ in metal share arrays."""
+    if len(scenes) == 1:
+        return [build(scenes[0])]
+    bodies: list[tuple[Scene, Phantom]] = []
+    made: dict[tuple[int, str], Phantom] = {}
     built: list[Phantom] = []
     for scene in scenes:
-        alike = [(other, phantom) for other, phantom in zip(scenes, built, strict=False) if _same_body(other, scene)]
-        # the very same phantom rather than one with its metal renamed
-        alike.sort(key=lambda pair: pair[0].phantom.metal != scene.phantom.metal)
-        phantom = _with_metal(alike[0][1], alike[0][0], scene) if alike else None
-        built.append(build(scene) if phantom is None else phantom)
+        body = next((phantom for other, phantom in bodies if _same_body(other, scene)), None)
+        if body is None:
+            body = build(msgspec.structs.replace(scene, phantom=_without_metal(scene)))
+            bodies.append((scene, body))
+        key = id(body), scene.phantom.metal
+        if key not in made:
+            made[key] = _with_metal(body, scene.phantom.metal) or build(scene)
+        built.append(made[key])
     return built
 
 
 def _same_body(a: Scene, b: Scene) -> bool:
-    """Say whether the phantoms of two scenes are the same but for the name of the recipe's metal."""
+    """Say whether the phantoms of two scenes are the same but for the recipe's metal."""
     if (_without_metal(a), a.seed, a.metal_in_view) != (_without_metal(b), b.seed, b.metal_in_view):
         return False
     return not a.metal_in_view or a.resolve().geometry == b.resolve().geometry
 
 
-def _with_metal(phantom: Phantom, like: Scene, scene: Scene) -> Phantom | None:
-    """Give a phantom the metal of another scene; None where a name stands for more than the recipe's metal."""
-    old, new = like.phantom.metal, scene.phantom.metal
-    if old == new:
-        return phantom
-    others = (value for name, value in msgspec.structs.asdict(scene.phantom).items() if name != "metal")
-    if old in others or new in phantom.materials:
-        return None
-    materials = tuple(new if m == old else m for m in phantom.materials)
-    solids = tuple(replace(s, material=new) if s.material == old else s for s in phantom.solids)
-    return replace(phantom, materials=materials, solids=solids)
+def _with_metal(body: Phantom, metal: str) -> Phantom | None:
+    """Put a metal where a body holds the stand-in; None where the body has this material already."""
+    if STAND_IN not in body.materials:
+        return body
+    if metal in body.materials:
+        return body if metal == STAND_IN else None
+    materials = tuple(metal if m == STAND_IN else m for m in body.materials)
+    solids = tuple(replace(s, material=metal) if s.material == STAND_IN else s for s in body.solids)
+    return replace(body, materials=materials, solids=solids)

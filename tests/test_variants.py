@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ctsim.phantoms import dataset
+from ctsim.phantoms.body_teeth import Teeth
 from ctsim.phantoms.body_volume import CtVolume
 from ctsim.phantoms.dataset import make_scene, make_scenes
 from ctsim.phantoms.recipes import BUILDERS
@@ -132,13 +133,36 @@ DRAWN = [kind for kind in BUILDERS if kind is not CtVolume]
 @pytest.mark.parametrize("seed", [1, 2])
 def test_metal_of_another_name_is_all_that_another_metal_changes(kind, seed):
     """For every recipe, among them those with a second metal of the same name."""
-    names = ["Fe", "Ti", "CoCr", "Au", "Fe"]
+    names = ["Au", "Fe", "Ti", "CoCr", "amalgam", "water", "soft_tissue", "Fe"]
     made = [Scene(name=f"s{k}", seed=seed, phantom=kind(metal=m, n_voxel=(20, 20, 20))) for k, m in enumerate(names)]
     for scene, phantom in zip(made, build_all(made), strict=True):
         alone = build(scene)
         assert phantom.materials == alone.materials and phantom.solids == alone.solids
         assert np.array_equal(phantom.labels, alone.labels)
         assert (phantom.d_voxel, phantom.off_origin) == (alone.d_voxel, alone.off_origin)
+
+
+def test_restorations_of_another_metal_keep_theirs():
+    """Gold crowns stay gold where the recipe's metal, once gold too, is another one."""
+    made = [
+        Scene(name=m, seed=3, phantom=Teeth(metal=m, n_voxel=(20, 20, 20), gold_crowns=1)) for m in ("Au", "Ti", "Fe")
+    ]
+    for order in (made, made[::-1]):
+        for scene, phantom in zip(order, build_all(order), strict=True):
+            alone = build(scene)
+            assert (phantom.materials, phantom.solids) == (alone.materials, alone.solids)
+            assert "Au" in alone.materials
+
+
+def test_scanners_that_may_not_be_mixed_are_made_one_after_another(tmp_path):
+    told = msgspec.to_builtins(scenes(truth=Truth())[0])
+    parts = ({"tube": {"heel": True}}, {"noise": {"model": "tigre"}})
+    both = [
+        msgspec.convert(told | {"name": f"s{k}", "scanner": told["scanner"] | part}, Scene)
+        for k, part in enumerate(parts)
+    ]
+    make_scenes(both, tmp_path)
+    assert [len(family) for family in families(both)] == [1, 1]
 
 
 def test_families_are_neighbours_of_one_body():

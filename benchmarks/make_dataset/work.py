@@ -166,14 +166,13 @@ def _make_here(scenes: list[Scene], out: Path, force: bool) -> None:
     titles = {scene.name: f"{number}/{len(scenes)} {scene.name}" for number, scene in enumerate(scenes, 1)}
     with Bar(sum(views.values()), "view") as bar:
         for family in families(scenes):
-            done = bar.done
+            done = bar.done + sum(views[scene.name] for scene in family)
             there = [s for s in family if not force and is_complete(out, s.name, scene_id(s))]
             for scene in there:
                 say(f"{scene.name}: already complete")
             if todo := [scene for scene in family if scene not in there]:
                 make_scenes(todo, out, force=force, watch=functools.partial(_watch, bar, titles), tell=_note)
             for scene in family:
-                done += views[scene.name]
                 bar.at(done, titles[scene.name])
 
 
@@ -212,7 +211,8 @@ def _make_apart(jobs: list[SceneJob], pool: Jobs) -> None:
                 left.difference_update(names)
                 ended = f"{len(views) - len(left)}/{len(views)} {', '.join(names)}"
             noted = {name: progress.views for name, progress in unfinished(jobs[0].out).items()}
-            bar.at(sum(noted.get(name, 0) if name in left else n for name, n in views.items()), ended)
+            done = sum(noted.get(name, 0) if name in left else n for name, n in views.items())
+            bar.at(max(done, bar.done), ended)  # a scene in its place is noted no more, and its job still runs
 
 
 def do(job: SceneJob) -> tuple[tuple[str, str], ...]:
