@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from run_records import append, make_record
 
+import ctsim
 from ctsim import reports
 from ctsim.benchmarks import cli, make_dataset
 from ctsim.benchmarks.engine import host
@@ -28,6 +29,8 @@ from ctsim.benchmarks.studies.methods import study as cli_run
 from ctsim.benchmarks.studies.methods import tables
 from ctsim.benchmarks.studies.methods.volumes import at_50kev_of, write_volume
 from ctsim.benchmarks.studies.stress import study as stress
+from ctsim.dataset.manifest import read_index
+from ctsim.dataset.store import open_scan
 from ctsim.errors import InputError
 from ctsim.reports import figures, kept, report, show, slices, view
 
@@ -527,3 +530,36 @@ def test_the_stability_notebook_shows_what_the_stress_suite_recorded(smallest, t
     said = notebook("stability", smallest, tmp_path, tmp_path)
     assert "1 of 2 rows are as expected" in said and "- starved, nmar: 3 values are not finite" in said
     assert "older" not in said and (tmp_path / "stability-stress.png").exists()
+
+
+def cells(said):
+    """Rows of the Markdown tables in a text: first cell -> the other cells of every such row."""
+    found = {}
+    for line in re.findall(r"^\| (.+) \|$", said, re.M):
+        first, *others = line.split(" | ")
+        found.setdefault(first, []).append(others)
+    return found
+
+
+def test_the_training_notebook_makes_data_trains_and_scores(tmp_path, monkeypatch):
+    folder = tmp_path / "training"
+    monkeypatch.setenv("CTSIM_TRAINING", str(folder))
+    monkeypatch.setenv("CTSIM_TRAINING_SIZE", "tiny")
+    found = cells(notebook("train", tmp_path, tmp_path, tmp_path))
+    names = ("train", "val", "test")
+    assert {path.name for path in (folder / "shards").iterdir()} == {f"{name}-00000.h5" for name in names}
+    assert {path.stem for path in tmp_path.glob("train-*.png")} == {"train-loss", "train-slices"}
+    index = read_index(folder / "data")
+    assert all(found[name][0][1] == found[name][0][0] for name in names)  # one scan an individual
+    assert sum(int(found[name][0][0]) for name in names) <= len(index) == 12
+    for network in ("U-Net on LIMAR", "U-Net without LIMAR", "denoiser"):
+        assert float(found[network][0][1]) > float(found[network][0][2])  # the loss falls
+    stored = [open_scan(folder / "data" / name) for name, line in index.items() if line.about.split == "test"]
+    scored = [s for s in stored if s.metal.any()]
+    assert int(found["test"][0][0]) == len(scored) > 1
+    for method in ("fdk", "limar"):
+        one = [ctsim.score_volume(ctsim.reconstruct_scan(s, method), s, protocols="tissue") for s in scored]
+        psnr = np.mean([score["tissue"].values["psnr3d"] for score in one])
+        assert float(found[method.upper()][0][1].split()[0]) == pytest.approx(psnr, abs=0.0051)  # two decimals
+    assert found["FDK"][0][-1] == found["LIMAR"][0][-1]  # without metal LIMAR is FDK
+    assert len(found["U-Net on LIMAR over LIMAR"][0]) == 4
