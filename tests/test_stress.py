@@ -11,7 +11,7 @@ import pytest
 import torch
 from stress_ends import ENDS, Ends, Threads, catalogue
 
-from ctsim import plan
+from ctsim import look
 from ctsim.baselines.known_spectrum import Beam
 from ctsim.beam.quadrature import gauss_rule
 from ctsim.beam.spectrum import Tube
@@ -114,7 +114,7 @@ def test_without_a_floor_under_the_counts_the_dark_scan_is_reported(monkeypatch)
 
 
 def test_without_as_many_energies_as_it_takes_the_scan_is_reported(monkeypatch):
-    monkeypatch.setattr(plan, "energy_rule", lambda spectrum, detector, *_: gauss_rule(spectrum, detector, 2))
+    monkeypatch.setattr(look, "energy_rule", lambda spectrum, detector, *_: gauss_rule(spectrum, detector, 2))
     (wrong,) = judged(ROWS["k-edge", "simulator"]).wrong
     assert "|ΔP|" in wrong and "limit" in wrong
 
