@@ -83,7 +83,7 @@ def _in_box(solids: Phantom, geometry: Geometry, points: NDArray[np.float64]) ->
 def _in_view(tracer: Tracer, geometry: Geometry, view: int, response: Response, subrays: int) -> bool:
     """Measure a view's pixels in the metal's shadow with it and without."""
     shape = geometry.n_detector
-    spans = row_spans(tracer.shadows(geometry.pose(view), shape)[:, tracer.metal], shape[1])
+    spans = row_spans(tracer.shadows(geometry, view)[:, tracer.metal], shape[1])
     if not spans.any():
         return False
     nothing = np.zeros((len(tracer.materials), *shape), np.float32)

@@ -158,7 +158,7 @@ class Signals:
             return scan, self._transmit(self.bare, geometry, k), None
         # only pixels in the metal's shadow can differ
         shape = geometry.n_detector
-        spans = row_spans(self.tracer.shadows(geometry.pose(k), shape)[:, self.tracer.metal], shape[1])
+        spans = row_spans(self.tracer.shadows(geometry, k)[:, self.tracer.metal], shape[1])
         return scan, self._transmit(self.bare, geometry, k, (scan[0].copy(), scan[1].copy(), spans)), spans
 
     def _transmit(

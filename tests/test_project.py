@@ -254,7 +254,7 @@ def test_intensities_equal_the_reference(tolerance, views):
         pose, background = g.pose_array()[view], tracer.background(g, view)
         background[-1] += extra
         arguments = (
-            tracer.bricks[:5], project._solids(tracer, pose, shape), pose, work_order(1), everywhere,
+            tracer.bricks[:5], tracer.solids(g, view), pose, work_order(1), everywhere,
             background, (r.mu, r.w1, r.w2),
             (r.edge_mu, project.EDGE_THRESHOLD, project.STEP_THRESHOLD, 21, tolerance), True,
         )  # fmt: skip

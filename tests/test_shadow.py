@@ -38,7 +38,7 @@ def test_no_ray_that_meets_a_primitive_lies_outside_its_shadow(kind):
     met = np.zeros((n_v, len(prims), n_u), bool)
     for view in range(GEOMETRY.n_views):
         pose = GEOMETRY.pose(view)
-        cast = shadow.cast(pose, GEOMETRY.n_detector, shadow.primitive_corners(prims))
+        cast = shadow.cast(pose[None], GEOMETRY.n_detector, shadow.primitive_corners(prims))[0]
         source, centre, e_u, e_v = pose.reshape(4, 3)
         step = 7 if kind == TORUS else 1  # its reference solves a quartic a ray
         # pixel centres and corners, since both are asked for
@@ -57,7 +57,7 @@ def test_the_shadow_of_a_slanted_rod_is_a_narrow_band():
     rod = Primitive(kind=FRUSTUM, centre=(0.0, 0.0, 0.0), params=(11.0, 0.5, 0.5), axis=(0.3, 1.0, 0.8))
     prims = pack([Solid(name="s", material="Fe", primitives=(rod,), metal=True)], ("air", "Fe"))
     fine = msgspec.structs.replace(GEOMETRY, n_detector=(310, 470), d_detector=(0.19, 0.14))
-    cast = shadow.cast(fine.pose(0), fine.n_detector, shadow.primitive_corners(prims))
+    cast = shadow.cast(fine.pose(0)[None], fine.n_detector, shadow.primitive_corners(prims))[0]
     width = np.maximum(cast[..., 1] - cast[..., 0] + 1, 0)
     rows = (width > 0).sum()
     box = rows * (cast[..., 1].max() - cast[..., 0][width > 0].min())
@@ -68,7 +68,7 @@ def test_parts_beside_the_detector_and_behind_the_source():
     aside = shadow.box_corners(np.array([-5.0, 500.0, -5.0]), np.array([5.0, 510.0, 5.0]))
     around = shadow.box_corners(np.full(3, -200.0), np.full(3, 200.0))
     front = msgspec.structs.replace(GEOMETRY, start_deg=0.0)
-    cast = shadow.cast(front.pose(0), GEOMETRY.n_detector, np.concatenate([aside, around]))
+    cast = shadow.cast(front.pose(0)[None], GEOMETRY.n_detector, np.concatenate([aside, around]))[0]
     assert np.all(cast[:, 0, 0] > cast[:, 0, 1])
     assert np.array_equal(cast[:, 1:], shadow.everywhere(GEOMETRY.n_detector, 1))
     assert np.array_equal(shadow.row_spans(cast, 47), np.tile([0, 47], (31, 1)))

@@ -6,8 +6,9 @@ Only pixels inside the shadow of the object are measured, primitives are tested 
 lies, and sub-rays are cast only where the solids' optical thickness changes within a pixel.
 """
 
+import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,27 @@ from ctsim.types import Phantom
 # ray by R²/24 in P, so R = 0.1 costs 4e-4, below the photon noise of 1e6 photons; at a kink it is R/4. Where a solid
 # begins within the pixel the mean can differ by R/2.
 EDGE_THRESHOLD, STEP_THRESHOLD = 0.1, 0.004
+CAST = 1024  # rows of detectors whose shadows are cast at once: of all views of a small one
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Shadows:
+    """Where parts of a phantom are seen in some views of a geometry, `first` and those after it.
+
+    `fat` [view, primitive, …] are the primitives as `shadow.inflate` has them, `parts` [view, v, primitive, 2] and
+    `body` [view, v, 2] the columns in which they and the label volume are seen.
+    """
+
+    geometry: Geometry
+    first: int
+    poses: NDArray[np.float64]
+    fat: NDArray[np.float64]
+    parts: NDArray[np.int64]
+    body: NDArray[np.int64]
+
+    def holds(self, geometry: Geometry, view: int) -> bool:
+        """Say whether a view is among them."""
+        return self.geometry is geometry and 0 <= view - self.first < len(self.poses)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,6 +62,8 @@ class Tracer:
     materials: tuple[str, ...]
     metal: NDArray[np.bool_]
     skip: bool = True
+    cast: list[_Shadows] = field(init=False, default_factory=list, compare=False, repr=False)
+    """The shadows that were cast last."""
 
     @staticmethod
     def of(
@@ -71,7 +95,7 @@ class Tracer:
 
         It is written to `out` if given. Material 0 is air and is left as it is, 0 in a new array.
         """
-        shape, pose = geometry.n_detector, geometry.pose(view)
+        shape, pose = geometry.n_detector, self.pose(geometry, view)
         if out is None:
             out = np.zeros((len(self.materials), *shape), np.float32)
         # a single row shares no footprint with others, and bricks of one label are crossed in one step
@@ -81,17 +105,55 @@ class Tracer:
             fill = columns_cpu.fill_view if isinstance(self.columns, Columns) else density_cpu.fill_view
             fill(tuple(self.columns), self.bricks.grid, pose, order, out)
         else:
-            low, high = self.bricks.box[:3], self.bricks.box[3:]
-            seen = shadow.cast(pose, shape, shadow.box_corners(low, high)[: int(low[0] <= high[0])])
-            spans = shadow.row_spans(seen if self.skip else shadow.everywhere(shape, 1), shape[1])
-            bricks_cpu.fill_view(self.bricks[:5], pose, work_order(shape[0]), spans, out)
+            seen = self._seen(geometry, view)
+            bricks_cpu.fill_view(self.bricks[:5], pose, work_order(shape[0]), seen.body[view - seen.first], out)
         return out
 
-    def shadows(self, pose: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.int64]:
-        """Columns (from, to) of each row in which each primitive is seen, as `ctsim.tracer.shadow.cast` has them."""
-        if not self.skip:
-            return shadow.everywhere(shape, len(self.prims))
-        return shadow.cast(pose, shape, shadow.primitive_corners(self.prims))
+    def shadows(self, geometry: Geometry, view: int) -> NDArray[np.int64]:
+        """Columns (from, to) of each row in which each primitive is seen, as `shadow.cast` has them: [v, primitive, 2].
+
+        Without `skip` that is everywhere.
+        """
+        seen = self._seen(geometry, view)
+        return seen.parts[view - seen.first]
+
+    def pose(self, geometry: Geometry, view: int) -> NDArray[np.float64]:
+        """Return what `geometry.pose` does, [12]."""
+        seen = self._seen(geometry, view)
+        return seen.poses[view - seen.first]
+
+    def solids(self, geometry: Geometry, view: int) -> tuple[NDArray, NDArray, NDArray]:
+        """Return the primitives, their inflated twins and their `shadows` in a view, as the kernels want them."""
+        seen = self._seen(geometry, view)
+        return self.prims, seen.fat[view - seen.first], seen.parts[view - seen.first]
+
+    def _seen(self, geometry: Geometry, view: int) -> _Shadows:
+        """Return the shadows of some views, this one among them; those of the views that follow serve later."""
+        for seen in self.cast:
+            if seen.holds(geometry, view):
+                return seen
+        shape = geometry.n_detector
+        step = max(1, CAST // max(shape[0], len(self.prims)))
+        first = view - view % step
+        poses = geometry.pose_array()[first : first + step]
+        low, high = self.bricks.box[:3], self.bricks.box[3:]
+        box = shadow.box_corners(low, high)[: int(low[0] <= high[0])]
+
+        def cast(corners: NDArray[np.float64]) -> NDArray[np.int64]:
+            if self.skip:
+                return shadow.cast(poses, shape, corners)
+            return np.tile(shadow.everywhere(shape, len(corners)), (len(poses), 1, 1, 1))
+
+        seen = _Shadows(
+            geometry=geometry,
+            first=first,
+            poses=poses,
+            fat=shadow.inflate(self.prims, poses),
+            parts=cast(shadow.primitive_corners(self.prims)),
+            body=shadow.row_spans(cast(box), shape[1]),
+        )
+        self.cast[:] = [seen]
+        return seen
 
 
 def _upright(pose: NDArray[np.float64]) -> bool:
@@ -101,6 +163,7 @@ def _upright(pose: NDArray[np.float64]) -> bool:
     return bool(e_v[2] > 0 and max(slant) < 1e-14)
 
 
+@functools.lru_cache(16)
 def work_order(n_rows: int) -> NDArray[np.int64]:
     """Order the rows so that every contiguous share of them holds rows from all over the detector."""
     return np.argsort(np.arange(n_rows) * 0.6180339887498949 % 1.0, kind="stable")
@@ -204,7 +267,7 @@ def transmit_all(
 
     Each variant gets, to the last bit, what `transmit` gives it.
     """
-    shape, pose = geometry.n_detector, geometry.pose(view)
+    shape, pose = geometry.n_detector, tracer.pose(geometry, view)
     if out is None:
         images = len(responses.nodes), *shape
         m1, m2 = np.empty(images, np.float32), np.empty(images, np.float32)
@@ -214,7 +277,7 @@ def transmit_all(
     most = subrays if len(tracer.prims) else 1
     raytrace_cpu.transmit_variants(
         tracer.bricks[:5],
-        _solids(tracer, pose, shape),
+        tracer.solids(geometry, view),
         pose,
         work_order(-(-shape[0] // raytrace_cpu.STRIP)),
         spans,
@@ -239,12 +302,8 @@ def path_lengths(
         background = tracer.background(geometry, view)
     if len(tracer.prims) == 0:
         return background.copy()
-    shape, pose = geometry.n_detector, geometry.pose(view)
+    shape, pose = geometry.n_detector, tracer.pose(geometry, view)
     lengths = np.zeros_like(background)
-    solids = _solids(tracer, pose, shape)
+    solids = tracer.solids(geometry, view)
     raytrace_cpu.replace_view(tracer.bricks[:5], solids, pose, work_order(shape[0]), background, lengths)
     return lengths
-
-
-def _solids(tracer: Tracer, pose: NDArray[np.float64], shape: tuple[int, int]) -> tuple[NDArray, NDArray, NDArray]:
-    return tracer.prims, shadow.inflate(tracer.prims, pose), tracer.shadows(pose, shape)

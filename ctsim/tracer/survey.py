@@ -65,7 +65,7 @@ def trial(tracer: Tracer, geometry: Geometry, response: Response, *, settings: S
     """Measure one view, and its metal-free twin if there is to be one, as the simulator does."""
     view, shape = geometry.n_views // 2, geometry.n_detector
     rays = {"subrays": settings.subrays, "edge_tolerance": settings.edge_tolerance}
-    spans = row_spans(tracer.shadows(geometry.pose(view), shape)[:, tracer.metal], shape[1])
+    spans = row_spans(tracer.shadows(geometry, view)[:, tracer.metal], shape[1])
     background, m1, seconds = tracer.background(geometry, view), np.empty(0), 0.0
     for _ in range(2):  # the first call compiles
         start = time.perf_counter()

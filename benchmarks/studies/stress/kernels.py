@@ -158,7 +158,7 @@ def raytrace_in_float64(side: int, found: Findings) -> None:
     plan = make_plan(phantom, scanner, Simulation(), Truth(), "stress")
     tracer = Tracer.of(phantom)
     rule, background = Response.of(plan.rule, tracer.materials), tracer.background(where, 0)
-    solids = (tracer.prims, inflate(tracer.prims, pose), everywhere(shape, len(tracer.prims)))
+    solids = (tracer.prims, inflate(tracer.prims, pose[None])[0], everywhere(shape, len(tracer.prims)))
     spans, order = np.tile(np.array([0, shape[1]]), (shape[0], 1)), work_order(-(-shape[0] // raytrace_cpu.STRIP))
     edge = (rule.edge_mu, EDGE_THRESHOLD, STEP_THRESHOLD, plan.settings.subrays, plan.settings.edge_tolerance)
     logs = []
