@@ -1,6 +1,5 @@
 """Scenes that differ in metal, beam, noise and dose alone: one body is built for them, and its rays are traced once."""
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -18,11 +17,16 @@ STAND_IN = "Re"
 
 
 def families(scenes: Sequence[Scene], most: int = MOST) -> Iterator[tuple[Scene, ...]]:
-    """Divide scenes into runs, of at most `most`, that seem to differ in metal, beam, noise and dose alone."""
-    for _, group in itertools.groupby(scenes, _shared):
-        alike = tuple(group)
-        size = max(1, min(most, FILES // _stacks(alike[0])))
-        yield from (alike[k : k + size] for k in range(0, len(alike), size))
+    """Divide scenes into groups, of at most `most`, that seem to differ in metal, beam, noise and dose alone.
+
+    Groups come in the order of their first scenes.
+    """
+    groups: dict[bytes, list[Scene]] = {}
+    for scene in scenes:
+        groups.setdefault(msgspec.json.encode(_shared(scene)), []).append(scene)
+    for group in groups.values():
+        size = max(1, min(most, FILES // _stacks(group[0])))
+        yield from (tuple(group[k : k + size]) for k in range(0, len(group), size))
 
 
 def _stacks(scene: Scene) -> int:

@@ -165,8 +165,12 @@ def test_scanners_that_may_not_be_mixed_are_made_one_after_another(tmp_path):
     assert [len(family) for family in families(both)] == [1, 1]
 
 
-def test_families_are_neighbours_of_one_body():
+@pytest.mark.parametrize("order", ["one body after the other", "in turn"])
+def test_families_are_of_one_body(order):
     two = scenes() + tuple(msgspec.structs.replace(s, name=f"x{s.name}", seed=9) for s in scenes())
+    if order == "in turn":
+        mixed = [s for pair in zip(two[:5], two[5:], strict=True) for s in pair]
+        assert list(families(mixed)) == list(families(two))
     assert [[s.name for s in f] for f in families(two)] == [[s.name for s in two[:5]], [s.name for s in two[5:]]]
     assert [len(f) for f in families(two, 2)] == [2, 2, 1, 2, 2, 1]
 
