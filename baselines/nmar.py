@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ctsim.baselines.inpaint import Filled, fill
 from ctsim.baselines.limar import Bridging, finished, mended, uncorrected
 from ctsim.baselines.metal import Trace, find_metal, reinsert
-from ctsim.baselines.prior import NO_BODY, Prior, choose_prior
+from ctsim.baselines.prior import NO_BODY, choose_prior, fitted_prior
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.filters import Filter
 from ctsim.reconstruct.primary import primary
@@ -28,6 +28,10 @@ from ctsim.types import Scan, Status, Volume
 Normalisation = Annotated[
     Literal["offset", "additive", "ratio"],
     about("how the prior's projections flatten the measured ones before bridging"),
+]
+Prior = Annotated[
+    Literal["auto", "fdk", "limar", "splat"],
+    about("volume that the prior is made from; auto: limar if it fits the projections better, else fdk"),
 ]
 Floor = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 
@@ -71,7 +75,8 @@ class Settings(Bridging, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Those of `ctsim.baselines.limar.Bridging`; `normalisation` and `floor` as in `Normalise`; and which prior.
 
     With `prior` "auto" it is LIMAR's where its projections fit the measured ones better by a twentieth around the
-    trace (`ctsim.baselines.prior.choose_prior`).
+    trace (`ctsim.baselines.prior.choose_prior`), else FDK's. "splat" is the volume of splats by their defaults, with
+    water for metal (`ctsim.baselines.prior.fitted_prior`).
     """
 
     prior: Prior = "auto"
@@ -95,7 +100,10 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     if first.status is not Status.OK or not metal.found:
         return uncorrected(first, metal)
     trace = Trace(metal, scan, settings.dilation)
-    choice = choose_prior(trace, metal, first.values, settings, settings.prior, settings.interpolation)
+    if settings.prior == "splat":
+        choice = fitted_prior(trace, metal, scan, settings.prior)
+    else:
+        choice = choose_prior(trace, metal, first.values, settings, settings.prior, settings.interpolation)
     if choice is None:
         return uncorrected(first, metal, NO_BODY)
     rule = Normalise(kind=settings.normalisation, floor=settings.floor)
@@ -105,7 +113,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     details: dict[str, object] = {"dilation": settings.dilation, "largest_prior": choice.largest}
     shown = filled.intermediates(trace.view(filled.shown))
     details["intermediates"] = shown | {"prior": choice.columns.transpose(2, 0, 1)}
-    details |= {"view_updates": (2 + choice.view_updates) * scan.geometry.n_views}
+    details |= {"view_updates": (2 + choice.view_updates) * scan.geometry.n_views + choice.fitted}
     return finished(values, first, metal, details | choice.details() | filled.details())
 
 

@@ -17,6 +17,8 @@ from ctsim.baselines.morphology import dilate, opened, spread
 from ctsim.reconstruct.filters import Filter
 from ctsim.reconstruct.projector import forward_columns
 from ctsim.reconstruct.settings import about, names_of
+from ctsim.reconstruct.splat.fast import reconstruct as splat
+from ctsim.types import Scan, Status
 
 AIR, LUNG, BONE = 0.5, 0.15, 1.5  # bounds of the classes in multiples of water
 LUNG_SHARE = 0.03  # of the body; with less there is no lung class
@@ -38,6 +40,7 @@ class Choice:
     """The prior chosen, `columns` [y, x, z], and its name; `largest` is its greatest projection in some views.
 
     `misfit` holds by prior the standard deviation of P − q on the ring around the trace, 0 where nothing was seen.
+    `fitted` is how often views were used to fit it.
     """
 
     name: str
@@ -45,6 +48,7 @@ class Choice:
     misfit: dict[str, float]
     largest: float
     water: float
+    fitted: int = 0
 
     def details(self) -> dict[str, object]:
         """Return what a result says of its prior."""
@@ -78,6 +82,25 @@ def choose_prior(
     name = better(misfit) if prior == "auto" else prior
     columns, largest = found[name]
     return Choice(name=name, columns=columns, misfit=misfit, largest=largest, water=water)
+
+
+def fitted_prior(trace: Trace, metal: Metal, scan: Scan, name: str) -> Choice | None:
+    """Return the volume of splats, with water in place of the metal and of what lies next to it; None where all is air.
+
+    No tissue classes are made of it. Lee et al., Med. Phys. 52, 2025, doi:10.1002/mp.17859, take a neural field's
+    volume so.
+    """
+    volume = splat(scan)
+    values, inside = volume.values.numpy().copy(), dilate(metal.mask, SKIN, corners=True)
+    values[inside] = 0
+    water = water_value(values) if volume.status is not Status.ERROR else 0.0
+    if water <= 0:
+        return None
+    values[inside] = water
+    columns = np.ascontiguousarray(np.maximum(values, 0).transpose(1, 2, 0))
+    misfit, largest = _misfit(trace, columns)
+    updates = int(volume.details["view_updates"])
+    return Choice(name=name, columns=columns, misfit={name: misfit}, largest=largest, water=water, fitted=updates)
 
 
 def better(misfit: dict[str, float]) -> str:

@@ -39,6 +39,7 @@ RUNS_PROGRAM = "ctsim.benchmarks.program"
 COUNTS_ONLY, METAL_MASK, SPECTRUM = "counts only", "metal mask", "spectrum"
 ASSUMED = "assumed spectrum"
 """Told no spectrum, but built on the tube, filter and scintillator that the simulator has by default."""
+MASK_ASSUMED = "metal mask, assumed spectrum"
 CONTROL, TWIN = "control", "control, told the twin"
 CONTROLS = (CONTROL, TWIN)
 """The classes of rows that are no methods: tables show them and never rank them."""
@@ -68,6 +69,8 @@ TABLE: dict[str, tuple[str, str]] = {
 """name -> ("module:function", what it needs in addition to the counts)."""
 ASKED = {"known": SPECTRUM, "tube": ASSUMED}
 """A splat's `response` -> what it needs then."""
+FITTED = ("splat",)
+"""Values of a `prior` that is built on the spectrum that splats assume."""
 GONE = {("splat", "preset"): "presets are methods of their own; expected --method splat-paper or --method splat-r2"}
 """(method, removed parameter) -> what to do instead."""
 WIDEST = 24  # characters; a longer default is not aligned with the others
@@ -161,8 +164,11 @@ def find(name: str, overrides: dict[str, Any] | None = None) -> Method:
     function = resolve(target)
     module = sys.modules[function.__module__]
     params, changed = _settings(name, function, overrides or {})
+    fitted = params.get("prior") in FITTED
     if inputs == METAL_MASK and params["mask"] == "auto":
-        inputs = COUNTS_ONLY  # it finds the metal itself
+        inputs = ASSUMED if fitted else COUNTS_ONLY  # it finds the metal itself
+    elif inputs == METAL_MASK and fitted:
+        inputs = MASK_ASSUMED
     if inputs in (COUNTS_ONLY, ASSUMED) and (response := params.get("response")) in ASKED:
         inputs = ASKED[response]
     return Method(
