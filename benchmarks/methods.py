@@ -67,6 +67,11 @@ TABLE: dict[str, tuple[str, str]] = {
     "splat-r2": ("ctsim.reconstruct.splat.published:r2", COUNTS_ONLY),
 }
 """name -> ("module:function", what it needs in addition to the counts)."""
+EXTERNAL = {
+    "mbir": "ctsim.baselines.external:mbir",
+    "mbir-mar": "ctsim.baselines.external:mbir_mar",
+}
+"""name -> "module:function" of methods that run another package, which `ctsim[peers-methods]` installs."""
 ASKED = {"known": SPECTRUM, "tube": ASSUMED}
 """A splat's `response` -> what it needs then."""
 FITTED = ("splat",)
@@ -155,10 +160,10 @@ def find(name: str, overrides: dict[str, Any] | None = None) -> Method:
         return _program(name, overrides or {})
     if name in TABLE:
         target, inputs = TABLE[name]
-    elif ":" in name:
-        target, inputs = name, ""
+    elif ":" in name or name in EXTERNAL:
+        target, inputs = EXTERNAL.get(name, name), ""
     else:
-        near = difflib.get_close_matches(name, TABLE, n=3)
+        near = difflib.get_close_matches(name, [*TABLE, *EXTERNAL], n=3)
         hint = f"did you mean {' or '.join(near)}?" if near else f"expected {', '.join(TABLE)} or module:function"
         raise InputError(f"there is no method {name!r}: {hint}")
     function = resolve(target)
@@ -346,7 +351,7 @@ class Flags:
 def main(arguments: list[str]) -> int:
     """Print the list; return 0."""
     given = tyro.cli(Flags, prog="run-benchmark methods", args=arguments)
-    sys.stdout.write("\n".join(described(name) for name in given.method or TABLE))
+    sys.stdout.write("\n".join(described(name) for name in given.method or [*TABLE, *EXTERNAL]))
     return 0
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ctsim.benchmarks.engine.process import check_limit
 from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.study import record_of
-from ctsim.benchmarks.methods import TABLE, Method
+from ctsim.benchmarks.methods import EXTERNAL, TABLE, Method
 from ctsim.benchmarks.scores import placement
 from ctsim.benchmarks.scores.artefact import effective_attenuation
 from ctsim.benchmarks.scores.protocol import truth_of
@@ -69,7 +69,7 @@ def submit(given: Flags) -> list[RunRecord]:
 def _check(given: Flags) -> None:
     if not NAME.fullmatch(given.name):
         raise InputError(f"--name {given.name!r}: expected up to 60 letters, digits, spaces and _.+-")
-    if given.name in TABLE:
+    if given.name in TABLE or given.name in EXTERNAL:
         raise InputError(f"--name {given.name}: is a method of ctsim, expected another name")
     if not given.inputs.strip():
         raise InputError("--inputs is empty, expected a text such as 'counts only' or 'metal mask'")

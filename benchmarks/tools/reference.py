@@ -24,7 +24,7 @@ import tyro
 
 import ctsim
 from ctsim.benchmarks.cli import OF_DATASETS, OTHERS, guarded
-from ctsim.benchmarks.methods import TABLE, find, parameters, resolve
+from ctsim.benchmarks.methods import EXTERNAL, TABLE, find, parameters, resolve
 from ctsim.benchmarks.suites import bundled, load
 from ctsim.errors import InputError
 from ctsim.materials import _TABLE as MATERIALS
@@ -69,10 +69,11 @@ PLAIN = {str: "text", float: "number", int: "integer", bool: "true or false", ty
 def pages() -> dict[str, str]:
     """Return the text of every generated page by its file name."""
     first = [_method_row(name, target, inputs) for name, (target, inputs) in TABLE.items()]
+    first += [_method_row(name, target, find(name).inputs) for name, target in EXTERNAL.items()]
     parts = {
         "commands.md": [COMMANDS, *(command(name, form) for name, form in forms().items())],
         "scene-keys.md": [SCENE_KEYS, *_scene_tables(), _presets(), _materials()],
-        "methods.md": [METHODS, table(("method", "inputs", "what it does"), first), *map(method, TABLE)],
+        "methods.md": [METHODS, table(("method", "inputs", "what it does"), first), *map(method, [*TABLE, *EXTERNAL])],
         "python.md": [PYTHON, *map(public, ctsim._MODULES)],
         "suites.md": [SUITES, *map(suite, sorted(bundled()))],
     }
