@@ -65,6 +65,9 @@ TABLE: dict[str, tuple[str, str]] = {
     "splat": ("ctsim.reconstruct.splat.fast:reconstruct", ASSUMED),
     "splat-paper": ("ctsim.reconstruct.splat.published:paper", COUNTS_ONLY),
     "splat-r2": ("ctsim.reconstruct.splat.published:r2", COUNTS_ONLY),
+    "naf": ("ctsim.reconstruct.field.methods:naf", COUNTS_ONLY),
+    "park": ("ctsim.reconstruct.field.methods:park", COUNTS_ONLY),
+    "field": ("ctsim.reconstruct.field.methods:field", ASSUMED),
 }
 """name -> ("module:function", what it needs in addition to the counts)."""
 EXTERNAL = {

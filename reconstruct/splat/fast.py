@@ -105,7 +105,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     weights = weights_and_bounds(scan, p.numpy(), valid, scatter, below.noise)
     data = Data(geometry=finest, p=p.numpy(), weights=weights, scatter=scatter.mean)
     levels = levels_of(data, coarse=(settings.passes or PASSES)[0] > 0)
-    filtration = None if clamped.all() else _filtration(levels, scan, settings)
+    filtration = None if clamped.all() else find_filtration(levels, scan, settings)
     response = settings.make_response(scan.e_max, filtration.value if filtration else settings.filtration or USUAL)
 
     fit = None if clamped.all() else _fitted(_course(levels, response, settings), scan, settings, stopwatch)
@@ -147,7 +147,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     )
 
 
-def _filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtration | None:
+def find_filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtration | None:
     """Find the filtration by coarse fits; None where it is given, the beam is known, or the finest grid too coarse.
 
     Edges that no grid holds are then the misfit: on 18 voxels 12 mm of aluminium are found where 0.5 are right.
@@ -285,17 +285,22 @@ def _summed(weights: tuple[float, float], rho: Image) -> Image:
 
 def _course(levels: list[Data], response: Response, settings: Settings, again: bool = True) -> Course:
     data = levels[-1]
-    met = max(OPEN / math.sqrt(_open_photons(data)), LEAST_OPEN)
+    met = least_met(data)
     return Course(
         levels=levels,
         passes=passes_over(levels, settings.passes),
         response=response,
-        curve=MaterialCurve.of(response, _rough_length(data, response, met)),
+        curve=MaterialCurve.of(response, rough_length(data, response, met)),
         met=met,
         tv=settings.tv,
         exact=settings.exact,
         again=again,
     )
+
+
+def least_met(data: Data) -> float:
+    """Return how far p of a ray that met something lies above that of open ones."""
+    return max(OPEN / math.sqrt(_open_photons(data)), LEAST_OPEN)
 
 
 def _open_photons(data: Data) -> float:
@@ -311,7 +316,7 @@ def _readings(data: Data) -> Image:
     return data.p[views][data.weights[views] > 0]
 
 
-def _rough_length(data: Data, response: Response, met: float) -> float:
+def rough_length(data: Data, response: Response, met: float) -> float:
     """Return the water path (mm) behind which p is the median of the rays that met something."""
     p = _readings(data)
     seen = p[p > met + data.open]

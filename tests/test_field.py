@@ -1,0 +1,255 @@
+"""Neural fields: gradients, physics in closed form, what is refused, and that a run repeats itself."""
+
+import dataclasses
+import math
+import types
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from ctsim.benchmarks.methods import find
+from ctsim.dataset.store import list_scans, open_scan
+from ctsim.errors import InputError
+from ctsim.geometry import Geometry
+from ctsim.reconstruct.field import methods
+from ctsim.reconstruct.field.data import Data, held_out_views, subsets
+from ctsim.reconstruct.field.encoding import Encoding
+from ctsim.reconstruct.field.grid import Grid, overlaps
+from ctsim.reconstruct.field.network import evaluate, first_parameters
+from ctsim.reconstruct.field.physics import SERIES, Bins, Curve, Mono, Park, log_sinhc
+from ctsim.reconstruct.projector import forward_columns
+
+GEOMETRY = Geometry(
+    dso=60.0,
+    dsd=90.0,
+    n_voxel=(3, 4, 5),
+    d_voxel=(2.0, 1.5, 1.0),
+    n_detector=(4, 6),
+    d_detector=(2.5, 2.0),
+    n_views=5,
+    off_origin=(0.3, -0.2, 0.1),
+)
+VIEWS = np.array([0, 3])
+STEP = 1e-6
+
+
+class ExactGrid:
+    """A grid whose projector is a float64 matrix, so that gradients are not those of float32."""
+
+    def __init__(self, chosen):
+        self.grid = Grid.of(GEOMETRY, chosen)
+        self.whole = GEOMETRY
+        units = np.eye(len(self.grid), dtype=np.float32)
+        images = [self.grid.project(torch.from_numpy(u), np.arange(5)).numpy() for u in units]
+        self.matrix = torch.from_numpy(np.stack(images, -1).astype(np.float64))
+        self.columns = self.grid.columns
+
+    def project(self, values, views):
+        return self.matrix[views] @ values
+
+
+@pytest.fixture(scope="module")
+def chosen():
+    chosen = np.random.default_rng(0).random(GEOMETRY.n_voxel) < 0.7
+    chosen[1, 1, 1] = True
+    return chosen
+
+
+def bins(chosen, smoothness):
+    grid = ExactGrid(chosen)
+    metal = np.zeros(len(grid.grid), bool)
+    metal[5:9] = True
+    inside = np.zeros(chosen.shape, bool)
+    inside.transpose(1, 2, 0)[tuple(a[metal] for a in np.nonzero(chosen.transpose(1, 2, 0)))] = True
+    eta = torch.tensor([0.2, 0.5, 0.3], dtype=torch.float64)
+    return Bins(
+        grid=grid,
+        metal_grid=ExactGrid(inside),
+        metal=torch.from_numpy(metal),
+        eta=eta,
+        unit=0.02,
+        smoothness=smoothness,
+    )
+
+
+def curve(chosen):
+    double = {"dtype": torch.float64}
+    return Curve(
+        grid=ExactGrid(chosen),
+        knots=torch.tensor([0.0, 0.02, 0.05, 1.0], **double),
+        densities=torch.tensor([[0, 0], [0.01, 0.005], [0.02, 0.02], [0.2, 0.6]], **double),
+        slopes=torch.tensor([[0.5, 0.25], [0.333, 0.5], [0.19, 0.61]], **double),
+        nodes=torch.tensor([[1.1, 3.0], [1.0, 1.0], [0.9, 0.4]], **double),
+        log_eta=torch.log(torch.tensor([0.2, 0.5, 0.3], **double)),
+        ratios=(0.7, 1.0, 0.5),
+        tv=0.3,
+        scatter=0.05,
+        dark=np.random.default_rng(8).random(GEOMETRY.shape) < 0.2,
+    )
+
+
+PHYSICS = {
+    "naf": lambda chosen: Mono(grid=ExactGrid(chosen)),
+    "park": lambda chosen: Park(grid=ExactGrid(chosen), scales=(1.0, 2.0)),
+    "polyner": lambda chosen: bins(chosen, None),
+    "polyner-published": lambda chosen: bins(chosen, 0.2),
+    "field": curve,
+}
+
+
+@pytest.mark.parametrize("power", [1, 2])
+@pytest.mark.parametrize("name", PHYSICS)
+def test_gradients_are_finite_differences(name, power, chosen):
+    """In float64, by every parameter of the network and some of the table."""
+    physics = PHYSICS[name](chosen)
+    grid = physics.grid.grid
+    encoding = Encoding.of(grid.points(), (2, 4), 5)
+    parameters = first_parameters(encoding, 2, 3, len(physics.scales), 7, torch.float64)
+    random = np.random.default_rng(4)
+    parameters["table"] *= 1e4  # else the network is next to linear
+    parameters["b2"] += torch.from_numpy(random.random(len(physics.scales)))  # else bins may be equal, a kink
+    p, weights = random.random(GEOMETRY.shape).astype(np.float32), random.random(GEOMETRY.shape).astype(np.float32)
+    data = Data(p=p, weights=weights - 0.2, power=power)  # some are bounds
+    scale = 0.03 * torch.tensor(physics.scales, dtype=torch.float64)
+
+    def loss():
+        values = evaluate(encoding, parameters, scale)
+        misfit, penalty = data.misfit(physics.line_integrals(values, VIEWS), VIEWS), physics.penalty(values)
+        return misfit if penalty is None else misfit + penalty
+
+    for tensor in parameters.values():
+        tensor.requires_grad_()
+    gradients = torch.autograd.grad(loss(), list(parameters.values()))
+    for tensor, gradient in zip(parameters.values(), gradients, strict=True):
+        flat = tensor.detach().view(-1)  # shares memory
+        for k in range(0, flat.numel(), max(flat.numel() // 6, 1)):
+            at, sides = float(flat[k]), []
+            for side in (STEP, -STEP):
+                flat[k] = at + side
+                sides.append(float(loss().detach()))
+            flat[k] = at
+            difference = (sides[0] - sides[1]) / (2 * STEP)
+            # rounding: 1e-16 of a loss near 1 over 2e-6; curvature: far below
+            assert difference == pytest.approx(float(gradient.view(-1)[k]), rel=1e-6, abs=1e-9)
+
+
+def test_the_projector_of_points_is_the_exact_one_and_its_gradient_the_adjoint(chosen):
+    """A support away from the border is cropped, which changes nothing."""
+    inner = np.zeros((7, 9, 11), bool)
+    inner[2:5, 3:7, 4:9] = chosen
+    geometry = msgspec.structs.replace(GEOMETRY, n_voxel=inner.shape)
+    grid, random = Grid.of(geometry, inner), np.random.default_rng(1)
+    assert grid.geometry.n_voxel < inner.shape
+    values = torch.from_numpy(random.random(len(grid)).astype(np.float32)).requires_grad_()
+    found = grid.project(values, VIEWS)
+    volume = np.zeros((9, 11, 7), np.float32)
+    volume[inner.transpose(1, 2, 0)] = values.detach().numpy()
+    expected = forward_columns(volume, geometry, VIEWS)
+    assert np.allclose(found.detach().numpy(), expected, atol=1e-5 * expected.max())
+    images = torch.from_numpy(random.random(expected.shape).astype(np.float32))
+    (gradient,) = torch.autograd.grad((found * images).sum(), values)
+    dot = float((found.detach().double() * images.double()).sum())
+    assert float((gradient.double() * values.detach().double()).sum()) == pytest.approx(dot, rel=1e-5)
+    read = grid.volume(values.detach().numpy(), geometry)
+    assert np.array_equal(read, volume.transpose(2, 0, 1))
+
+
+def test_points_stand_at_the_centres_of_their_voxels(chosen):
+    grid = Grid.of(GEOMETRY, chosen)
+    z, y, x = np.nonzero(chosen)
+    expected = {((j + 0.5) * 1.5 / 6, (i + 0.5) / 6, (k + 0.5) * 2 / 6) for k, j, i in zip(z, y, x, strict=True)}
+    assert {tuple(np.round(p, 12)) for p in grid.points()} == {tuple(np.round(p, 12)) for p in expected}
+
+
+def test_a_finer_grid_is_read_as_means_over_voxels():
+    shares = overlaps(2, 3)
+    assert np.allclose(shares, [[2 / 3, 1 / 3, 0], [0, 1 / 3, 2 / 3]])
+    assert np.array_equal(overlaps(5, 5), np.eye(5, dtype=np.float32))
+
+
+@pytest.mark.parametrize("b", [0.0, 1e-4, 0.05, 0.0999999, 0.1, 0.1000001, 0.5, 3.0, 300.0])
+def test_parks_hardening_is_the_closed_form(b):
+    """On both sides of the series' end; float32 rounds b itself, which b/3 of it passes on."""
+    exact = 0.0 if b == 0 else math.log(math.sinh(b) / b)
+    slope = 0.0 if b == 0 else 1 / math.tanh(b) - 1 / b
+    for kind, tolerance in ((torch.float64, 5e-10), (torch.float32, 3e-6 if b > SERIES / 2 else 1e-7)):
+        at = torch.tensor([b], dtype=kind, requires_grad=True)
+        found = log_sinhc(at)
+        (gradient,) = torch.autograd.grad(found.sum(), at)
+        assert float(found.detach()) == pytest.approx(exact, abs=tolerance * max(1, b))
+        assert float(gradient) == pytest.approx(slope, abs=max(tolerance, 1e-8) * 30)
+
+
+def test_views_are_kept_apart_and_the_others_all_used_once_a_turn():
+    held = held_out_views(60)
+    assert held.size == 6 and held_out_views(3).size == 0 and held_out_views(1000).size == 12
+    rest = np.setdiff1d(np.arange(60), held)
+    turn, again = subsets(rest, 6, 1, 0), subsets(rest, 6, 1, 0)
+    assert len(turn) == 9 and np.array_equal(np.sort(np.concatenate(turn)), rest)
+    assert all(np.array_equal(a, b) for a, b in zip(turn, again, strict=True))
+    assert any(not np.array_equal(a, b) for a, b in zip(turn, subsets(rest, 6, 1, 1), strict=True))
+
+
+@pytest.fixture(scope="module")
+def scan(smallest):
+    return open_scan(list_scans(smallest)[0]).scan
+
+
+def test_a_seed_says_all_and_a_fit_goes_on_to_the_same_bit(scan, tmp_path):
+    whole = methods.naf(scan, steps=12)
+    assert torch.equal(methods.naf(scan, steps=12).values, whole.values)
+    assert not torch.equal(methods.naf(scan, steps=12, seed=1).values, whole.values)
+    told = {"steps": 12, "checkpoints": str(tmp_path)}
+    assert methods.naf(scan, seconds=1e-9, **told).details["steps"] == 0
+    stopped = _interrupted(scan, told)
+    assert 0 < stopped < 12 and list(tmp_path.iterdir())
+    assert torch.equal(methods.naf(scan, **told).values, whole.values)
+    assert not list(tmp_path.iterdir())
+    details = whole.details
+    assert details["steps"] == 12 and details["held_out"]["misfit"] > 0 and details["parameters"] > 1000
+
+
+def _interrupted(scan, told):
+    """End a run by its time after a few steps, on a clock that goes on by a second whenever it is read."""
+    clock = iter(range(1000))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ctsim.reconstruct.watch.time", types.SimpleNamespace(perf_counter=lambda: float(next(clock))))
+        return methods.naf(scan, seconds=12, **told).details["steps"]
+
+
+def test_held_out_views_choose_the_field_that_is_returned(scan, monkeypatch):
+    """A fit that runs away after its third turn returns that turn's field."""
+    judged = iter([3.0, 2.0, 1.0] + [5.0] * 100)
+    real = Data.misfit
+
+    def misfit(self, found, views):
+        return torch.tensor(next(judged)) if not found.requires_grad else real(self, found, views)
+
+    monkeypatch.setattr(Data, "misfit", misfit)
+    volume = methods.naf(scan, steps=40, views=6)
+    turn = len(subsets(np.arange(11), 6, 0, 0))
+    held = volume.details["held_out"]
+    assert (held["step"], held["misfit"]) == (3 * turn, 1.0)
+    # 12 turns without a better one end it
+    assert volume.details["steps"] == min(15 * turn, 40)
+    monkeypatch.undo()
+    assert "held_out" not in methods.naf(scan, steps=3, stop="none").details
+
+
+@pytest.mark.parametrize("name", ["naf", "park", "field"])
+def test_what_a_field_cannot_do_is_refused_in_a_sentence(name, scan):
+    """Six columns see 10 mm of an object of three times that."""
+    geometry = msgspec.structs.replace(scan.geometry, n_detector=(16, 6))
+    cut = dataclasses.replace(scan, geometry=geometry, counts=scan.counts[..., 6:12], flat=scan.flat[..., 6:12])
+    method = find(name)
+    with pytest.raises(InputError, match="a field explains all attenuation within the grid: the object reaches over"):
+        method.reconstruct(cut)
+    assert "reaches over" in method.skip(cut) and method.skip(scan) is None
+    elsewhere = object.__new__(type(scan))
+    for part in dataclasses.fields(scan):
+        object.__setattr__(elsewhere, part.name, getattr(scan, part.name))
+    object.__setattr__(elsewhere, "counts", scan.counts.to("meta"))
+    with pytest.raises(InputError, match="fields are fitted on the CPU only, expected the counts there, got meta"):
+        method.reconstruct(elsewhere)
