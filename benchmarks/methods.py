@@ -37,9 +37,10 @@ PROGRAM = "cmd:"
 """A method's name that begins so is the command of a program."""
 RUNS_PROGRAM = "ctsim.benchmarks.program"
 COUNTS_ONLY, METAL_MASK, SPECTRUM = "counts only", "metal mask", "spectrum"
+MASK_AND_SPECTRUM = "metal mask and spectrum"
 ASSUMED = "assumed spectrum"
 """Told no spectrum, but built on the tube, filter and scintillator that the simulator has by default."""
-MASK_ASSUMED = "metal mask, assumed spectrum"
+MASK_AND_ASSUMED = "metal mask and assumed spectrum"
 CONTROL, TWIN = "control", "control, told the twin"
 CONTROLS = (CONTROL, TWIN)
 """The classes of rows that are no methods: tables show them and never rank them."""
@@ -66,6 +67,7 @@ TABLE: dict[str, tuple[str, str]] = {
     "splat-paper": ("ctsim.reconstruct.splat.published:paper", COUNTS_ONLY),
     "splat-r2": ("ctsim.reconstruct.splat.published:r2", COUNTS_ONLY),
     "naf": ("ctsim.reconstruct.field.methods:naf", COUNTS_ONLY),
+    "polyner": ("ctsim.baselines.polyner:reconstruct", MASK_AND_SPECTRUM),
     "park": ("ctsim.reconstruct.field.methods:park", COUNTS_ONLY),
     "field": ("ctsim.reconstruct.field.methods:field", ASSUMED),
 }
@@ -75,6 +77,8 @@ EXTERNAL = {
     "mbir-mar": "ctsim.baselines.external:mbir_mar",
 }
 """name -> "module:function" of methods that run another package, which `ctsim[peers-methods]` installs."""
+UNMASKED = {METAL_MASK: COUNTS_ONLY, MASK_AND_SPECTRUM: SPECTRUM, MASK_AND_ASSUMED: ASSUMED}
+"""What a method needs that is told the metal mask -> what it needs where it finds the metal itself."""
 ASKED = {"known": SPECTRUM, "tube": ASSUMED}
 """A splat's `response` -> what it needs then."""
 FITTED = ("splat",)
@@ -172,11 +176,10 @@ def find(name: str, overrides: dict[str, Any] | None = None) -> Method:
     function = resolve(target)
     module = sys.modules[function.__module__]
     params, changed = _settings(name, function, overrides or {})
-    fitted = params.get("prior") in FITTED
-    if inputs == METAL_MASK and params["mask"] == "auto":
-        inputs = ASSUMED if fitted else COUNTS_ONLY  # it finds the metal itself
-    elif inputs == METAL_MASK and fitted:
-        inputs = MASK_ASSUMED
+    if inputs == METAL_MASK and params.get("prior") in FITTED:
+        inputs = MASK_AND_ASSUMED
+    if inputs in UNMASKED and params["mask"] == "auto":
+        inputs = UNMASKED[inputs]  # it finds the metal itself
     if inputs in (COUNTS_ONLY, ASSUMED) and (response := params.get("response")) in ASKED:
         inputs = ASKED[response]
     return Method(

@@ -15,7 +15,7 @@ from ctsim.reconstruct.primary import without_scatter
 from ctsim.reconstruct.scatter import Scatter
 from ctsim.types import Status
 
-FIELDS = ("naf", "park", "field")
+FIELDS = ("naf", "polyner", "park", "field")
 SHORT = {name: {"steps": 100} for name in ("splat-paper", "splat-r2", *FIELDS)}  # of 20 000, 30 000 and hundreds
 
 

@@ -13,7 +13,17 @@ from test_tables import record as table_record
 from test_twins import pair
 
 from ctsim.benchmarks.engine.table import Cell, Column, Table
-from ctsim.benchmarks.methods import ASSUMED, CONTROL, CONTROLS, COUNTS_ONLY, SPECTRUM, TABLE, TWIN, find
+from ctsim.benchmarks.methods import (
+    ASSUMED,
+    CONTROL,
+    CONTROLS,
+    COUNTS_ONLY,
+    MASK_AND_SPECTRUM,
+    SPECTRUM,
+    TABLE,
+    TWIN,
+    find,
+)
 from ctsim.benchmarks.scores.score import NO_TWIN, row_of
 from ctsim.benchmarks.studies.methods import attempt, overview, plan, tables
 from ctsim.reconstruct.fdk import fdk, ramp
@@ -180,6 +190,10 @@ def test_gains_over_fdk_are_not_over_the_ramp():
         ("splat-paper", {"response": "tube"}, ASSUMED),
         ("splat-paper", {"response": "known"}, SPECTRUM),
         ("splat-r2", {}, COUNTS_ONLY),
+        ("field", {}, ASSUMED),
+        ("field", {"response": "known"}, SPECTRUM),
+        ("polyner", {}, MASK_AND_SPECTRUM),
+        ("polyner", {"mask": "auto"}, SPECTRUM),
     ],
 )
 def test_a_splat_is_in_the_class_of_what_it_is_told(name, settings, inputs):

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from ctsim.baselines import polyner
+from ctsim.baselines.polyner import equal_bins
 from ctsim.benchmarks.methods import find
 from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
@@ -19,7 +21,11 @@ from ctsim.reconstruct.field.encoding import Encoding
 from ctsim.reconstruct.field.grid import Grid, overlaps
 from ctsim.reconstruct.field.network import evaluate, first_parameters
 from ctsim.reconstruct.field.physics import SERIES, Bins, Curve, Mono, Park, log_sinhc
+from ctsim.reconstruct.field.run import Given
 from ctsim.reconstruct.projector import forward_columns
+from ctsim.reconstruct.splat.curve import MaterialCurve
+from ctsim.reconstruct.splat.response import evaluate as evaluate_response
+from ctsim.reconstruct.splat.response import make_response
 
 GEOMETRY = Geometry(
     dso=60.0,
@@ -135,6 +141,57 @@ def test_gradients_are_finite_differences(name, power, chosen):
             assert difference == pytest.approx(float(gradient.view(-1)[k]), rel=1e-6, abs=1e-9)
 
 
+def test_bins_that_are_equal_outside_the_mask_are_projected_as_all_would_be(chosen):
+    """P of the definition: every bin's whole volume is projected."""
+    physics = bins(chosen, None)
+    values = torch.from_numpy(np.random.default_rng(2).random((len(physics.grid.grid), 3))) * 0.1
+    mu = physics.attenuations(values)
+    assert torch.equal(mu[physics.metal], 10 * values[physics.metal])
+    outside = mu[~physics.metal]
+    assert torch.allclose(outside, values[~physics.metal].mean(1, keepdim=True).expand(-1, 3))
+    paths = torch.stack([physics.grid.project(mu[:, k], VIEWS) for k in range(3)], -1)
+    expected = -torch.log((physics.eta * torch.exp(-paths)).sum(-1))
+    assert torch.allclose(physics.line_integrals(values, VIEWS), expected, rtol=1e-6)  # the grids are float32's
+    published = bins(chosen, 0.2)
+    everywhere = -torch.log((published.eta * torch.exp(-_paths(published, values))).sum(-1))
+    assert torch.allclose(published.line_integrals(values, VIEWS), everywhere, rtol=1e-12)
+    steps = (values[~physics.metal][:, 1:] - values[~physics.metal][:, :-1]).abs().sum(1).mean()
+    assert float(published.penalty(values)) == pytest.approx(0.2 * float(steps) / 0.02, rel=1e-12)
+
+
+def _paths(physics, values):
+    return torch.stack([physics.grid.project(mu, VIEWS) for mu in physics.attenuations(values).T], -1)
+
+
+def test_field_has_the_response_and_the_curve_of_splat(chosen):
+    response = make_response("tube", e_max=90.0, basis="klein-nishina")
+    known = MaterialCurve.of(response, 30.0)
+    grid = Grid.of(GEOMETRY, chosen)
+    weights = np.ones(GEOMETRY.shape, np.float32)
+    weights[3, 1] = -1
+    data = Data(p=np.zeros(GEOMETRY.shape, np.float32), weights=weights)
+    given = Given(scan=None, data=data, grid=grid, unit=0.02, clamped=0, scatter=0.04)
+    physics = methods.curve_physics(given, known, response, 0.01)
+    u = np.geomspace(1e-4, 30 * known.knots[-2], len(grid)).astype(np.float32)
+    rho = physics.densities_of(torch.from_numpy(u))
+    assert np.allclose(rho.numpy(), known.densities_of(u), rtol=1e-5)
+    la, lb = (grid.project(rho[:, k].contiguous(), VIEWS).numpy() for k in range(2))
+    p, _, _ = evaluate_response(response, la, lb)
+    found = physics.line_integrals(torch.from_numpy(u)[:, None], VIEWS).numpy()
+    scattered = -np.log(np.exp(-p.astype(np.float64)) + 0.04)
+    bound = weights[VIEWS] < 0
+    assert np.allclose(found, np.where(bound, p, scattered), rtol=2e-5, atol=2e-6)
+
+
+def test_bins_of_a_spectrum_hold_about_equal_signal():
+    energies, signal = np.linspace(20, 90, 71), np.exp(-((np.linspace(-2, 2, 71)) ** 2))
+    means, eta = equal_bins(energies, signal, 8)
+    # a bin's ends are off by half of an energy's share at most
+    assert len(eta) == 8 and np.abs(eta - 1 / 8).max() < (signal / signal.sum()).max()
+    assert np.all(np.diff(means) > 0) and means @ eta == pytest.approx(energies @ signal / signal.sum(), rel=1e-12)
+    assert equal_bins(np.array([30.0, 60.0]), np.array([1.0, 3.0]), 8)[1].tolist() == [0.25, 0.75]
+
+
 def test_the_projector_of_points_is_the_exact_one_and_its_gradient_the_adjoint(chosen):
     """A support away from the border is cropped, which changes nothing."""
     inner = np.zeros((7, 9, 11), bool)
@@ -238,7 +295,7 @@ def test_held_out_views_choose_the_field_that_is_returned(scan, monkeypatch):
     assert "held_out" not in methods.naf(scan, steps=3, stop="none").details
 
 
-@pytest.mark.parametrize("name", ["naf", "park", "field"])
+@pytest.mark.parametrize("name", ["naf", "polyner", "park", "field"])
 def test_what_a_field_cannot_do_is_refused_in_a_sentence(name, scan):
     """Six columns see 10 mm of an object of three times that."""
     geometry = msgspec.structs.replace(scan.geometry, n_detector=(16, 6))
@@ -253,3 +310,22 @@ def test_what_a_field_cannot_do_is_refused_in_a_sentence(name, scan):
     object.__setattr__(elsewhere, "counts", scan.counts.to("meta"))
     with pytest.raises(InputError, match="fields are fitted on the CPU only, expected the counts there, got meta"):
         method.reconstruct(elsewhere)
+
+
+def test_polyner_reads_its_bins(smallest):
+    """At the bins' energies, in the middle, and their mean; without a mask there is one attenuation for all."""
+    stored = open_scan(list_scans(smallest)[0])
+    scan = dataclasses.replace(stored.scan, metal=torch.from_numpy(np.asarray(stored.metal) > 0))
+    volume = polyner.reconstruct(scan, steps=20)
+    energies, eta = (volume.details[key] for key in ("energies_kev", "eta"))
+    of = torch.stack([volume.at_energy(e) for e in energies], -1)
+    assert torch.allclose(of @ torch.tensor(eta, dtype=torch.float32), volume.values, atol=1e-6)
+    assert torch.equal(polyner.reconstruct(scan, steps=20, readout="middle").values, of[..., 3])
+    metal = scan.metal.bool()
+    assert bool((of[metal].std(-1) > 0).any()) and not bool((of[~metal].std(-1) > 1e-6).any())
+    assert torch.equal(volume.at_energy(1.0), of[..., 0]) and torch.equal(volume.at_energy(500.0), of[..., -1])
+    free = polyner.reconstruct(dataclasses.replace(scan, metal=torch.zeros(metal.shape, dtype=torch.bool)), steps=3)
+    assert free.details["mask_status"] == "no_metal"
+    assert torch.allclose(free.at_energy(30.0), free.at_energy(80.0), atol=1e-7)
+    with pytest.raises(InputError, match="at_energy must be asked for a positive energy in keV, got -1"):
+        volume.at_energy(-1)

@@ -12,7 +12,7 @@ from ctsim.baselines.inpaint import Filled, fill, harmonic
 from ctsim.baselines.metal import Metal, Trace, auto_mask, find_metal, reach, reinsert, water_value
 from ctsim.baselines.morphology import dilate, spread
 from ctsim.baselines.prior import choice_views, choose_prior, tissue_prior
-from ctsim.benchmarks.methods import ASSUMED, MASK_ASSUMED, METAL_MASK, find
+from ctsim.benchmarks.methods import ASSUMED, MASK_AND_ASSUMED, METAL_MASK, find
 from ctsim.detector.noise import Noise
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -257,7 +257,7 @@ def test_a_fitted_prior_has_water_for_metal_and_comes_closer_to_the_twin(iron, m
 
 @pytest.mark.parametrize(
     ("settings", "inputs"),
-    [({}, METAL_MASK), ({"prior": "splat"}, MASK_ASSUMED), ({"prior": "splat", "mask": "auto"}, ASSUMED)],
+    [({}, METAL_MASK), ({"prior": "splat"}, MASK_AND_ASSUMED), ({"prior": "splat", "mask": "auto"}, ASSUMED)],
 )
 def test_a_prior_of_splats_assumes_their_spectrum(settings, inputs):
     assert find("nmar", settings).inputs == inputs

@@ -71,6 +71,15 @@ class Grid:
         empty = torch.zeros(n_y * n_x * n_z, dtype=values.dtype)
         return empty.index_put((torch.from_numpy(self.index),), values).view(n_y, n_x, n_z)
 
+    def of_volume(self, volume: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return a volume's values [z, y, x] at the points: [point]."""
+        ranges = tuple(slice(first, first + n) for first, n in zip(self.box, self.geometry.n_voxel, strict=True))
+        return volume[ranges].transpose(1, 2, 0).reshape(-1)[self.index]
+
+    def filled(self, values: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return values [point] as a volume on the whole grid, 0 elsewhere: [z, y, x]."""
+        return self.volume(values.astype(np.float32), self.whole) > 0.5
+
     def project(self, values: torch.Tensor, views: Views) -> torch.Tensor:
         """Integrate values [point] in 1/mm along the rays of some views: [view, v, u], in the values' type."""
         return _Project.apply(values, self, views)  # pyright: ignore[reportReturnType]

@@ -1,8 +1,7 @@
 """Neural fields that are told counts alone: "naf", "park" and "field". "polyner" is in `ctsim.baselines.polyner`."""
 
 import functools
-from collections.abc import Callable
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -12,7 +11,7 @@ from ctsim.reconstruct.beam import DetectorTable, TubeTable, check_tables, refus
 from ctsim.reconstruct.field.data import Data
 from ctsim.reconstruct.field.fit import Common
 from ctsim.reconstruct.field.physics import Curve, Image, Mono, Park
-from ctsim.reconstruct.field.run import Given, Model, Seen, refuse_device, run, truncated
+from ctsim.reconstruct.field.run import Given, Model, Seen, on_cpu, run, truncated
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reconstruct.primary import Scattered, primary, scatter_in
 from ctsim.reconstruct.settings import about, keywords
@@ -28,18 +27,6 @@ from ctsim.reconstruct.tv import axis_ratios
 from ctsim.types import Scan, Volume
 
 skip = truncated
-S = TypeVar("S", bound=Common)
-
-
-def on_cpu(function: Callable[[Scan, S], Volume]) -> Callable[[Scan, S], Volume]:
-    """Refuse scans on another device, before anything looks at their counts."""
-
-    @functools.wraps(function)
-    def method(scan: Scan, settings: S) -> Volume:
-        refuse_device(scan)
-        return function(scan, settings)
-
-    return method
 
 
 class Naf(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):

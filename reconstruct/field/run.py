@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -26,6 +26,7 @@ from ctsim.reconstruct.watch import Stopwatch
 from ctsim.types import Scan, Status, Volume
 
 Image = NDArray[np.float32]
+S = TypeVar("S", bound=Common)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,16 +66,25 @@ def truncated(scan: Scan) -> str | None:
     return f"a field explains all attenuation within the grid: {beyond}" if beyond else None
 
 
-def refuse_device(scan: Scan) -> None:
-    """Raise InputError for counts on another device than the CPU."""
-    if scan.counts.device.type != "cpu":
-        raise InputError(f"fields are fitted on the CPU only, expected the counts there, got {scan.counts.device}")
+def on_cpu(function: Callable[[Scan, S], Volume]) -> Callable[[Scan, S], Volume]:
+    """Refuse scans on another device, before anything looks at their counts.
+
+    Raises InputError for counts on another device than the CPU.
+    """
+
+    @functools.wraps(function)
+    def method(scan: Scan, settings: S) -> Volume:
+        if scan.counts.device.type != "cpu":
+            raise InputError(f"fields are fitted on the CPU only, expected the counts there, got {scan.counts.device}")
+        return function(scan, settings)
+
+    return method
 
 
 def run(scan: Scan, settings: Common, make: Callable[[Given], Model], see: "See | None" = None) -> Volume:
     """Fit the field of a model to a scan that has none of its scatter, or whose `see` knows it.
 
-    Raises InputError for a scan on another device than the CPU, and for one whose object leaves the field of view.
+    Raises InputError for a scan whose object leaves the field of view.
     """
     stopwatch = Stopwatch(limit=settings.seconds)
     if reason := truncated(scan):

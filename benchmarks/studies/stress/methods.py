@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.beam.spectrum import TABLE_KVP
-from ctsim.benchmarks.methods import SPECTRUM, TABLE, Method, find
+from ctsim.benchmarks.methods import MASK_AND_SPECTRUM, SPECTRUM, TABLE, Method, find
 from ctsim.benchmarks.studies.stress import scans
 from ctsim.benchmarks.studies.stress.scans import USUAL, Example, Findings, example
 from ctsim.benchmarks.studies.stress.suite import BOUNDS, GROUPS, NEAR, P_SURE, Machine, Scene, same_of
@@ -44,7 +44,7 @@ def bound(scan: Scan) -> float:
 def on_scene(name: str, settings: dict[str, Any], scene: Scene, side: int, found: Findings) -> None:
     """Run a method on a scene and judge what it returns."""
     method, given = find(name, settings), example(scene, side)
-    if method.name in TABLE and method.inputs == SPECTRUM and given.scan.e_max > TABLE_KVP[1]:
+    if method.name in TABLE and method.inputs in (SPECTRUM, MASK_AND_SPECTRUM) and given.scan.e_max > TABLE_KVP[1]:
         found.refused("kvp must be within", lambda: method.reconstruct(given.scan))
         return
     if reason := method.skip(given.scan):

@@ -38,13 +38,14 @@ BOUNDS = {"ibhc": 10.0}  # it adds to P the hardening computed from its own volu
 PROJECTED, VOXELISED, RESPONDED = 1e-5, 1e-5, 2e-6  # splats: of the peak, of the greatest voxel, of the response
 
 SPLATS = ("splat", "splat-paper", "splat-r2")
+FIELDS = ("naf", "polyner", "park", "field")
 GROUPS: dict[str, tuple[str, ...]] = {
     "by-mask": ("limar", "nmar", "bhc-poly"),
     # their steps have one length for any gradient of TV, also where that is rounding in a flat region
     "descent": ("asd-pocs", "awpcsd"),
-    "ordered": ("sart", "os-sart", "asd-pocs", "awpcsd", *SPLATS),  # a repeated view updates them twice
+    "ordered": ("sart", "os-sart", "asd-pocs", "awpcsd", *SPLATS, *FIELDS),  # a repeated view updates them twice
     "sampled": ("bhc-poly",),  # fits in 64 views, other ones where the scan has twice the views
-    "physical": (*SPLATS, "ibhc"),  # take materials from tables in 1/mm, so lengths must be true
+    "physical": (*SPLATS, "ibhc", "field"),  # take materials from tables in 1/mm, so lengths must be true
 }
 """Groups of methods that a scene's `unlike` may name."""
 
