@@ -183,6 +183,28 @@ def test_field_has_the_response_and_the_curve_of_splat(chosen):
     assert np.allclose(found, np.where(bound, p, scattered), rtol=2e-5, atol=2e-6)
 
 
+def test_total_variation_of_a_step_is_its_area(chosen):
+    """A step of water between two layers: 1 a voxel of the layer, times the ratio of the axis, over all voxels."""
+    for axis, ratio in ((0, 1.0), (1, 0.7), (2, 0.5)):
+        physics = dataclasses.replace(curve(np.ones_like(chosen)), ratios=(0.7, 0.5, 1.0))
+        n_z, n_y, n_x = chosen.shape
+        ones = np.ones((n_z, n_y, n_x))
+        for k in range(2):
+            ones[(slice(None),) * axis + (k,)] = 2
+        values = torch.from_numpy(0.02 * ones.transpose(1, 2, 0).reshape(-1, 1))
+        layer = ones.size // ones.shape[axis]
+        expected = 0.3 * layer * ratio / ones.size
+        # the rounded root leaves a thousandth of water in each voxel
+        assert float(physics.penalty(values)) == pytest.approx(expected, abs=0.3 * 1e-3)
+
+
+def test_a_bound_pulls_at_what_is_brighter_alone():
+    p, weights = np.array([[[1.0, 1.0, 1.0]]], np.float32), np.array([[[0.5, -0.5, -0.5]]], np.float32)
+    found, views = torch.tensor([[[2.0, 2.0, 0.0]]]), np.array([0])
+    assert float(Data(p=p, weights=weights, power=1).misfit(found, views)) == pytest.approx(1.0 / 3)
+    assert float(Data(p=p, weights=2 * weights, power=2).misfit(3 * found, views)) == pytest.approx(26.0 / 3)
+
+
 def test_bins_of_a_spectrum_hold_about_equal_signal():
     energies, signal = np.linspace(20, 90, 71), np.exp(-((np.linspace(-2, 2, 71)) ** 2))
     means, eta = equal_bins(energies, signal, 8)
@@ -237,6 +259,15 @@ def test_parks_hardening_is_the_closed_form(b):
         (gradient,) = torch.autograd.grad(found.sum(), at)
         assert float(found.detach()) == pytest.approx(exact, abs=tolerance * max(1, b))
         assert float(gradient) == pytest.approx(slope, abs=max(tolerance, 1e-8) * 30)
+
+
+def test_a_seed_draws_the_first_parameters():
+    encoding = Encoding.of(np.random.default_rng(0).random((9, 3)), (2, 4), 5)
+    first, again, other = (first_parameters(encoding, 2, 3, 1, seed) for seed in (1, 1, 2))
+    for name, drawn in first.items():
+        assert torch.equal(drawn, again[name])
+        assert name == "b2" or not torch.equal(drawn, other[name])
+    assert float(first["table"].abs().max()) <= 1e-4
 
 
 def test_views_are_kept_apart_and_the_others_all_used_once_a_turn():
