@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ctsim.baselines.inpaint import Filled, fill
 from ctsim.baselines.limar import Bridging, finished, mended, uncorrected
 from ctsim.baselines.metal import Trace, find_metal, reinsert
-from ctsim.baselines.prior import NO_BODY, choose_prior, fitted_prior
+from ctsim.baselines.prior import FITTED, NO_BODY, choose_prior, fitted_prior
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.filters import Filter
 from ctsim.reconstruct.primary import primary
@@ -30,7 +30,7 @@ Normalisation = Annotated[
     about("how the prior's projections flatten the measured ones before bridging"),
 ]
 Prior = Annotated[
-    Literal["auto", "fdk", "limar", "splat"],
+    Literal["auto", "fdk", "limar", "splat", "field"],
     about("volume that the prior is made from; auto: limar if it fits the projections better, else fdk"),
 ]
 Floor = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
@@ -75,8 +75,8 @@ class Settings(Bridging, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Those of `ctsim.baselines.limar.Bridging`; `normalisation` and `floor` as in `Normalise`; and which prior.
 
     With `prior` "auto" it is LIMAR's where its projections fit the measured ones better by a twentieth around the
-    trace (`ctsim.baselines.prior.choose_prior`), else FDK's. "splat" is the volume of splats by their defaults, with
-    water for metal (`ctsim.baselines.prior.fitted_prior`).
+    trace (`ctsim.baselines.prior.choose_prior`), else FDK's. "splat" and "field" are those methods' volumes, by their
+    defaults, with water for metal (`ctsim.baselines.prior.fitted_prior`).
     """
 
     prior: Prior = "auto"
@@ -100,7 +100,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     if first.status is not Status.OK or not metal.found:
         return uncorrected(first, metal)
     trace = Trace(metal, scan, settings.dilation)
-    if settings.prior == "splat":
+    if settings.prior in FITTED:
         choice = fitted_prior(trace, metal, scan, settings.prior)
     else:
         choice = choose_prior(trace, metal, first.values, settings, settings.prior, settings.interpolation)

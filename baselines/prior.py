@@ -3,6 +3,7 @@
 Volumes [z, y, x] in 1/mm, projections [view, v, u].
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -14,11 +15,12 @@ from numpy.typing import NDArray
 from ctsim.baselines.limar import interpolated
 from ctsim.baselines.metal import Metal, Trace, around, reach, water_value
 from ctsim.baselines.morphology import dilate, opened, spread
+from ctsim.reconstruct.field.methods import field
 from ctsim.reconstruct.filters import Filter
 from ctsim.reconstruct.projector import forward_columns
 from ctsim.reconstruct.settings import about, names_of
 from ctsim.reconstruct.splat.fast import reconstruct as splat
-from ctsim.types import Scan, Status
+from ctsim.types import Scan, Status, Volume
 
 AIR, LUNG, BONE = 0.5, 0.15, 1.5  # bounds of the classes in multiples of water
 LUNG_SHARE = 0.03  # of the body; with less there is no lung class
@@ -31,6 +33,8 @@ Prior = Annotated[
     about("volume that the tissue prior is made from; auto: limar if it fits the projections better"),
 ]
 PRIORS = names_of(Prior)
+FITTED: dict[str, Callable[[Scan], Volume]] = {"splat": splat, "field": field}
+"""Methods whose volume is a prior as it is."""
 NO_BODY = "nothing stands out from air"
 Array = NDArray[np.float32]
 
@@ -85,12 +89,11 @@ def choose_prior(
 
 
 def fitted_prior(trace: Trace, metal: Metal, scan: Scan, name: str) -> Choice | None:
-    """Return the volume of splats, with water in place of the metal and of what lies next to it; None where all is air.
+    """Return a fitted volume with water in place of the metal and of what lies next to it; None where all is air.
 
-    No tissue classes are made of it. Lee et al., Med. Phys. 52, 2025, doi:10.1002/mp.17859, take a neural field's
-    volume so.
+    No tissue classes are made of it. Lee et al., Med. Phys. 52, 2025, doi:10.1002/mp.17859, take a neural field so.
     """
-    volume = splat(scan)
+    volume = FITTED[name](scan)
     values, inside = volume.values.numpy().copy(), dilate(metal.mask, SKIN, corners=True)
     values[inside] = 0
     water = water_value(values) if volume.status is not Status.ERROR else 0.0
@@ -99,7 +102,7 @@ def fitted_prior(trace: Trace, metal: Metal, scan: Scan, name: str) -> Choice | 
     values[inside] = water
     columns = np.ascontiguousarray(np.maximum(values, 0).transpose(1, 2, 0))
     misfit, largest = _misfit(trace, columns)
-    updates = int(volume.details["view_updates"])
+    updates = int(volume.details.get("view_updates", 0))
     return Choice(name=name, columns=columns, misfit={name: misfit}, largest=largest, water=water, fitted=updates)
 
 

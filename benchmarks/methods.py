@@ -81,8 +81,8 @@ UNMASKED = {METAL_MASK: COUNTS_ONLY, MASK_AND_SPECTRUM: SPECTRUM, MASK_AND_ASSUM
 """What a method needs that is told the metal mask -> what it needs where it finds the metal itself."""
 ASKED = {"known": SPECTRUM, "tube": ASSUMED}
 """A splat's `response` -> what it needs then."""
-FITTED = ("splat",)
-"""Values of a `prior` that is built on the spectrum that splats assume."""
+FITTED = ("splat", "field")
+"""Values of a `prior` that is built on an assumed spectrum."""
 GONE = {("splat", "preset"): "presets are methods of their own; expected --method splat-paper or --method splat-r2"}
 """(method, removed parameter) -> what to do instead."""
 WIDEST = 24  # characters; a longer default is not aligned with the others

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from ctsim.baselines import bhc, limar, nmar
+from ctsim.baselines import bhc, limar, nmar, prior
 from ctsim.baselines.inpaint import Filled, fill, harmonic
 from ctsim.baselines.metal import Metal, Trace, auto_mask, find_metal, reach, reinsert, water_value
 from ctsim.baselines.morphology import dilate, spread
 from ctsim.baselines.prior import choice_views, choose_prior, tissue_prior
-from ctsim.benchmarks.methods import ASSUMED, MASK_AND_ASSUMED, METAL_MASK, find
+from ctsim.benchmarks.methods import ASSUMED, FITTED, MASK_AND_ASSUMED, METAL_MASK, find
 from ctsim.detector.noise import Noise
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -242,24 +242,29 @@ def test_a_fitted_prior_has_water_for_metal_and_comes_closer_to_the_twin(iron, m
     twin = fdk(bare)
     with_metal = twin.values + 40 * torch.from_numpy(scan.metal.numpy().astype(np.float32))
     fitted = dataclasses.replace(twin, values=with_metal, details={"view_updates": 123})
-    monkeypatch.setattr("ctsim.baselines.prior.splat", lambda _: fitted)
-    by = {prior: nmar.reconstruct(scan, prior=prior) for prior in ("auto", "splat")}
-    error = {prior: tissue_error(volume, twin, scan) for prior, volume in by.items()}
+    monkeypatch.setitem(prior.FITTED, "splat", lambda _: fitted)
+    by = {name: nmar.reconstruct(scan, prior=name) for name in ("auto", "splat")}
+    error = {name: tissue_error(volume, twin, scan) for name, volume in by.items()}
     assert error["splat"] < 0.8 * error["auto"]
     details = by["splat"].details
     assert details["prior"] == "splat" and details["view_updates"] == 123 + 2 * GEOMETRY.n_views
-    prior, water = details["intermediates"]["prior"], details["water_per_mm"]
+    given, water = details["intermediates"]["prior"], details["water_per_mm"]
     skin = dilate(scan.metal.numpy() > 0, 1, corners=True)
-    assert (prior[skin] == np.float32(water)).all() and np.array_equal(prior[~skin], twin.values.numpy().clip(0)[~skin])
-    monkeypatch.setattr("ctsim.baselines.prior.splat", lambda _: dataclasses.replace(fitted, status=Status.ERROR))
+    assert (given[skin] == np.float32(water)).all() and np.array_equal(given[~skin], twin.values.numpy().clip(0)[~skin])
+    monkeypatch.setitem(prior.FITTED, "splat", lambda _: dataclasses.replace(fitted, status=Status.ERROR))
     assert torch.equal(nmar.reconstruct(scan, prior="splat").values, fdk(scan).values)
 
 
 @pytest.mark.parametrize(
     ("settings", "inputs"),
-    [({}, METAL_MASK), ({"prior": "splat"}, MASK_AND_ASSUMED), ({"prior": "splat", "mask": "auto"}, ASSUMED)],
+    [
+        ({}, METAL_MASK),
+        *(({"prior": name}, MASK_AND_ASSUMED) for name in FITTED),
+        ({"prior": "splat", "mask": "auto"}, ASSUMED),
+    ],
 )
-def test_a_prior_of_splats_assumes_their_spectrum(settings, inputs):
+def test_a_fitted_prior_assumes_the_spectrum_of_its_fit(settings, inputs):
+    assert set(FITTED) == set(prior.FITTED)
     assert find("nmar", settings).inputs == inputs
 
 

@@ -1,0 +1,1 @@
+"""What is claimed of methods, checked by records of them."""
