@@ -7,7 +7,7 @@ from run_records import make_record
 
 from ctsim.benchmarks import cli, make_dataset
 from ctsim.benchmarks.scores.score import Score
-from ctsim.benchmarks.studies import claims as reproduce
+from ctsim.benchmarks.studies.claims import study as reproduce
 from ctsim.benchmarks.studies.methods import study
 from ctsim.benchmarks.studies.methods.records import Cost
 

@@ -1,13 +1,17 @@
 """The five rules of `run-benchmark reproduce --neural`: each is failed by the one change that it is there for."""
 
 import pytest
+from conftest import SMALLEST
 from run_records import make_record
 
+from ctsim import open_scan, score_volume
+from ctsim.benchmarks import make_dataset
 from ctsim.benchmarks.methods import TABLE, find
 from ctsim.benchmarks.scores.score import Score
-from ctsim.benchmarks.studies.claims import neural
+from ctsim.benchmarks.studies.claims import neural, study
 from ctsim.benchmarks.studies.methods.records import METAL, TWIN
 from ctsim.benchmarks.suites import load
+from ctsim.reconstruct.watch import watch
 
 SCENES = ("thorax-Fe", "teeth-Ti")
 PSNR = {"fdk": 22.0, "hull": 18.0, "limar": 24.0, "nmar": 24.5, "naf": 23.5, "denoise": 24.0}
@@ -19,8 +23,11 @@ def score(**values):
 
 
 def record(method, scene, variant, psnr, rmse, **params):
+    label = f"{method}[seed={params['seed']}]" if params else method
     scores = {"tissue": score(psnr3d=psnr), "artefact": score(rmse=rmse)}
-    return make_record(method, scan=f"{scene}{variant}", scene=scene, variant=variant, params=params, scores=scores)
+    return make_record(
+        method, label=label, scan=f"{scene}{variant}", scene=scene, variant=variant, params=params, scores=scores
+    )
 
 
 def judged(name, changes=None, lost=0.1, again=0.2):
@@ -31,14 +38,16 @@ def judged(name, changes=None, lost=0.1, again=0.2):
         for method in (*neural.OTHERS, *neural.ABLATIONS):
             here = usual if method == name else {"psnr": PSNR.get(method, 26.0), "twin": 27.0, "rmse": 150.0}
             rmse = 300.0 if method == "fdk" else here["rmse"]
-            here = here | {k.removeprefix(f"{scene}:"): v for k, v in here.items() if k.startswith(f"{scene}:")}
+            here = here | {k.partition(":")[2]: v for k, v in here.items() if k.startswith(f"{scene}:")}
             found.append(record(method, scene, METAL, here["psnr"], rmse))
             found.append(record(method, scene, TWIN, here["twin"], None))
             if method in neural.FIELDS:
                 found.append(record(method, scene, METAL, here["psnr"] + again, rmse, seed=neural.AGAIN))
     code = {m: find(m).code for m in neural.FIELDS}
     fits = [
-        neural.Course(scene=s, method=m, code=code[m], best=26.0 + lost, end=26.0) for s in SCENES for m in neural.FIELDS
+        neural.Course(scene=s, method=m, code=code[m], best=26.0 + lost, end=26.0)
+        for s in SCENES
+        for m in neural.FIELDS
     ]
     return neural.judged(found, fits)[name]
 
@@ -87,3 +96,29 @@ def test_the_rules_are_of_methods_and_scenes_that_there_are():
     assert len(scenes) == 6 and sum("-Fe" in scene.name for scene in scenes) == 3
     others = {(s.phantom.recipe, s.seed) for suite in ("quick", "core", "tune", "headline") for s in load(suite)}
     assert not others & {(s.phantom.recipe, s.seed) for s in scenes}
+
+
+def test_a_dry_run_lists_all_runs_and_writes_nothing(tmp_path, capsys):
+    suite = tmp_path / "suite.toml"
+    suite.write_text(SMALLEST, encoding="utf-8")
+    words = [*(str(tmp_path / name) for name in ("data", "r")), "--suite", str(suite), "--neural"]
+    assert make_dataset.main([str(suite), str(tmp_path / "data")]) == 0
+    capsys.readouterr()
+    assert study.main([*words, "--dry-run"]) == 0 and not (tmp_path / "r").exists()
+    shown = capsys.readouterr().out
+    assert all(f" {name} " in shown for name in (*neural.ABLATIONS, *neural.OTHERS, "naf[seed=1]"))
+
+
+def test_a_course_holds_the_best_of_a_fit_and_its_end(tmp_path, monkeypatch):
+    suite = tmp_path / "suite.toml"
+    suite.write_text(SMALLEST, encoding="utf-8")
+    make_dataset.main([str(suite), str(tmp_path)])
+    monkeypatch.setattr(neural, "FIELDS", ("sirt",))
+    (course,) = neural.courses(tmp_path, tmp_path, ["smallest"])
+    values, seen = open_scan(tmp_path / "smallest"), []
+    with watch(lambda _u, _s, volume: seen.append(volume.clone())):
+        end = find("sirt").reconstruct(values.scan)
+    span = [score_volume(v, values, protocols="tissue")["tissue"].values["psnr3d"] for v in (*seen, end.values)]
+    assert course.best == pytest.approx(max(span)) and course.end == pytest.approx(span[-1])
+    monkeypatch.setattr(neural, "_course", None)  # it is known by now
+    assert neural.courses(tmp_path, tmp_path, ["smallest"]) == [course]
