@@ -347,11 +347,12 @@ def test_polyner_reads_its_bins(smallest):
     """At the bins' energies, in the middle, and their mean; without a mask there is one attenuation for all."""
     stored = open_scan(list_scans(smallest)[0])
     scan = dataclasses.replace(stored.scan, metal=torch.from_numpy(np.asarray(stored.metal) > 0))
-    volume = polyner.reconstruct(scan, steps=20)
+    told = {"steps": 20, "fineness": 1.0}  # a finer grid has voxels of metal and tissue
+    volume = polyner.reconstruct(scan, **told)
     energies, eta = (volume.details[key] for key in ("energies_kev", "eta"))
     of = torch.stack([volume.at_energy(e) for e in energies], -1)
     assert torch.allclose(of @ torch.tensor(eta, dtype=torch.float32), volume.values, atol=1e-6)
-    assert torch.equal(polyner.reconstruct(scan, steps=20, readout="middle").values, of[..., 3])
+    assert torch.equal(polyner.reconstruct(scan, readout="middle", **told).values, of[..., 3])
     metal = scan.metal.bool()
     assert bool((of[metal].std(-1) > 0).any()) and not bool((of[~metal].std(-1) > 1e-6).any())
     assert torch.equal(volume.at_energy(1.0), of[..., 0]) and torch.equal(volume.at_energy(500.0), of[..., -1])

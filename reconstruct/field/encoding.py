@@ -63,22 +63,25 @@ class Encoding:
     @classmethod
     def of(cls, points: NDArray[np.float64], resolutions: tuple[int, ...], table: int) -> "Encoding":
         """Encode points [n, 3], within 0 … 1 along the longest axis, in tables of at most 2^`table` entries a level."""
-        columns = np.empty((len(points), len(resolutions), CORNERS), np.int32)
-        values = np.empty(columns.shape, np.float32)
-        entries, dense = 0, []
-        for level, resolution in enumerate(resolutions):
+        n, n_levels = len(points), len(resolutions)
+        columns, values = np.empty((n, n_levels, CORNERS), np.int32), np.empty((n, n_levels, CORNERS), np.float32)
+        rows, weights = np.empty((n_levels, n * CORNERS), np.int32), np.empty((n_levels, n * CORNERS), np.float32)
+        entries, dense, counts = 0, [], []
+        for level, resolution in enumerate(resolutions):  # one at a time, as sorting all would take more memory
             at, values[:, level], fits = corners(points, resolution, table)
             used, at = np.unique(at, return_inverse=True)
-            columns[:, level] = at.reshape(-1, CORNERS) + entries
+            order = np.argsort(at.reshape(-1), kind="stable")
+            rows[level] = order // CORNERS * n_levels + level
+            weights[level] = values[:, level].reshape(-1)[order]
+            counts.append(np.bincount(at.reshape(-1), minlength=used.size))
+            columns[:, level] = at.reshape(n, CORNERS) + entries
             entries += used.size
             dense.append(fits)
-        flat, rows = columns.reshape(-1), np.repeat(np.arange(columns.size // CORNERS, dtype=np.int32), CORNERS)
-        order = np.argsort(flat, kind="stable")
-        ends = np.append(0, np.cumsum(np.bincount(flat, minlength=entries)))
-        starts = np.arange(0, flat.size + 1, CORNERS)
+        starts = np.arange(0, columns.size + 1, CORNERS, dtype=np.int64)
+        ends = np.append(0, np.cumsum(np.concatenate(counts))).astype(np.int64)
         return cls(
-            matrix=Matrix.of(starts.astype(np.int64), flat, values.reshape(-1)),
-            transposed=Matrix.of(ends.astype(np.int64), rows[order], values.reshape(-1)[order]),
+            matrix=Matrix.of(starts, columns.reshape(-1), values.reshape(-1)),
+            transposed=Matrix.of(ends, rows.reshape(-1), weights.reshape(-1)),
             entries=entries,
             resolutions=resolutions,
             dense=tuple(dense),

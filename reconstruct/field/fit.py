@@ -1,6 +1,7 @@
 """The fit of a field: steps of Adam from ordered subsets of the views, up to a stop by views that are kept apart."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,6 +22,8 @@ from ctsim.reconstruct.watch import Stopwatch
 
 PATIENCE = 12  # turns over the views without a better misfit of the held-out ones, after which a fit ends
 Image = NDArray[np.float32]
+Read = Callable[[torch.Tensor], Image]
+Steps = Annotated[int, about("steps of Adam, a subset of the views each", ge=1, le=10_000_000)]
 
 
 class Common(Readings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -30,9 +33,9 @@ class Common(Readings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     published, fits all views and returns the last field.
     """
 
-    steps: Annotated[int, about("steps of Adam, a subset of the views each", ge=1, le=10_000_000)] = 300
+    steps: Steps = 100
     views: Annotated[int, about("views in a subset", ge=1, le=10_000)] = 6
-    rate: Annotated[float, about("learning rate of the network; tables have twice as much", gt=0, le=10)] = 5e-3
+    rate: Annotated[float, about("learning rate of the network; tables have twice as much", gt=0, le=10)] = 0.02
     levels: Annotated[
         Annotated[int, about("", ge=1, le=32)] | None, about("levels of the encoding; null: each twice as fine")
     ] = None
@@ -40,7 +43,7 @@ class Common(Readings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     features: Annotated[int, about("features a level", ge=1, le=64)] = 4
     table: Annotated[int, about("entries of a level's table at most, as a power of 2", ge=4, le=26)] = 19
     width: Annotated[int, about("neurons of the hidden layer", ge=1, le=4096)] = 32
-    fineness: Annotated[float, about("how much finer the field's grid is than the volume's", ge=1, le=16)] = 1.0
+    fineness: Annotated[float, about("how much finer the field's grid is than the volume's", ge=1, le=16)] = 1.5
     stop: Annotated[Literal["held-out", "none"], about("what ends the fit before its last step")] = "held-out"
     seed: Annotated[int, about("of the first parameters and of the order of subsets", ge=0, le=2**63 - 1)] = 0
     seconds: Seconds = math.inf
@@ -73,7 +76,7 @@ class Fit:
         """The number of parameters."""
         return sum(p.numel() for p in self.adam.parameters.values())
 
-    def go(self, stopwatch: Stopwatch, read: Any, checkpoint: Checkpoint | None = None) -> None:
+    def go(self, stopwatch: Stopwatch, read: Read, checkpoint: Checkpoint | None = None) -> None:
         """Take the steps that are left, or until time or held-out views end them; `read(values)` makes the volume."""
         turn: list[NDArray[np.int64]] = []
         n_turn = len(subsets(self.views, self.settings.views, 0, 0))
@@ -110,7 +113,7 @@ class Fit:
     def objective(self, parameters: dict[str, torch.Tensor], views: NDArray[np.int64]) -> torch.Tensor:
         """Return the misfit of some views and the penalty."""
         values = evaluate(self.encoding, parameters, self.scale)
-        misfit, penalty = self.data.misfit(self.physics.line_integrals(values, views), views), None
+        misfit = self.data.misfit(self.physics.line_integrals(values, views), views)
         penalty = self.physics.penalty(values)
         return misfit if penalty is None else misfit + penalty
 

@@ -9,7 +9,7 @@ import torch
 from ctsim.geometry import few_views
 from ctsim.reconstruct.beam import DetectorTable, TubeTable, check_tables, refuse_beam
 from ctsim.reconstruct.field.data import Data
-from ctsim.reconstruct.field.fit import Common
+from ctsim.reconstruct.field.fit import Common, Steps
 from ctsim.reconstruct.field.physics import Curve, Image, Mono, Park
 from ctsim.reconstruct.field.run import Given, Model, Seen, on_cpu, run, truncated
 from ctsim.reconstruct.log import line_integrals
@@ -76,7 +76,8 @@ def first_output(values: torch.Tensor) -> tuple[Image, str]:
 class Field(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As `Common`, and the beam as in `splat`'s settings."""
 
-    tv: Annotated[float, about("total variation's weight in the loss", "of water", ge=0, le=1000)] = 0.01
+    steps: Steps = 250
+    tv: Annotated[float, about("total variation's weight in the loss", "of water", ge=0, le=1000)] = 0.003
     response: Annotated[Literal["tube", "known"], about("beam: assumed, or known from tube and detector")] = "tube"
     filtration: Annotated[fast.Filter | None, about("filtration behind the assumed tube; null: found", "mm Al")] = None
     tube: TubeTable = None

@@ -41,8 +41,8 @@ SPLATS = ("splat", "splat-paper", "splat-r2")
 FIELDS = ("naf", "polyner", "park", "field")
 GROUPS: dict[str, tuple[str, ...]] = {
     "by-mask": ("limar", "nmar", "bhc-poly"),
-    # their steps have one length for any gradient of TV, also where that is rounding in a flat region
-    "descent": ("asd-pocs", "awpcsd"),
+    # their steps have one length for any gradient, of TV or by Adam, also where that is rounding
+    "descent": ("asd-pocs", "awpcsd", *FIELDS),
     "ordered": ("sart", "os-sart", "asd-pocs", "awpcsd", *SPLATS, *FIELDS),  # a repeated view updates them twice
     "sampled": ("bhc-poly",),  # fits in 64 views, other ones where the scan has twice the views
     "physical": (*SPLATS, "ibhc", "field"),  # take materials from tables in 1/mm, so lengths must be true
