@@ -41,6 +41,8 @@ MASK_AND_SPECTRUM = "metal mask and spectrum"
 ASSUMED = "assumed spectrum"
 """Told no spectrum, but built on the tube, filter and scintillator that the simulator has by default."""
 MASK_AND_ASSUMED = "metal mask and assumed spectrum"
+TRAINED, TRAINED_MASK = "training", "training, metal mask"
+"""Counts and weights that were trained on other scans (the suite `train`), and the same with a metal mask."""
 CONTROL, TWIN = "control", "control, told the twin"
 CONTROLS = (CONTROL, TWIN)
 """The classes of rows that are no methods: tables show them and never rank them."""
@@ -63,6 +65,8 @@ TABLE: dict[str, tuple[str, str]] = {
     "fista-tv": ("ctsim.baselines.tv_methods:fista_tv", COUNTS_ONLY),
     "asd-pocs": ("ctsim.baselines.tv_methods:asd_pocs", COUNTS_ONLY),
     "awpcsd": ("ctsim.baselines.tv_methods:awpcsd", COUNTS_ONLY),
+    "fusion": ("ctsim.baselines.learned.methods:fusion", TRAINED_MASK),
+    "denoise": ("ctsim.baselines.learned.methods:denoise", TRAINED),
     "splat": ("ctsim.reconstruct.splat.fast:reconstruct", ASSUMED),
     "splat-paper": ("ctsim.reconstruct.splat.published:paper", COUNTS_ONLY),
     "splat-r2": ("ctsim.reconstruct.splat.published:r2", COUNTS_ONLY),
@@ -77,7 +81,12 @@ EXTERNAL = {
     "mbir-mar": "ctsim.baselines.external:mbir_mar",
 }
 """name -> "module:function" of methods that run another package, which `ctsim[peers-methods]` installs."""
-UNMASKED = {METAL_MASK: COUNTS_ONLY, MASK_AND_SPECTRUM: SPECTRUM, MASK_AND_ASSUMED: ASSUMED}
+UNMASKED = {
+    METAL_MASK: COUNTS_ONLY,
+    MASK_AND_SPECTRUM: SPECTRUM,
+    MASK_AND_ASSUMED: ASSUMED,
+    TRAINED_MASK: TRAINED,
+}
 """What a method needs that is told the metal mask -> what it needs where it finds the metal itself."""
 ASKED = {"known": SPECTRUM, "tube": ASSUMED}
 """A splat's `response` -> what it needs then."""

@@ -1,0 +1,85 @@
+"""Train a learned row on the suite `train`.
+
+    python -m ctsim.benchmarks.tools.train_learned DATA OUT NAME [STEPS]
+
+DATA is a dataset with splits (`make-dataset train DATA`), NAME one of fusion, denoise, dicdnet-lite, acdnet-lite and
+oscnet-lite. The networks' inputs are written into OUT/inputs once. An interrupted training goes on from the checkpoint
+in OUT/NAME, of the same STEPS. OUT/NAME.safetensors and OUT/NAME.json are what `baselines/learned/weights` holds.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ctsim.baselines.learned import dictionary, fusion, training
+from ctsim.baselines.learned.data import Listed, about, listed, prepare, slices_of
+from ctsim.benchmarks.cli import guarded
+from ctsim.errors import InputError
+from ctsim.human import human_choice
+
+ARCHITECTURES = fusion.SIZES | dictionary.SIZES
+SLICES = {"train": 28, "val": 12}  # of each scene
+CUBES = 60  # to validate on
+STEPS = {"fusion": 3000, "denoise": 3000}
+SLICE_STEPS = 10_000
+Scene = dict[str, NDArray[np.generic]]
+
+
+def main(arguments: list[str]) -> int:
+    """Train, and write weights and what is known of them; return 0."""
+    if len(arguments) not in (3, 4):
+        raise InputError("expected DATA, OUT, the name of a learned row and, if not the usual ones, its steps")
+    data, out, name = Path(arguments[0]), Path(arguments[1]), arguments[2]
+    if name not in ARCHITECTURES:
+        raise InputError(f"{name}: there is no such learned row, expected {human_choice(tuple(ARCHITECTURES), name)}")
+    if len(arguments) == 4 and not arguments[3].isdecimal():
+        raise InputError(f"{arguments[3]}: expected a number of steps")
+    steps = int(arguments[3]) if len(arguments) == 4 else STEPS.get(name, SLICE_STEPS)
+    train(name, listed(data), {split: scenes(data, out / "inputs", split) for split in SLICES}, out, steps)
+    return 0
+
+
+def scenes(data: Path, folder: Path, split: str) -> list[Scene]:
+    """Return the arrays of a split's scenes; what is not there is written first."""
+    paths = [prepare(data, name, folder) for name in listed(data).names[split]]
+    return [dict(np.load(path, allow_pickle=False)) for path in paths]
+
+
+def train(name: str, which: Listed, by_split: dict[str, list[Scene]], out: Path, steps: int) -> None:
+    """Train a row and write it."""
+    architecture = ARCHITECTURES[name]
+    torch.manual_seed(0)
+    net = training.build(architecture)
+    names = ("fdk", "limar", "nmar")[: int(architecture.get("sources", 2))]
+    if architecture["kind"] == "residual":
+        train, val = ({key: _stacked(found, key) for key in found[0]} for found in by_split.values())
+        plan = training.Plan(steps=steps, batch=4, rate=3e-3, every=200)
+
+        def draw(n: int, draws: torch.Generator) -> training.Batch:
+            return training.patches(train, n, draws, names)
+    else:
+        train, val = (_tensors(slices_of(by_split[split], n)) for split, n in SLICES.items())
+        plan = training.Plan(steps=steps, batch=16, rate=1e-3, every=200)
+
+        def draw(n: int, draws: torch.Generator) -> training.Batch:
+            return training.slices(train, n, draws)
+
+    validate = training.validation(val, names, CUBES)
+    course = training.fit(net, draw, validate, plan, out / name, lambda text: sys.stdout.write(f"{name}: {text}\n"))
+    told = about(architecture, which.digest, {s: len(which.names[s]) for s in SLICES})
+    training.ship(net, name, told | training.report(plan, course, "cpu"), out)
+
+
+def _stacked(found: list[Scene], key: str) -> torch.Tensor:
+    return torch.from_numpy(np.stack([scene[key] for scene in found]))
+
+
+def _tensors(arrays: dict[str, NDArray[np.float16]]) -> training.Batch:
+    return {name: torch.from_numpy(value) for name, value in arrays.items()}
+
+
+if __name__ == "__main__":
+    sys.exit(guarded("train_learned", "ctsim.benchmarks.tools.train_learned", sys.argv[1:]))
