@@ -23,8 +23,10 @@ from ctsim.human import human_choice
 ARCHITECTURES = fusion.SIZES | dictionary.SIZES
 SLICES = {"train": 28, "val": 12}  # of each scene
 CUBES = 60  # to validate on
-STEPS = {"fusion": 3000, "denoise": 3000}
-SLICE_STEPS = 10_000
+STEPS = {"residual": 1800, "slices": 10_000}  # by kind of network
+BATCH = {"residual": 4, "slices": 16}
+RATE = {"residual": 3e-3, "slices": 1e-3}
+EVERY = 200  # steps between validations
 Scene = dict[str, NDArray[np.generic]]
 
 
@@ -37,9 +39,14 @@ def main(arguments: list[str]) -> int:
         raise InputError(f"{name}: there is no such learned row, expected {human_choice(tuple(ARCHITECTURES), name)}")
     if len(arguments) == 4 and not arguments[3].isdecimal():
         raise InputError(f"{arguments[3]}: expected a number of steps")
-    steps = int(arguments[3]) if len(arguments) == 4 else STEPS.get(name, SLICE_STEPS)
+    steps = int(arguments[3]) if len(arguments) == 4 else STEPS[kind_of(name)]
     train(name, listed(data), {split: scenes(data, out / "inputs", split) for split in SLICES}, out, steps)
     return 0
+
+
+def kind_of(name: str) -> str:
+    """Return what a row's network is trained on: cubes of volumes ("residual") or "slices"."""
+    return "residual" if ARCHITECTURES[name]["kind"] == "residual" else "slices"
 
 
 def scenes(data: Path, folder: Path, split: str) -> list[Scene]:
@@ -50,24 +57,22 @@ def scenes(data: Path, folder: Path, split: str) -> list[Scene]:
 
 def train(name: str, which: Listed, by_split: dict[str, list[Scene]], out: Path, steps: int) -> None:
     """Train a row and write it."""
-    architecture = ARCHITECTURES[name]
+    architecture, kind = ARCHITECTURES[name], kind_of(name)
     torch.manual_seed(0)
     net = training.build(architecture)
     names = ("fdk", "limar", "nmar")[: int(architecture.get("sources", 2))]
-    if architecture["kind"] == "residual":
-        train, val = ({key: _stacked(found, key) for key in found[0]} for found in by_split.values())
-        plan = training.Plan(steps=steps, batch=4, rate=3e-3, every=200)
-
-        def draw(n: int, draws: torch.Generator) -> training.Batch:
-            return training.patches(train, n, draws, names)
+    plan = training.Plan(steps=steps, batch=BATCH[kind], rate=RATE[kind], every=EVERY)
+    if kind == "residual":
+        arrays = [{key: _stacked(found, key) for key in found[0]} for found in by_split.values()]
     else:
-        train, val = (_tensors(slices_of(by_split[split], n)) for split, n in SLICES.items())
-        plan = training.Plan(steps=steps, batch=16, rate=1e-3, every=200)
+        arrays = [_tensors(slices_of(by_split[split], n)) for split, n in SLICES.items()]
 
-        def draw(n: int, draws: torch.Generator) -> training.Batch:
-            return training.slices(train, n, draws)
+    def draw(n: int, draws: torch.Generator) -> training.Batch:
+        if kind == "residual":
+            return training.patches(arrays[0], n, draws, names)
+        return training.slices(arrays[0], n, draws)
 
-    validate = training.validation(val, names, CUBES)
+    validate = training.validation(arrays[1], names, CUBES)
     course = training.fit(net, draw, validate, plan, out / name, lambda text: sys.stdout.write(f"{name}: {text}\n"))
     told = about(architecture, which.digest, {s: len(which.names[s]) for s in SLICES})
     training.ship(net, name, told | training.report(plan, course, "cpu"), out)
