@@ -17,11 +17,11 @@ from ctsim import new_scene, reconstruct_scan, score_volume, simulate_scene
 from ctsim.baselines import limar, nmar
 from ctsim.baselines.learned import dictionary, fusion, methods, training
 from ctsim.baselines.learned.inputs import blind, told
-from ctsim.baselines.learned.weights import SHIPPED, Card, network
+from ctsim.baselines.learned.weights import SHIPPED, Card, trained
 from ctsim.benchmarks.make_dataset import main as make_dataset
 from ctsim.benchmarks.methods import TABLE, TRAINED, TRAINED_MASK, find
 from ctsim.benchmarks.suites import load as load_suite
-from ctsim.benchmarks.tools import train_learned
+from ctsim.benchmarks.tools import score_learned, train_learned
 from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
 from ctsim.reconstruct.fdk import reconstruct as fdk
@@ -86,7 +86,7 @@ def test_the_shipped_weights_have_the_scores_that_they_had(iron):
 def test_weights_say_what_they_are():
     assert SHIPPED.keys() == SCORES.keys() == {n for n, (_, kind) in TABLE.items() if kind in (TRAINED, TRAINED_MASK)}
     for name in SHIPPED:
-        net, card = network(name, "shipped")
+        net, card = trained(name, "shipped")
         n = sum(parameter.numel() for parameter in net.parameters())
         assert n <= 40_000 if name in fusion.SIZES else 100_000 <= n <= 200_000
         assert (WEIGHTS / f"{name}.safetensors").stat().st_size < 1e6
@@ -99,7 +99,7 @@ def test_weights_say_what_they_are():
 def test_the_ablation_differs_in_its_inputs_alone():
     told_all, alone = ALL["fusion"], ALL["denoise"]
     assert {key for key in told_all if told_all[key] != alone[key]} == {"sources", "metal"}
-    full, part = (network(name, "shipped")[1].training for name in ("fusion", "denoise"))
+    full, part = (trained(name, "shipped")[1].training for name in ("fusion", "denoise"))
     keys = ("steps", "batch", "rate", "seed")
     assert [getattr(full, key) for key in keys] == [getattr(part, key) for key in keys]
     assert find("denoise").inputs == TRAINED and find("denoise").mask == "none"
@@ -158,7 +158,7 @@ def test_the_metal_is_put_back_and_nothing_is_outside_the_field_of_view(iron):
 
 
 def test_slabs_are_the_whole(iron):
-    net = network("fusion", "shipped")[0]
+    net = trained("fusion", "shipped")[0]
     generator = torch.Generator().manual_seed(1)
     sources, metal = torch.rand(1, 3, 70, 12, 9, generator=generator), torch.zeros(1, 1, 70, 12, 9)
     metal[:, :, 30:40, 4:7, 3:5] = 1
@@ -225,10 +225,10 @@ def short(monkeypatch):
 @pytest.mark.parametrize("name", ALL)
 def test_fifty_steps_of_training_lower_the_loss(name, data, tmp_path, capsys, short):
     assert train_learned.main([str(data), str(tmp_path), name, "50"]) == 0
-    net, card = network(name, str(tmp_path / f"{name}.safetensors"))
+    net, card = trained(name, str(tmp_path / f"{name}.safetensors"))
     assert card.training.steps == 50 and card.architecture == ALL[name] and not net.training
-    trained, valid = [c[1] for c in card.training.curve], [c[2] for c in card.training.curve]
-    assert np.mean(trained[3:]) < 0.9 * trained[0] and valid[-1] < valid[0], (trained, valid)
+    losses, valid = [c[1] for c in card.training.curve], [c[2] for c in card.training.curve]
+    assert np.mean(losses[3:]) < 0.9 * losses[0] and valid[-1] < valid[0], (losses, valid)
     assert "validation" in capsys.readouterr().out
 
 
@@ -271,6 +271,20 @@ def test_a_dataset_without_splits_is_refused(smallest, tmp_path):
         train_learned.main([str(smallest), str(tmp_path), "fusion"])
 
 
+def test_only_the_test_scans_are_scored(data, tmp_path, capsys):
+    assert score_learned.main([str(data), str(tmp_path), "fdk", "denoise"]) == 0
+    lines = (tmp_path / "learned.csv").read_text().splitlines()
+    held = {scene.name for scene in load_suite(str(data.parent / "many.toml")) if scene.drawn.split == "test"}
+    assert 0 < len(held) < 5 and {line.partition(",")[0] for line in lines[1:]} == held
+    shown = capsys.readouterr().out.splitlines()
+    assert shown[0].startswith(f"| method | Fe ({len(held)}) PSNR3D | ") and [s[:6] for s in shown[2:]] == [
+        "| `fdk",
+        "| `den",
+    ]
+    with pytest.raises(InputError, match="expected DATA, OUT"):
+        score_learned.main(["data"])
+
+
 # --- what is not read ----------------------------------------------------------------------------------
 
 
@@ -294,15 +308,15 @@ def test_a_pickle_is_refused_and_not_run(suffix, tmp_path, iron):
     path = copied(tmp_path).with_suffix(suffix)
     path.write_bytes(pickle.dumps(Evil(tmp_path / "run")))
     with pytest.raises(InputError, match="safetensors") as found:
-        reconstruct_scan(iron, "denoise", weights=str(path))
+        reconstruct_scan(iron, "denoise", network=str(path))
     assert "\n" not in str(found.value) and not (tmp_path / "run").exists()
 
 
 def test_what_torch_saves_is_refused(tmp_path, iron):
     path = copied(tmp_path)
-    torch.save(network("denoise", "shipped")[0].state_dict(), path)
+    torch.save(trained("denoise", "shipped")[0].state_dict(), path)
     with pytest.raises(InputError, match="not a safetensors file"):
-        reconstruct_scan(iron, "denoise", weights=str(path))
+        reconstruct_scan(iron, "denoise", network=str(path))
 
 
 def changed_card(path, **changes):
@@ -320,40 +334,40 @@ def rewritten(path, change):
 
 def test_weights_that_are_not_what_their_json_says_are_refused(tmp_path):
     path = copied(tmp_path)
-    assert network("denoise", str(path))[1] == network("denoise", "shipped")[1]
+    assert trained("denoise", str(path))[1] == trained("denoise", "shipped")[1]
     with pytest.raises(InputError, match="made for denoise"):
-        network("fusion", str(path))
+        trained("fusion", str(path))
     rewritten(path, lambda tensors: tensors["last.bias"].fill_(torch.nan))
     with pytest.raises(InputError, match="not all are finite"):
-        network("denoise", str(path))
+        trained("denoise", str(path))
     rewritten(path, lambda tensors: tensors.pop("last.bias"))
     with pytest.raises(InputError, match="do not fit the architecture"):
-        network("denoise", str(path))
+        trained("denoise", str(path))
     path = copied(tmp_path)
     changed_card(path, architecture={"kind": "residual", "sources": 1, "metal": 0, "channels": 10**9})
-    with pytest.raises(InputError, match=r"denoise\.json: .*channels"):
-        network("denoise", str(path))
+    with pytest.raises(InputError, match=r"denoise\.json: Expected .int. <= 256"):
+        trained("denoise", str(path))
     changed_card(path, architecture={"kind": "pickled"})
     with pytest.raises(InputError, match="do not fit the architecture"):
-        network("denoise", str(path))
+        trained("denoise", str(path))
     changed_card(copied(tmp_path), code="print()")
     with pytest.raises(InputError, match="unknown field `code`"):
-        network("denoise", str(path))
+        trained("denoise", str(path))
     copied(tmp_path).write_bytes(path.read_bytes()[:-4])
     with pytest.raises(InputError, match="not a safetensors file"):
-        network("denoise", str(path))
+        trained("denoise", str(path))
     path.with_suffix(".json").unlink()
     with pytest.raises(InputError, match="there is no such file"):
-        network("denoise", str(path))
+        trained("denoise", str(path))
 
 
 def test_shipped_weights_are_those_of_the_code(monkeypatch):
     monkeypatch.setitem(SHIPPED, "denoise", "0" * 64)
     with pytest.raises(InputError, match="install it again"):
-        network("denoise", "shipped")
+        trained("denoise", "shipped")
     monkeypatch.delitem(SHIPPED, "denoise")
     with pytest.raises(InputError, match="not trained"):
-        network("denoise", "shipped")
+        trained("denoise", "shipped")
     assert msgspec.json.decode((WEIGHTS / "fusion.json").read_bytes(), type=Card).sha256 == SHIPPED["fusion"]
 
 

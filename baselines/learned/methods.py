@@ -15,7 +15,7 @@ from ctsim.baselines.learned import fusion as net_3d
 from ctsim.baselines.learned.dictionary import Unrolled
 from ctsim.baselines.learned.fusion import Residual
 from ctsim.baselines.learned.inputs import Inputs, blind, told
-from ctsim.baselines.learned.weights import OWN, Card, network
+from ctsim.baselines.learned.weights import OWN, Card, trained
 from ctsim.baselines.limar import Bridging
 from ctsim.baselines.metal import reinsert
 from ctsim.baselines.prior import NO_BODY
@@ -28,20 +28,20 @@ from ctsim.types import Scan, Status, Volume
 
 SLAB = 32  # slices of a volume that a 3-D network sees at a time in addition to its halo
 SLICES = 8  # axial slices at a time
-Weights = Annotated[str, parameter("shipped, or a safetensors file with its JSON next to it; nothing else is read")]
+Trained = Annotated[str, parameter("trained weights: shipped, or a safetensors file with its JSON next to it")]
 Array = NDArray[np.float32]
 
 
 class Settings(Bridging, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Those of `ctsim.baselines.limar.Bridging`, for LIMAR, NMAR and the metal; and the weights."""
+    """Those of `ctsim.baselines.limar.Bridging`, for LIMAR, NMAR and the metal; and the trained weights."""
 
-    weights: Weights = OWN
+    network: Trained = OWN
 
 
 class Blind(Filter, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The filter of FDK, and the weights."""
+    """The filter of FDK, and the trained weights."""
 
-    weights: Weights = OWN
+    network: Trained = OWN
 
 
 @keywords(Settings)
@@ -52,7 +52,7 @@ def fusion(scan: Scan, settings: Settings) -> Volume:
     Without metal, and where the mask is not to be relied on, LIMAR and NMAR are FDK and the network only denoises.
     Where FDK fails or shows no body the result is FDK's. Raises InputError as LIMAR does, and for wrong weights.
     """
-    net, card = network("fusion", settings.weights)
+    net, card = trained("fusion", settings.network)
     seen = told(scan, settings)
     return _finished(seen, card, settings.insert, lambda: _in_slabs(cast(Residual, net), seen))
 
@@ -64,7 +64,7 @@ def denoise(scan: Scan, settings: Blind) -> Volume:
 
     Where FDK fails or shows no body the result is FDK's. Raises InputError as FDK does, and for wrong weights.
     """
-    net, card = network("denoise", settings.weights)
+    net, card = trained("denoise", settings.network)
     seen = blind(scan, settings)
     return _finished(seen, card, "none", lambda: _in_slabs(cast(Residual, net), seen))
 
@@ -94,7 +94,7 @@ def oscnet_lite(scan: Scan, settings: Settings) -> Volume:
 
 
 def _slice_by_slice(name: str, scan: Scan, settings: Settings) -> Volume:
-    net, card = network(name, settings.weights)
+    net, card = trained(name, settings.network)
     seen = told(scan, settings, ("fdk", "limar"))
     return _finished(seen, card, settings.insert, lambda: _slices(cast(Unrolled, net), seen))
 
@@ -133,5 +133,5 @@ def _slices(net: Unrolled, seen: Inputs) -> Array:
     y, start = (torch.from_numpy(seen.scaled(name))[:, None] for name in ("fdk", "limar"))
     keep = torch.from_numpy(~seen.mask[:, None]).float()
     parts = [slice(k, k + SLICES) for k in range(0, len(y), SLICES)]
-    found = [net(y[part], start[part], keep[part])[-1][0][:, 0].numpy() for part in parts]
-    return np.concatenate(found) * np.float32(seen.water)
+    found = [net(y[part], start[part], keep[part])[-1][0][:, 0] * seen.water for part in parts]
+    return torch.cat(found).numpy()

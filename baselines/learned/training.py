@@ -86,7 +86,7 @@ def patches(arrays: Batch, n: int, draws: torch.Generator, names: tuple[str, ...
     for _ in range(n):
         scene = int(torch.randint(len(arrays["fdk"]), (), generator=draws))
         bare = bool(torch.rand((), generator=draws) < 0.25)
-        at = [int(torch.randint(max(size - PATCH, 0) + 1, (), generator=draws)) for size in arrays["fdk"].shape[1:]]
+        at = [_place(size, draws) for size in arrays["fdk"].shape[1:]]
         part = (scene, *(slice(k, k + PATCH) for k in at))
         found = [arrays["bare" if bare else name][part].float() for name in names]
         cube = torch.stack([
@@ -99,6 +99,12 @@ def patches(arrays: Batch, n: int, draws: torch.Generator, names: tuple[str, ...
         cubes.append({"cube": cube.flip(mirrored)})
     cube = torch.stack([c["cube"] for c in cubes])
     return {"sources": cube[:, :-2], "truth": cube[:, -2:-1], "metal": cube[:, -1:]}
+
+
+def _place(size: int, draws: torch.Generator) -> int:
+    """Draw where a cube begins along an axis; the outer quarters of the places show next to nothing but air."""
+    places = max(size - PATCH, 0) + 1
+    return places // 4 + int(torch.randint(places - 2 * (places // 4), (), generator=draws))
 
 
 def loss_of(net: nn.Module, batch: Batch) -> Tensor:

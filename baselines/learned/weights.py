@@ -18,7 +18,13 @@ from ctsim.baselines.learned.inputs import HIGHEST, LOWEST
 from ctsim.baselines.learned.training import build
 from ctsim.errors import InputError
 
-SHIPPED: dict[str, str] = {}
+SHIPPED: dict[str, str] = {
+    "fusion": "2c612688761cee1bd44bebb1dc7562afc7f6a510f316ce65fe8f0280630a7ee5",
+    "denoise": "f64a38afd8da6ef60d78a9509cd00cb998d38484a0e46a01f726e5baf2ee0ae8",
+    "dicdnet-lite": "f43298f424288715e158835abf5bbb32171cdc6dc77dc0057eae9a57db30b88d",
+    "acdnet-lite": "44385dbc638827eafca99a9f3b54066a9c76803009d015a18dcc117cf1bc9010",
+    "oscnet-lite": "7b19cc176adab57ca3e72a7a297f0051aee4a28d6417a242dbb0bb80e25b85d6",
+}
 """SHA-256 of each method's weights in this package: with them the method's code changes."""
 OWN = "shipped"
 LARGEST = 2**24  # bytes of a file of weights
@@ -59,7 +65,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     training: Training
 
 
-def network(name: str, weights: str) -> tuple[nn.Module, Card]:
+def trained(name: str, weights: str) -> tuple[nn.Module, Card]:
     """Return a method's network, ready to run, and what is known of its weights.
 
     `weights` is "shipped" or the path of a safetensors file with its JSON next to it. Raises InputError for a file of
@@ -68,7 +74,7 @@ def network(name: str, weights: str) -> tuple[nn.Module, Card]:
     if weights != OWN:
         return _read(name, Path(weights))
     if name not in SHIPPED:
-        raise InputError(f"{name} is not trained: expected weights=, a safetensors file")
+        raise InputError(f"{name} is not trained: expected network=, a safetensors file")
     with resources.as_file(resources.files("ctsim.baselines.learned") / "weights") as folder:
         net, card = _read(name, folder / f"{name}.safetensors")
     if card.sha256 != SHIPPED[name]:
