@@ -247,6 +247,10 @@ FDKS = {
     "splat": 2.9,
     "splat-paper": 0.49,
     "splat-r2": 1.27,
+    "naf": 3.6,
+    "polyner": 6.9,
+    "park": 5.2,
+    "field": 4.3,
 }
 """Time in units of FDK's, per iteration or step where a method has them, measured on lung-Fe of `quick`.
 
