@@ -46,7 +46,7 @@ def first_parameters(
 
 def evaluate(encoding: Encoding, parameters: Mapping[str, torch.Tensor], scale: torch.Tensor) -> torch.Tensor:
     """Return the field at all points, [point, output], in the unit of `scale` [output]."""
-    hidden = torch.relu(torch.addmm(parameters["b1"], encoding(parameters["table"]), parameters["w1"]))
+    hidden = torch.relu_(torch.addmm(parameters["b1"], encoding(parameters["table"]), parameters["w1"]))
     return scale * squareplus(torch.addmm(parameters["b2"], hidden, parameters["w2"]))
 
 
