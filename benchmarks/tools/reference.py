@@ -267,11 +267,13 @@ def _materials() -> str:
 
 
 def suite(name: str) -> str:
-    """Return the comment at the head of a suite's file, and its scenes."""
+    """Return the comment at the head of a suite's file, and its scenes; of a table with `count` the first."""
     lines = bundled()[name].read_text(encoding="utf-8").splitlines()
     said = " ".join(line.lstrip("# ") for line in itertools.takewhile(lambda line: line.startswith("#"), lines))
     rows = []
     for scene in load(name):
+        if scene.drawn and scene.drawn.index:
+            continue  # one of a table with `count`: its first stands for all
         scanner = scene.resolve()
         g, tube = scanner.geometry, scanner.tube
         volume, views = " × ".join(map(str, g.n_voxel)), f"{g.n_views} of {' × '.join(map(str, g.n_detector))}"
