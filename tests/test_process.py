@@ -331,7 +331,13 @@ def cluster():
 @pytest.fixture(params=["pool", "cluster"])
 def opened(request):
     """Two processes of this machine, or a cluster's workers."""
-    with Pool(2) if request.param == "pool" else Cluster(request.getfixturevalue("cluster")[0]) as found:
+    if request.param == "pool":
+        with Pool(2) as found:
+            yield found
+        return
+    address, client = request.getfixturevalue("cluster")
+    with Cluster(address) as found:
+        client.wait_for_workers(2, timeout=60)  # those that were killed start again, unless the machine is too busy
         yield found
 
 
