@@ -14,7 +14,7 @@ import torch
 
 from ctsim.baselines.sart import OsSart, os_sart
 from ctsim.benchmarks import cli, methods
-from ctsim.benchmarks.methods import TABLE
+from ctsim.benchmarks.methods import EXTERNAL, TABLE
 from ctsim.dataset import store
 from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
@@ -212,7 +212,7 @@ def test_the_list_of_methods_names_every_parameter_with_its_default_and_unit(mon
     assert cli.run_benchmark() == 0
     shown = capsys.readouterr().out
     blocks = {block.partition(":")[0]: block for block in shown.split("\n\n")}
-    assert list(blocks) == list(TABLE)
+    assert list(blocks) == [*TABLE, *EXTERNAL]
     for name, block in blocks.items():
         method = methods.find(name)
         head, *lines = block.strip().splitlines()
