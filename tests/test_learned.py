@@ -157,7 +157,7 @@ def test_the_metal_is_put_back_and_nothing_is_outside_the_field_of_view(iron):
 # --- the networks --------------------------------------------------------------------------------------
 
 
-def test_slabs_are_the_whole(iron):
+def test_slabs_are_the_whole():
     net = trained("fusion", "shipped")[0]
     generator = torch.Generator().manual_seed(1)
     sources, metal = torch.rand(1, 3, 70, 12, 9, generator=generator), torch.zeros(1, 1, 70, 12, 9)
@@ -337,6 +337,9 @@ def test_weights_that_are_not_what_their_json_says_are_refused(tmp_path):
     assert trained("denoise", str(path))[1] == trained("denoise", "shipped")[1]
     with pytest.raises(InputError, match="made for denoise"):
         trained("fusion", str(path))
+    save_file(load_file(path) | {"last.bias": torch.ones(1)}, path)
+    with pytest.raises(InputError, match=r"not the file that denoise\.json speaks of"):
+        trained("denoise", str(path))
     rewritten(path, lambda tensors: tensors["last.bias"].fill_(torch.nan))
     with pytest.raises(InputError, match="not all are finite"):
         trained("denoise", str(path))
