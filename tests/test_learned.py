@@ -69,7 +69,13 @@ def psnr(volume, stored):
 
 # --- the shipped weights -----------------------------------------------------------------------------------
 
-SCORES = {"fusion": (0.0, 0.0), "denoise": (0.0, 0.0)}
+SCORES = {
+    "fusion": (34.547, 28.006),
+    "denoise": (34.188, 27.888),
+    "dicdnet-lite": (34.832, 26.484),
+    "acdnet-lite": (34.246, 25.78),
+    "oscnet-lite": (35.136, 26.616),
+}
 """PSNR3D under `tissue` of two scenes, in iron and in titanium, dB."""
 
 

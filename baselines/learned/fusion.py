@@ -1,9 +1,11 @@
 """A small 3-D network that adds a bounded residual to NMAR, and the same network on FDK alone.
 
-    x = b + β tanh(u(b, sources, their Gaussian means, metal))
+    x = b + β tanh(u_0 + Σ_j u_j (c_j − b))
 
-b is the last source (NMAR for `fusion`, FDK for `denoise`), β = 1 water, and u a U-Net of three levels with 3 × 3 × 3
-convolutions. The residual cannot take a voxel further from b than one water.
+b is the last source (NMAR for `fusion`, FDK for `denoise`). The c_j are the sources and their Gaussian means with
+standard deviations of one and two voxels. u_0 and u_j, a number a voxel each, come from a U-Net of three levels with
+3 × 3 × 3 convolutions that sees the c_j and the metal: it says where to take which of them. β = 1 water: no voxel is
+further from b.
 """
 
 import math
@@ -13,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 BOUND = 1.0  # water
-WIDE = 2.0  # standard deviation of the Gaussian mean, voxels
+WIDTHS = (1.0, 2.0)  # standard deviations of the Gaussian means, voxels
 HALO = 24  # voxels from which on no voxel of another slice matters, a multiple of 4
 SIZES: dict[str, dict[str, str | int]] = {
     "fusion": {"kind": "residual", "sources": 3, "metal": 1, "channels": 16},
@@ -28,11 +30,11 @@ class Residual(nn.Module):
     def __init__(self, *, sources: int, metal: int, channels: int) -> None:
         super().__init__()
         self.metal = bool(metal)
-        seen = 2 * (sources + metal)
+        seen = sources * (1 + len(WIDTHS)) + 2 * metal
         self.first = nn.Conv3d(seen, channels, 3, padding=1)
         self.down = nn.ModuleList(nn.Conv3d(channels, channels, 3, padding=1) for _ in range(3))
         self.up = nn.ModuleList(nn.Conv3d(channels, channels, 3, padding=1) for _ in range(2))
-        self.last = nn.Conv3d(channels, 1, 1)
+        self.last = nn.Conv3d(channels, 1 + sources * (1 + len(WIDTHS)), 1)
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)  # pyright: ignore[reportArgumentType]
 
@@ -45,14 +47,14 @@ class Residual(nn.Module):
 
         `sources` [item, source, z, y, x] are in multiples of water; `metal` [item, 1, z, y, x] is 1 in metal.
         """
-        seen = torch.cat([sources, metal], 1) if self.metal else sources
-        mean = smooth(seen)
-        if self.metal:  # next to metal rather than how much of it
-            mean = torch.cat([mean[:, :-1], 4 * mean[:, -1:]], 1)
-        return BOUND * torch.tanh(self.residual(torch.cat([seen, mean], 1)))
+        candidates = torch.cat([sources, *(smooth(sources, width) for width in WIDTHS)], 1)
+        near = [metal, 4 * smooth(metal, WIDTHS[-1])] if self.metal else []
+        u = self.weights(torch.cat([candidates, *near], 1))
+        taken = (u[:, 1:] * (candidates - sources[:, -1:])).sum(1, keepdim=True)
+        return BOUND * torch.tanh(u[:, :1] + taken)
 
-    def residual(self, seen: Tensor) -> Tensor:
-        """Return u, of any size: volumes are padded to multiples of 4 voxels."""
+    def weights(self, seen: Tensor) -> Tensor:
+        """Return u_0 and u_j, of any size: volumes are padded to multiples of 4 voxels."""
         shape = seen.shape[2:]
         pad = [n for size in reversed(shape) for n in (0, -size % 4)]
         fine = functional.silu(self.first(functional.pad(seen, pad, mode="replicate")))
@@ -69,11 +71,11 @@ def enlarged(x: Tensor) -> Tensor:
     return functional.interpolate(x, scale_factor=2.0, mode="nearest")
 
 
-def smooth(x: Tensor) -> Tensor:
-    """Return the Gaussian mean of [item, channel, z, y, x] with a standard deviation of two voxels, cut off at six."""
-    radius = math.ceil(3 * WIDE)
+def smooth(x: Tensor, width: float) -> Tensor:
+    """Return the Gaussian mean of [item, channel, z, y, x]; `width` is its standard deviation, cut off at three."""
+    radius = math.ceil(3 * width)
     at = torch.arange(-radius, radius + 1, device=x.device, dtype=torch.float32)
-    weights = torch.exp(-0.5 * (at / WIDE) ** 2)
+    weights = torch.exp(-0.5 * (at / width) ** 2)
     weights = (weights / weights.sum()).to(x.dtype)
     out = x.flatten(0, 1)[:, None]
     for axis in range(3):

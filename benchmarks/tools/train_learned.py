@@ -23,9 +23,9 @@ from ctsim.human import human_choice
 ARCHITECTURES = fusion.SIZES | dictionary.SIZES
 SLICES = {"train": 28, "val": 12}  # of each scene
 CUBES = 60  # to validate on
-STEPS = {"residual": 1200, "slices": 10_000}  # by kind of network
+STEPS = {"residual": 1000, "slices": 10_000}  # by kind of network
 BATCH = {"residual": 4, "slices": 16}
-RATE = {"residual": 3e-3, "slices": 1e-3}
+RATE = {"residual": 2e-3, "slices": 1e-3}
 EVERY = 200  # steps between validations
 Scene = dict[str, NDArray[np.generic]]
 
