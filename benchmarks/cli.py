@@ -45,9 +45,7 @@ OTHERS = {
     ),
     "stress": Command("ctsim.benchmarks.studies.stress.study", "extreme scenes for the simulator and every method"),
     "peers": Command("ctsim.benchmarks.studies.peers.study", "time and error against RTK and XCIST"),
-    "reproduce": Command(
-        "ctsim.benchmarks.studies.claims.study", "check what is claimed of FDK, LIMAR and NMAR, or of neural methods"
-    ),
+    "reproduce": Command("ctsim.benchmarks.studies.claims.study", "check claims about FDK, LIMAR, NMAR, neural rows"),
     "paper-tables": Command("ctsim.benchmarks.studies.paper.tables", "the paper's tables next to measured numbers"),
     "ablation": Command("ctsim.benchmarks.studies.ablation", "run the paper's ablations of its splat method"),
 }

@@ -19,7 +19,8 @@ from ctsim.benchmarks.engine.record import provenance, short
 from ctsim.benchmarks.engine.study import Study
 from ctsim.benchmarks.engine.table import Table, html_prose
 from ctsim.benchmarks.engine.terminal import Bar
-from ctsim.benchmarks.studies import ablation, claims
+from ctsim.benchmarks.studies import ablation
+from ctsim.benchmarks.studies.claims import study as claims
 from ctsim.benchmarks.studies.methods import records
 from ctsim.benchmarks.studies.methods.records import RunRecord
 from ctsim.benchmarks.studies.methods.tables import render

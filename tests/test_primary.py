@@ -92,7 +92,7 @@ def test_every_method_is_offered_what_splats_take_for_granted(name):
         pytest.skip("the row without any choice")
     assert find(name, {"scatter": 0.01}).params["scatter"] == 0.01
     assert find(name, {"scatter": "found"}).params["scatter"] == "found"
-    assert find(name).params["scatter"] == ("found" if name == "splat" else 0.0)
+    assert find(name).params["scatter"] == ("found" if name in ("splat", "field") else 0.0)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from ctsim import open_scan, score_volume
 from ctsim.benchmarks import make_dataset
 from ctsim.benchmarks.methods import TABLE, find
 from ctsim.benchmarks.scores.score import Score
-from ctsim.benchmarks.studies.claims import neural, study
+from ctsim.benchmarks.studies.claims import courses, neural, study
 from ctsim.benchmarks.studies.methods.records import METAL, TWIN
 from ctsim.benchmarks.suites import load
 from ctsim.reconstruct.watch import watch
@@ -113,12 +113,12 @@ def test_a_course_holds_the_best_of_a_fit_and_its_end(tmp_path, monkeypatch):
     suite = tmp_path / "suite.toml"
     suite.write_text(SMALLEST, encoding="utf-8")
     make_dataset.main([str(suite), str(tmp_path)])
-    monkeypatch.setattr(neural, "FIELDS", ("sirt",))
-    (course,) = neural.courses(tmp_path, tmp_path, ["smallest"])
+    monkeypatch.setattr(courses, "FIELDS", ("sirt",))
+    (course,) = courses.courses(tmp_path, tmp_path, ["smallest"])
     values, seen = open_scan(tmp_path / "smallest"), []
     with watch(lambda _u, _s, volume: seen.append(volume.clone())):
         end = find("sirt").reconstruct(values.scan)
     span = [score_volume(v, values, protocols="tissue")["tissue"].values["psnr3d"] for v in (*seen, end.values)]
     assert course.best == pytest.approx(max(span)) and course.end == pytest.approx(span[-1])
-    monkeypatch.setattr(neural, "_course", None)  # it is known by now
-    assert neural.courses(tmp_path, tmp_path, ["smallest"]) == [course]
+    monkeypatch.setattr(courses, "_course", None)  # it is known by now
+    assert courses.courses(tmp_path, tmp_path, ["smallest"]) == [course]

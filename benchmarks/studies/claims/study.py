@@ -101,7 +101,9 @@ def _judge_neural(given: Flags) -> int:
                 return code
         if given.dry_run:
             return 0
-    fitted = neural.courses(given.data, given.results, () if given.table else _there(given))
+    from ctsim.benchmarks.studies.claims.courses import courses  # loads torch
+
+    fitted = courses(given.data, given.results, () if given.table else _there(given))
     found = neural.judged(records.latest(records.read(given.results)), fitted)
     text = neural.table(found).markdown()
     (given.results / neural.NAME).write_text(text, encoding="utf-8")

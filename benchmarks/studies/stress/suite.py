@@ -40,7 +40,7 @@ PROJECTED, VOXELISED, RESPONDED = 1e-5, 1e-5, 2e-6  # splats: of the peak, of th
 SPLATS = ("splat", "splat-paper", "splat-r2")
 FIELDS = ("naf", "polyner", "park", "field")
 GROUPS: dict[str, tuple[str, ...]] = {
-    "by-mask": ("limar", "nmar", "bhc-poly"),
+    "by-mask": ("limar", "nmar", "bhc-poly", "fusion", "dicdnet-lite", "acdnet-lite", "oscnet-lite"),
     # their steps have one length for any gradient, of TV or by Adam, also where that is rounding
     "descent": ("asd-pocs", "awpcsd", *FIELDS),
     "ordered": ("sart", "os-sart", "asd-pocs", "awpcsd", *SPLATS, *FIELDS),  # a repeated view updates them twice
