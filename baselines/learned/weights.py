@@ -28,6 +28,7 @@ SHIPPED: dict[str, str] = {
 """SHA-256 of each method's weights in this package: with them the method's code changes."""
 OWN = "shipped"
 LARGEST = 2**24  # bytes of a file of weights
+LONGEST = 200  # characters of what torch says
 Size = Annotated[int, msgspec.Meta(ge=0, le=256)]
 
 
@@ -103,7 +104,7 @@ def _read(name: str, path: Path) -> tuple[nn.Module, Card]:
         net = build(card.architecture)
         net.load_state_dict(tensors)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        why = str(error).splitlines()[0]
+        why = " ".join(str(error).split())[:LONGEST]
         raise InputError(f"weights {path}: they do not fit the architecture in the JSON ({why})") from None
     if not all(bool(torch.isfinite(value).all()) for value in tensors.values()):
         raise InputError(f"weights {path}: not all are finite")
