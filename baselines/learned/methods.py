@@ -123,8 +123,9 @@ def _in_slabs(net: Residual, seen: Inputs) -> Array:
         begin, end = max(first - net_3d.HALO, 0), min(first + SLAB + net_3d.HALO, n_z)
         sources = torch.from_numpy(np.stack([scaled[name][begin:end] for name in scaled])[None])
         metal = torch.from_numpy(mask[None, None, begin:end].astype(np.float32))
-        changes.append(net.change(sources, metal)[0, 0, first - begin : first - begin + SLAB].numpy())
-    return seen.sources[last] + np.float32(seen.water) * np.concatenate(changes)
+        change = net.change(sources, metal)[0, 0, first - begin : first - begin + SLAB]
+        changes.append((change * seen.water).numpy())
+    return seen.sources[last] + np.concatenate(changes)
 
 
 @torch.no_grad()
