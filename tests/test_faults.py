@@ -1,6 +1,6 @@
 """Killed at any moment, refused by a disk, given damaged files: nothing is lost, nothing is left half-written.
 
-CTSIM_FAULTS is the number of kills, 24 where it is not set.
+CTSIM_FAULTS is the number of kills, 12 where it is not set.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ from ctsim.dataset.tiffstack import map_array
 
 pytestmark = pytest.mark.slow
 
-KILLS = int(os.environ.get("CTSIM_FAULTS", "24"))
+KILLS = int(os.environ.get("CTSIM_FAULTS", "12"))
 VIEWS = 12
 LONG = 300  # views of scenes that are written for a while
 SUITE = f"""

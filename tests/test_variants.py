@@ -130,11 +130,10 @@ DRAWN = [kind for kind in BUILDERS if kind is not CtVolume]
 
 
 @pytest.mark.parametrize("kind", DRAWN, ids=lambda kind: kind.__name__)
-@pytest.mark.parametrize("seed", [1, 2])
-def test_metal_of_another_name_is_all_that_another_metal_changes(kind, seed):
+def test_metal_of_another_name_is_all_that_another_metal_changes(kind):
     """For every recipe, among them those with a second metal of the same name."""
     names = ["Au", "Fe", "Ti", "CoCr", "amalgam", "water", "soft_tissue", "Fe"]
-    made = [Scene(name=f"s{k}", seed=seed, phantom=kind(metal=m, n_voxel=(20, 20, 20))) for k, m in enumerate(names)]
+    made = [Scene(name=f"s{k}", seed=1, phantom=kind(metal=m, n_voxel=(20, 20, 20))) for k, m in enumerate(names)]
     for scene, phantom in zip(made, build_all(made), strict=True):
         alone = build(scene)
         assert phantom.materials == alone.materials and phantom.solids == alone.solids
