@@ -67,6 +67,7 @@ TABLE: dict[str, tuple[str, str]] = {
     "awpcsd": ("ctsim.baselines.tv_methods:awpcsd", COUNTS_ONLY),
     "fusion": ("ctsim.baselines.learned.methods:fusion", TRAINED_MASK),
     "denoise": ("ctsim.baselines.learned.methods:denoise", TRAINED),
+    "denoise-lite": ("ctsim.baselines.learned.methods:denoise_lite", TRAINED),
     "dicdnet-lite": ("ctsim.baselines.learned.methods:dicdnet_lite", TRAINED_MASK),
     "acdnet-lite": ("ctsim.baselines.learned.methods:acdnet_lite", TRAINED_MASK),
     "oscnet-lite": ("ctsim.baselines.learned.methods:oscnet_lite", TRAINED_MASK),

@@ -72,6 +72,7 @@ def psnr(volume, stored):
 SCORES = {
     "fusion": (34.547, 28.006),
     "denoise": (34.188, 27.888),
+    "denoise-lite": (34.442, 26.484),
     "dicdnet-lite": (34.832, 26.484),
     "acdnet-lite": (34.246, 25.78),
     "oscnet-lite": (35.136, 26.616),
@@ -102,14 +103,32 @@ def test_weights_say_what_they_are():
     assert {file.stem for file in WEIGHTS.iterdir()} == set(SHIPPED)
 
 
-def test_the_ablation_differs_in_its_inputs_alone():
-    told_all, alone = ALL["fusion"], ALL["denoise"]
-    assert {key for key in told_all if told_all[key] != alone[key]} == {"sources", "metal"}
-    full, part = (trained(name, "shipped")[1].training for name in ("fusion", "denoise"))
-    keys = ("steps", "batch", "rate", "seed")
+@pytest.mark.parametrize(
+    ("name", "ablation", "inputs"),
+    [("fusion", "denoise", {"sources", "metal"}), ("dicdnet-lite", "denoise-lite", {"metal"})],
+)
+def test_an_ablation_differs_in_its_inputs_alone(name, ablation, inputs):
+    told_all, alone = ALL[name], ALL[ablation]
+    assert {key for key in alone if told_all.get(key) != alone[key]} == inputs
+    full, part = (trained(row, "shipped")[1].training for row in (name, ablation))
+    keys = ("batch", "rate", "seed")
     assert [getattr(full, key) for key in keys] == [getattr(part, key) for key in keys]
-    assert find("denoise").inputs == TRAINED and find("denoise").mask == "none"
-    assert find("fusion").inputs == TRAINED_MASK and find("fusion", {"mask": "auto"}).inputs == TRAINED
+    # those of slices had as many seconds
+    assert full.steps == part.steps or full.seconds == pytest.approx(part.seconds, rel=0.05)
+    assert find(ablation).inputs == TRAINED and find(ablation).mask == "none"
+    assert find(name).inputs == TRAINED_MASK and find(name, {"mask": "auto"}).inputs == TRAINED
+
+
+def test_a_network_that_is_told_no_metal_sees_none():
+    net = trained("denoise-lite", "shipped")[0]
+    generator = torch.Generator().manual_seed(3)
+    y, start = torch.rand(2, 1, 1, 20, 20, generator=generator)
+    keep = torch.ones_like(y)
+    keep[..., 5:9, 5:9] = 0
+    with torch.no_grad():
+        assert torch.equal(net(y, start, keep)[-1][0], net(y, y, torch.ones_like(y))[-1][0])
+        told_net = trained("dicdnet-lite", "shipped")[0]
+        assert not torch.equal(told_net(y, start, keep)[-1][0], told_net(y, y, keep)[-1][0])
 
 
 def test_the_suite_has_its_splits():

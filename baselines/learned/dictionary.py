@@ -48,11 +48,11 @@ class Prox(nn.Module):
 
 
 class Unrolled(nn.Module):
-    """The stages; subclasses say where the filters come from."""
+    """The stages; subclasses say where the filters come from. With `metal` 0 it knows neither mask nor LIMAR."""
 
-    def __init__(self, *, maps: int, stages: int, channels: int) -> None:
+    def __init__(self, *, maps: int, stages: int, channels: int, metal: int = 1) -> None:
         super().__init__()
-        self.maps = maps
+        self.maps, self.metal = maps, bool(metal)
         self.memory = nn.Conv2d(2, channels // 2 - 1, 3, padding=1)  # what X's network remembers from stage to stage
         self.prox_m = nn.ModuleList(Prox(maps, channels) for _ in range(stages))
         self.prox_x = nn.ModuleList(Prox(channels // 2, channels) for _ in range(stages))
@@ -66,8 +66,11 @@ class Unrolled(nn.Module):
     def forward(self, y: Tensor, start: Tensor, keep: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return image and artefact (X, A) after each stage, each [image, 1, y, x].
 
-        `y` is FDK, `start` LIMAR, both in multiples of water; `keep` is 0 in metal, 1 elsewhere.
+        `y` is FDK, `start` LIMAR, both in multiples of water; `keep` is 0 in metal, 1 elsewhere. A network that is not
+        told the metal starts from FDK and keeps all.
         """
+        if not self.metal:
+            start, keep = y, torch.ones_like(y)
         kernel = self.filters(y, start)
         kernel = kernel / (kernel.square().sum((2, 3), keepdim=True) + 1e-8).sqrt()
         x, m = start, torch.zeros_like(y).expand(-1, self.maps, -1, -1)
@@ -87,8 +90,8 @@ class Unrolled(nn.Module):
 class Fixed(Unrolled):
     """Filters that are the same for every image."""
 
-    def __init__(self, *, maps: int, stages: int, channels: int) -> None:
-        super().__init__(maps=maps, stages=stages, channels=channels)
+    def __init__(self, *, maps: int, stages: int, channels: int, metal: int = 1) -> None:
+        super().__init__(maps=maps, stages=stages, channels=channels, metal=metal)
         self.kernels = nn.Parameter(torch.randn(1, maps, SIZE, SIZE))
 
     def filters(self, y: Tensor, start: Tensor) -> Tensor:
@@ -166,6 +169,7 @@ def spread_back(image: Tensor, kernel: Tensor) -> Tensor:
 KINDS: Mapping[str, type[Unrolled]] = {"fixed": Fixed, "mixed": Mixed, "turned": Turned}
 SIZES: dict[str, dict[str, str | int]] = {
     "dicdnet-lite": {"kind": "fixed", "maps": 16, "stages": 4, "channels": 32},
+    "denoise-lite": {"kind": "fixed", "maps": 16, "stages": 4, "channels": 32, "metal": 0},
     "acdnet-lite": {"kind": "mixed", "maps": 6, "atoms": 32, "stages": 4, "channels": 32},
     "oscnet-lite": {"kind": "turned", "patterns": 4, "turns": 8, "stages": 4, "channels": 24},
 }

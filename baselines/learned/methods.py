@@ -1,4 +1,4 @@
-"""Methods with trained weights: `fusion`, its ablation `denoise`, and three unrolled networks on axial slices.
+"""Methods with trained weights: `fusion`, three unrolled networks on axial slices, and the ablation of either kind.
 
 All were trained on the suite `train` (`ctsim.benchmarks.tools.train_learned`). Networks work in multiples of the scan's
 water; volumes are in 1/mm.
@@ -93,6 +93,18 @@ def oscnet_lite(scan: Scan, settings: Settings) -> Volume:
     return _slice_by_slice("oscnet-lite", scan, settings)
 
 
+@keywords(Blind)
+@primary
+def denoise_lite(scan: Scan, settings: Blind) -> Volume:
+    """Do as `dicdnet_lite` from FDK alone: the same network and training, neither metal mask nor LIMAR.
+
+    Where FDK fails or shows no body the result is FDK's. Raises InputError as FDK does, and for wrong weights.
+    """
+    net, card = trained("denoise-lite", settings.network)
+    seen = blind(scan, settings)
+    return _finished(seen, card, "none", lambda: _slices(cast(Unrolled, net), seen))
+
+
 def _slice_by_slice(name: str, scan: Scan, settings: Settings) -> Volume:
     net, card = trained(name, settings.network)
     seen = told(scan, settings, ("fdk", "limar"))
@@ -131,7 +143,7 @@ def _in_slabs(net: Residual, seen: Inputs) -> Array:
 @torch.no_grad()
 def _slices(net: Unrolled, seen: Inputs) -> Array:
     """Return the network's volume in 1/mm."""
-    y, start = (torch.from_numpy(seen.scaled(name))[:, None] for name in ("fdk", "limar"))
+    y, start = (torch.from_numpy(seen.scaled(name))[:, None] for name in ("fdk", [*seen.sources][-1]))
     keep = torch.from_numpy(~seen.mask[:, None]).float()
     parts = [slice(k, k + SLICES) for k in range(0, len(y), SLICES)]
     found = [net(y[part], start[part], keep[part])[-1][0][:, 0] * seen.water for part in parts]

@@ -21,6 +21,7 @@ from ctsim.errors import InputError
 SHIPPED: dict[str, str] = {
     "fusion": "f2e39d5e17bef60ffdbd3df14b3d34c4d61a585b4cfcfceb1ae32908ec1463f7",
     "denoise": "989579f348aa72c7de787f81c70c3861929301eabb65f8963ad3b5034df129d4",
+    "denoise-lite": "4854d942b9676f85a295b413896c0685db24b970c2c6e309dc7d4cfbfbe98b46",
     "dicdnet-lite": "f43298f424288715e158835abf5bbb32171cdc6dc77dc0057eae9a57db30b88d",
     "acdnet-lite": "44385dbc638827eafca99a9f3b54066a9c76803009d015a18dcc117cf1bc9010",
     "oscnet-lite": "7b19cc176adab57ca3e72a7a297f0051aee4a28d6417a242dbb0bb80e25b85d6",

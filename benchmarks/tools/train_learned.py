@@ -2,9 +2,10 @@
 
     python -m ctsim.benchmarks.tools.train_learned DATA OUT NAME [STEPS]
 
-DATA is a dataset with splits (`make-dataset train DATA`), NAME one of fusion, denoise, dicdnet-lite, acdnet-lite and
-oscnet-lite. The networks' inputs are written into OUT/inputs once. An interrupted training goes on from the checkpoint
-in OUT/NAME, of the same STEPS. OUT/NAME.safetensors and OUT/NAME.json are what `baselines/learned/weights` holds.
+DATA is a dataset with splits (`make-dataset train DATA`), NAME one of fusion, denoise, denoise-lite, dicdnet-lite,
+acdnet-lite and oscnet-lite. The networks' inputs are written into OUT/inputs once. An interrupted training goes on from
+the checkpoint in OUT/NAME, of the same STEPS. OUT/NAME.safetensors and OUT/NAME.json are what
+`baselines/learned/weights` holds.
 """
 
 import sys

@@ -22,9 +22,10 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "field": ("naf",),
     "denoise": (),
     "fusion": ("denoise", "limar", "nmar"),
-    "dicdnet-lite": ("denoise", "limar", "nmar"),
-    "acdnet-lite": ("denoise", "limar", "nmar"),
-    "oscnet-lite": ("denoise", "limar", "nmar"),
+    "denoise-lite": (),
+    "dicdnet-lite": ("denoise-lite", "limar", "nmar"),
+    "acdnet-lite": ("denoise-lite", "limar", "nmar"),
+    "oscnet-lite": ("denoise-lite", "limar", "nmar"),
 }
 """What a method must be better than: the same without its physics, its mask, or the prior volumes."""
 FIELDS = ("naf", "polyner", "park", "field")
