@@ -92,6 +92,8 @@ UNMASKED = {
     TRAINED_MASK: TRAINED,
 }
 """What a method needs that is told the metal mask -> what it needs where it finds the metal itself."""
+FAILED = {"denoise": "2", "park": "3"}
+"""Methods -> the rules of `run-benchmark reproduce --neural` that they failed when last judged, with their defaults."""
 ASKED = {"known": SPECTRUM, "tube": ASSUMED}
 """A splat's `response` -> what it needs then."""
 FITTED = ("splat", "field")
@@ -99,6 +101,11 @@ FITTED = ("splat", "field")
 GONE = {("splat", "preset"): "presets are methods of their own; expected --method splat-paper or --method splat-r2"}
 """(method, removed parameter) -> what to do instead."""
 WIDEST = 24  # characters; a longer default is not aligned with the others
+
+
+def daggered(label: str) -> str:
+    """Return a method's label; with a dagger and the rules that it failed, if it is one of `FAILED`."""
+    return f"{label} †{FAILED[label]}" if label in FAILED else label
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -102,7 +102,7 @@ def test_fdk_ramp_is_the_plain_ramp_and_fdk_is_not():
 def test_all_methods_that_end_in_fdk_share_one_filter():
     filters = {n: (p["window"], p["cutoff"]) for n in TABLE if "window" in (p := find(n).params)}
     learned = {name for name in TABLE if find(name).inputs in (TRAINED, TRAINED_MASK)}
-    assert len(learned) == 5
+    assert len(learned) == 6
     assert set(filters) == {"fdk", "twin-fdk", "limar", "nmar", "bhc-poly", "water-precorrection", "ibhc", *learned}
     assert len(set(filters.values())) == 1
 

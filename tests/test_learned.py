@@ -257,6 +257,31 @@ def test_fifty_steps_of_training_lower_the_loss(name, data, tmp_path, capsys, sh
     assert "validation" in capsys.readouterr().out
 
 
+def test_the_twin_as_target_holds_the_same_noise(data, tmp_path, short):
+    assert train_learned.main([str(data), str(tmp_path), "denoise-lite", "1", "--twin"]) == 0
+    assert trained("denoise-lite", str(tmp_path / "denoise-lite-twin.safetensors"))[1].target == "twin"
+    assert not (tmp_path / "denoise-lite.safetensors").exists()
+    names = train_learned.listed(data).names["train"]
+    found = dict(np.load(tmp_path / "inputs" / f"{names[0]}.npz"))
+    stored = open_scan(data / names[0])
+    expected = fdk(stored.metal_free.scan).values.numpy() / told(with_mask(stored), limar.Bridging()).water
+    np.testing.assert_allclose(found["twin"], expected.clip(-2, 8), atol=4e-3)
+
+
+@pytest.mark.parametrize("name", ["fusion", "denoise-lite"])
+def test_samples_for_a_target(name, data, tmp_path, monkeypatch, short):
+    """Without metal the twin is what the network sees; the effective reference is without noise."""
+    drawn = {}
+    monkeypatch.setattr(training, "fit", lambda net, draw, *rest: drawn.update(batch=draw(64, torch.Generator())))
+    monkeypatch.setattr(training, "report", lambda *given: {})
+    for flags, same in (([], False), (["--twin"], True)):
+        train_learned.main([str(data), str(tmp_path), name, "1", *flags])
+        batch = drawn["batch"]
+        seen = batch["sources"][:, :1] if name == "fusion" else batch["y"]
+        alike = (seen == batch["truth"]).flatten(1).all(1)
+        assert bool(alike.any()) is same and not alike.all()
+
+
 @pytest.mark.parametrize("name", ["denoise", "acdnet-lite"])
 def test_a_training_that_was_interrupted_goes_on_to_the_same_bits(name, data, tmp_path, monkeypatch, short):
     class Interrupted(Exception):

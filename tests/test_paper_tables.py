@@ -7,6 +7,7 @@ import pytest
 from run_records import append, make_record
 
 from ctsim.benchmarks import cli
+from ctsim.benchmarks.methods import FAILED
 from ctsim.benchmarks.scores.score import Score
 from ctsim.benchmarks.studies.methods.plan import repetition
 from ctsim.benchmarks.studies.methods.records import Cost
@@ -294,3 +295,10 @@ def test_a_table_with_a_hole_is_refused():
     broken = msgspec.to_builtins(TABLES[1]) | {"scene": ""}
     with pytest.raises(msgspec.ValidationError, match="expected suite, scene and method"):
         msgspec.convert(broken, paper_layout.PaperTable)
+
+
+def test_a_row_whose_method_failed_a_rule_has_its_dagger():
+    found = [record("park"), record("polyner"), record("fdk")]
+    text = "".join(sheet.markdown() for sheet in paper_tables.filled(found, "paper", (3, 4)))
+    assert f"| Park et al. †{FAILED['park']} |" in text and "Polyner †" not in text and "FDK †" not in text
+    assert "failed these rules" in text

@@ -1,7 +1,8 @@
 """What learned rows are trained on: the inputs of a dataset's scans and of their twins, and the truth.
 
-A scene becomes one file NAME.npz of float16 arrays [z, y, x] in multiples of the scan's water: "fdk", "limar", "nmar"
-and "truth" of the scan with metal; "bare" and "bare_truth", FDK and truth of its twin, in the twin's water; "metal".
+A scene becomes one file NAME.npz of float16 arrays [z, y, x] in multiples of the scan's water: "fdk", "limar", "nmar",
+"truth" and "twin", which is FDK of the twin; "bare" and "bare_truth", FDK and truth of the twin in the twin's water;
+"metal".
 """
 
 import dataclasses
@@ -43,13 +44,16 @@ def listed(data: Path) -> Listed:
     return Listed(names=names, digest=hashlib.sha256("\n".join(hashes).encode()).hexdigest())
 
 
-def about(architecture: Mapping[str, str | int], digest: str, scenes: Mapping[str, int]) -> dict[str, object]:
-    """Return what weights say of their network and its data."""
+def about(
+    architecture: Mapping[str, str | int], digest: str, scenes: Mapping[str, int], target: str = "effective"
+) -> dict[str, object]:
+    """Return what weights say of their network and its data; the target is the "effective" reference or the "twin"."""
     return {
         "architecture": dict(architecture),
         "unit": "water as FDK of the scan shows it",
         "clip": [LOWEST, HIGHEST],
         "data": {"suite": "train", "scenes": dict(scenes), "sha256": digest},
+        "target": target,
     }
 
 
@@ -75,7 +79,8 @@ def arrays(stored: StoredScan) -> dict[str, NDArray[np.generic]]:
     if min(seen.water, bare.water) <= 0:
         raise InputError(f"{stored.place}: nothing stands out from air")
     found: dict[str, NDArray[np.generic]] = {name: _half(seen.scaled(name)) for name in SOURCES}
-    found |= {"truth": _truth(stored, seen), "metal": metal}
+    twin_values = np.clip(bare.sources["fdk"] / np.float32(seen.water), LOWEST, HIGHEST)
+    found |= {"truth": _truth(stored, seen), "twin": _half(twin_values), "metal": metal}
     return found | {"bare": _half(bare.scaled("fdk")), "bare_truth": _truth(twin, bare)}
 
 
@@ -98,7 +103,7 @@ def slices_of(scenes: list[dict[str, NDArray[np.generic]]], n: int) -> dict[str,
         changed = np.abs(limar - fdk).max((1, 2)) > 0.02
         few = min(3 * n // 4, int(changed.sum()))
         chosen = [*_even(np.flatnonzero(changed), few), *_even(np.flatnonzero(~changed), n - few)]
-        for name in ("fdk", "limar", "truth", "metal", "bare", "bare_truth"):
+        for name in ("fdk", "limar", "truth", "twin", "metal", "bare", "bare_truth"):
             values = scene[name][np.sort(np.array(chosen, np.intp)), None]
             rounded = np.round(values.astype(np.float32) * 128) / 128
             parts.setdefault(name, []).append(_half(rounded))

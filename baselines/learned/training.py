@@ -135,14 +135,13 @@ def validation(arrays: Batch, names: tuple[str, ...], n: int) -> Callable[[nn.Mo
     return validate
 
 
-def ship(net: nn.Module, name: str, about: dict[str, object], folder: Path) -> None:
-    """Write NAME.safetensors with the weights, and NAME.json with `about` and the file's SHA-256."""
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{name}.safetensors"
+def ship(net: nn.Module, stem: Path, about: dict[str, object]) -> None:
+    """Write STEM.safetensors with the weights, and STEM.json with `about` and the file's SHA-256."""
+    path = stem.with_name(f"{stem.name}.safetensors")
+    path.parent.mkdir(parents=True, exist_ok=True)
     save_file({key: value.detach().cpu().contiguous() for key, value in net.state_dict().items()}, path)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    text = json.dumps({"name": name, "sha256": digest, **about}, indent=1)
-    path.with_suffix(".json").write_text(text + "\n")
+    path.with_suffix(".json").write_text(json.dumps(about | {"sha256": digest}, indent=1) + "\n")
 
 
 def report(plan: Plan, course: Course, device: str) -> dict[str, object]:

@@ -6,7 +6,7 @@ Nothing but safetensors is read: a pickle, such as torch.save writes, can run an
 import hashlib
 from importlib import resources
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import torch
@@ -56,7 +56,10 @@ class Training(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is known of weights. `architecture` is the network's kind and sizes, `clip` in the `unit` of its inputs."""
+    """What is known of weights. `architecture` is the network's kind and sizes, `clip` in the `unit` of its inputs.
+
+    The `target` of the training was the effective reference, or FDK of the twin, which holds the same noise.
+    """
 
     name: str
     sha256: str
@@ -65,6 +68,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     clip: tuple[float, float]
     data: Data
     training: Training
+    target: Literal["effective", "twin"] = "effective"
 
 
 def trained(name: str, weights: str) -> tuple[nn.Module, Card]:

@@ -34,6 +34,7 @@ _TEX = {
     "³": "$^3$",
     "×": r"$\times$",
     "°": r"$^\circ$",
+    "†": r"$^\dagger$",
     "·": r"$\cdot$",
 }
 _LINE = dict.fromkeys((*range(0x20), *range(0x7F, 0xA0), 0x2028, 0x2029), " ")

@@ -1,11 +1,12 @@
 """Train a learned row on the suite `train`.
 
-    python -m ctsim.benchmarks.tools.train_learned DATA OUT NAME [STEPS]
+    python -m ctsim.benchmarks.tools.train_learned DATA OUT NAME [STEPS] [--twin]
 
 DATA is a dataset with splits (`make-dataset train DATA`), NAME one of fusion, denoise, denoise-lite, dicdnet-lite,
 acdnet-lite and oscnet-lite. The networks' inputs are written into OUT/inputs once. An interrupted training goes on from
 the checkpoint in OUT/NAME, of the same STEPS. OUT/NAME.safetensors and OUT/NAME.json are what
-`baselines/learned/weights` holds.
+`baselines/learned/weights` holds. With `--twin` the target is FDK of the metal-free twin in place of the effective
+reference: it holds the scan's own noise, so that nothing is gained by denoising; the files are then OUT/NAME-twin.*.
 """
 
 import sys
@@ -33,6 +34,8 @@ Scene = dict[str, NDArray[np.generic]]
 
 def main(arguments: list[str]) -> int:
     """Train, and write weights and what is known of them; return 0."""
+    target = "twin" if "--twin" in arguments else "effective"
+    arguments = [argument for argument in arguments if argument != "--twin"]
     if len(arguments) not in (3, 4):
         raise InputError("expected DATA, OUT, the name of a learned row and, if not the usual ones, its steps")
     data, out, name = Path(arguments[0]), Path(arguments[1]), arguments[2]
@@ -41,7 +44,7 @@ def main(arguments: list[str]) -> int:
     if len(arguments) == 4 and not arguments[3].isdecimal():
         raise InputError(f"{arguments[3]}: expected a number of steps")
     steps = int(arguments[3]) if len(arguments) == 4 else STEPS[kind_of(name)]
-    train(name, listed(data), {split: scenes(data, out / "inputs", split) for split in SLICES}, out, steps)
+    train(name, listed(data), {split: scenes(data, out / "inputs", split) for split in SLICES}, out, steps, target)
     return 0
 
 
@@ -56,8 +59,8 @@ def scenes(data: Path, folder: Path, split: str) -> list[Scene]:
     return [dict(np.load(path, allow_pickle=False)) for path in paths]
 
 
-def train(name: str, which: Listed, by_split: dict[str, list[Scene]], out: Path, steps: int) -> None:
-    """Train a row and write it."""
+def train(name: str, which: Listed, by_split: dict[str, list[Scene]], out: Path, steps: int, target: str) -> None:
+    """Train a row for a target, "effective" or "twin", and write it."""
     architecture, kind = ARCHITECTURES[name], kind_of(name)
     torch.manual_seed(0)
     net = training.build(architecture)
@@ -67,6 +70,9 @@ def train(name: str, which: Listed, by_split: dict[str, list[Scene]], out: Path,
         arrays = [{key: _stacked(found, key) for key in found[0]} for found in by_split.values()]
     else:
         arrays = [_tensors(slices_of(by_split[split], n)) for split, n in SLICES.items()]
+    if target == "twin":
+        arrays = [part | {"truth": part["twin"], "bare_truth": part["bare"]} for part in arrays]
+    stem = name if target == "effective" else f"{name}-{target}"
 
     def draw(n: int, draws: torch.Generator) -> training.Batch:
         if kind == "residual":
@@ -74,9 +80,9 @@ def train(name: str, which: Listed, by_split: dict[str, list[Scene]], out: Path,
         return training.slices(arrays[0], n, draws)
 
     validate = training.validation(arrays[1], names, CUBES)
-    course = training.fit(net, draw, validate, plan, out / name, lambda text: sys.stdout.write(f"{name}: {text}\n"))
-    told = about(architecture, which.digest, {s: len(which.names[s]) for s in SLICES})
-    training.ship(net, name, told | training.report(plan, course, "cpu"), out)
+    course = training.fit(net, draw, validate, plan, out / stem, lambda text: sys.stdout.write(f"{stem}: {text}\n"))
+    told = about(architecture, which.digest, {s: len(which.names[s]) for s in SLICES}, target)
+    training.ship(net, out / stem, {"name": name} | told | training.report(plan, course, "cpu"))
 
 
 def _stacked(found: list[Scene], key: str) -> torch.Tensor:

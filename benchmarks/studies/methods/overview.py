@@ -14,7 +14,7 @@ from rich.text import Text
 from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.table import one_line, ranked
 from ctsim.benchmarks.engine.terminal import WIDEST, rendered, width
-from ctsim.benchmarks.methods import CONTROLS
+from ctsim.benchmarks.methods import CONTROLS, daggered
 from ctsim.benchmarks.scores.score import MAIN, MAIN_ACROSS, MAIN_MEASURED, NEED_TRUTH, NO_REFERENCE, Metric
 from ctsim.benchmarks.studies.methods.captions import across_scanners, measured
 from ctsim.benchmarks.studies.methods.records import METAL, RunRecord, latest, remarks
@@ -110,9 +110,10 @@ def overview(shown: Sequence[RunRecord]) -> str:
     rows = sorted(dict.fromkeys((record.inputs, record.label) for record in own), key=lambda row: row[0])
     failed = {(r.run.scene, r.label): r.status for r in own if r.status != OK}
     values = {(scene, row): _values(found, scene, row, what) for scene in scenes for row in rows}
-    stubs = sum(max(map(len, column)) + 2 for column in zip(("inputs", "method"), *rows, strict=True))
+    stubs = [("inputs", "method"), *((inputs, daggered(label)) for inputs, label in rows)]
+    wide_stubs = sum(max(map(len, column)) + 2 for column in zip(*stubs, strict=True))
     wide = max([len(_head(what)), *map(len, scenes)]) + 2
-    fit = max((width() - stubs) // wide, 1)
+    fit = max((width() - wide_stubs) // wide, 1)
     if len(scenes) > fit * MOST_TABLES:
         title = f"mean of {len(scenes)} scenes"
         values |= {(title, row): _mean([values[scene, row] for scene in scenes]) for row in rows}
@@ -151,7 +152,7 @@ def _table(
             _cell(what, values[column, row], failed.get((column, row[1]), ""), [row in best[column, k] for k in ranked])
             for column in columns
         ]
-        table.add_row(row[0] if first else "", Text(one_line(row[1])), *cells)
+        table.add_row(row[0] if first else "", Text(one_line(daggered(row[1]))), *cells)
     return rendered(table)
 
 

@@ -12,7 +12,7 @@ import msgspec
 
 from ctsim.benchmarks.engine.record import Found, Record, Store, Task
 from ctsim.benchmarks.engine.record import latest as latest_rows
-from ctsim.benchmarks.methods import TABLE
+from ctsim.benchmarks.methods import FAILED, TABLE
 from ctsim.benchmarks.scores.score import VERSION, Score
 from ctsim.benchmarks.studies.methods.grids import shared_text
 from ctsim.dataset.folder import mixture
@@ -214,7 +214,7 @@ def remarks(records: Sequence[RunRecord]) -> list[str]:
     known = {r.task.data: r.data_code for r in shown if r.data_code}
     made = {f"{r.run.scene} (seed {r.run.seed})": known.get(r.task.data, "") for r in shown}
     grids = {f"{r.label} on {r.run.scene}": r.details for r in shown}
-    said = outdated(records), mixture(made.items()), shared_text(grids), _stated(shown), _limits(shown)
+    said = outdated(records), mixture(made.items()), shared_text(grids), _stated(shown), doubtful(shown), _limits(shown)
     return [text for text in said if text]
 
 
@@ -222,6 +222,13 @@ def _stated(shown: Sequence[RunRecord]) -> str:
     """Say whose seconds were not measured here; "" where all were."""
     labels = dict.fromkeys(r.label for r in shown if r.cost is not None and r.cost.device == STATED)
     return f"not measured but stated: the seconds of {', '.join(labels)}" if labels else ""
+
+
+def doubtful(shown: Sequence[RunRecord]) -> str:
+    """Say what a dagger means; "" where no method has one."""
+    rules = {r.label: FAILED[r.label] for r in shown if r.label in FAILED}
+    listed = ", ".join(f"{label} {rule}" for label, rule in rules.items())
+    return f"†: failed these rules of `run-benchmark reproduce --neural`: {listed}" if rules else ""
 
 
 def _limits(shown: Sequence[RunRecord]) -> str:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal
 
 from ctsim.benchmarks.engine.record import OK, uncollected
 from ctsim.benchmarks.engine.table import Cell, Column, Table, escape, harmless, tex_comment
-from ctsim.benchmarks.methods import CONTROLS
+from ctsim.benchmarks.methods import CONTROLS, daggered
 from ctsim.benchmarks.scores.score import (
     COLUMNS,
     COMPARED,
@@ -250,7 +250,7 @@ def _grid_of(
         if protocol == "anchored":
             shares = (harm([c.number for c in cells[k :: len(metrics)]]) for k in range(len(metrics)))
             more += [Cell(text, share) for share, text in shares]
-        rows.append([Cell(inputs), Cell(method), *cells, *more])
+        rows.append([Cell(inputs), Cell(daggered(method)), *cells, *more])
     rows.sort(key=lambda row: row[0].text)
     heads = [Column(how.title, group, True, how.better) for group in groups for how in metrics.values()]
     return [*STUBS, *heads], rows

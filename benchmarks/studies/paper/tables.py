@@ -19,7 +19,7 @@ import tyro
 from ctsim.benchmarks import suites
 from ctsim.benchmarks.engine.record import OK, merged
 from ctsim.benchmarks.engine.table import Cell, Column, Table, ranked
-from ctsim.benchmarks.methods import TABLE
+from ctsim.benchmarks.methods import FAILED, TABLE
 from ctsim.benchmarks.scores.score import VERSION
 from ctsim.benchmarks.studies.methods import captions, records, tables
 from ctsim.benchmarks.studies.methods.records import METAL, Run, RunRecord, case_of
@@ -111,7 +111,10 @@ def fill(layout: PaperTable, measured: "Measured", protocol: Protocol) -> Sheet:
         columns += [Column(heading.title, heading.group, True, heading.shown.better, part) for part in parts]
     rows, rivals = [], dict[tuple[str, str, int, str], list[tuple[int, int]]]()
     for i, (row, planned) in enumerate(zip(layout.rows, plan, strict=True)):
+        failed = {FAILED.get(p.label, "") for p in planned} - {""}
         rows.append([Cell(stub) for stub in row.stubs])
+        if failed and len({p.label for p in planned}) == 1:
+            rows[-1][-1] = Cell(f"{row.stubs[-1]} †{failed.pop()}")
         for k, p in enumerate(planned):
             for side in sides[k]:
                 key = (layout.columns[k].metric, p.place, i if layout.rank == "across" else k, side)
@@ -296,7 +299,8 @@ def _remarks(used: list[RunRecord], measured: Measured) -> list[str]:
     failed = [f"{r.run.scene}, {r.label}: {r.status} – {r.reason or 'no reason given'}" for r in used if r.status != OK]
     old = [s for s in dict.fromkeys(r.run.scene for r in used) if s in measured.replaced]
     left = "records of older data are left out; the scan was made again"
-    return failed + [f"{scene}: {measured.replaced[scene]} {left}" for scene in old]
+    doubtful = records.doubtful(used)
+    return failed + [doubtful] * bool(doubtful) + [f"{scene}: {measured.replaced[scene]} {left}" for scene in old]
 
 
 def commands(layout: PaperTable, missing: list[Planned]) -> list[str]:
