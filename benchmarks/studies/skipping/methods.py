@@ -26,7 +26,7 @@ from ctsim.benchmarks.studies.methods.attempt import scan_for
 from ctsim.benchmarks.studies.methods.volumes import read_volume
 from ctsim.benchmarks.studies.skipping import effects, simulator
 from ctsim.benchmarks.studies.skipping.simulator import Bench, Cases, Pair, largest
-from ctsim.benchmarks.studies.skipping.study import Flags, Skip
+from ctsim.benchmarks.studies.skipping.study import CORE, Flags, Skip
 from ctsim.dataset.store import StoredScan, open_scan
 from ctsim.phantoms.dataset import make_scenes
 from ctsim.phantoms.scene import Scene, scene_to_toml
@@ -144,7 +144,7 @@ def rows(setup: Bench) -> Iterator[Pair]:
 
 def variants(setup: Bench) -> Iterator[Pair]:
     """Yield scans of one body made together, which share its building and its rays, and made one after another."""
-    scene = setup.scene()
+    scene, doses = setup.scene(), 8 if setup.size == CORE else 4
 
     def scans(metals: tuple[str, ...], voltages: tuple[float, ...], doses: int) -> tuple[Scene, ...]:
         found = []
@@ -160,16 +160,16 @@ def variants(setup: Bench) -> Iterator[Pair]:
         return [array for folder in folders for array in stored_arrays(open_scan(folder))]
 
     for what, many in {
-        "rays of 8 doses": scans(("Fe",), (90.0,), 8),
-        "rays of 2 metals, each at 2 voltages and 2 doses": scans(("Fe", "Ti"), (90.0, 120.0), 2),
+        f"rays of {doses} doses": scans(("Fe",), (90.0,), doses),
+        f"rays of 2 metals, each at 2 voltages and {doses // 4} doses": scans(("Fe", "Ti"), (90.0, 120.0), doses // 4),
     }.items():
         yield Pair(
             scene=scene.name,
-            what=f"{what}: traced once for 8 scans of one body",
+            what=f"{what}: traced once for {len(many)} scans of one body",
             skipping=functools.partial(arrays, [many]),
             whole=functools.partial(arrays, [(one,) for one in many]),
             unit="any array",
-            note="8 scans with twins, built, planned and written",
+            note=f"{len(many)} scans with twins, built, planned and written",
         )
 
 
