@@ -43,7 +43,7 @@ def image(phantom, energy, histories, cells=(3, 3), **more):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("material", "energy"), [("water", 60.0), ("water", 25.0), ("Al", 80.0), ("PMMA", 120.0)])
+@pytest.mark.parametrize(("material", "energy"), [("water", 25.0), ("Al", 80.0)])
 def test_photons_scattered_once_are_as_many_as_quadrature_says(material, energy):
     """The reference shares neither sampling nor tables: xraylib's differential cross-sections, integrated."""
     fine = single_scatter(material, 30.0, energy, POSE, (27, 27), nodes=24)

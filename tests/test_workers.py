@@ -154,6 +154,7 @@ def cluster():
     from distributed import Client, LocalCluster
 
     # a job may be moved from a worker that is killed to the other before that is, too; twice that on a busy machine
+    dask.config.set({"distributed.deploy.lost-worker-timeout": "10m"})  # 15 s are too few on a busy machine
     dask.config.set({"distributed.scheduler.allowed-failures": 4})
     with (
         LocalCluster(

@@ -12,14 +12,14 @@ REST, HC = 510.998950, 12.3984198  # keV, keV·Å
 _LOW, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy")
 def start(rng, key, history):
     """Begin a history's own stream: xoroshiro128+ (Blackman and Vigna 2018) from one Philox block."""
     w0, w1, w2, w3 = philox(history & _LOW, history >> _32, np.uint64(0), np.uint64(1), key & _LOW, key >> _32)
     rng[0], rng[1] = (w0 << _32) | w1, (w2 << _32) | w3 | np.uint64(1)  # all zeros would stay so
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy")
 def uniform(rng):
     """Return a random number within (0, 1)."""
     s0, s1 = rng[0], rng[1]
@@ -30,7 +30,7 @@ def uniform(rng):
     return (float(word >> np.uint64(12)) + 0.5) * 2.0**-52
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy")
 def turn(ray, cos, phi):
     """Turn the direction of a ray by a polar angle and an azimuth about itself."""
     sin = math.sqrt(max(0.0, 1.0 - cos * cos))
@@ -47,7 +47,7 @@ def turn(ray, cos, phi):
     ray[3], ray[4], ray[5] = x * scale, y * scale, z * scale
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy")
 def at(table, energy):
     """Return a table by energy at one energy."""
     place = (energy - E_MIN) * PER_STEP
@@ -55,7 +55,7 @@ def at(table, energy):
     return table[i] + (place - i) * (table[i + 1] - table[i])
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy")
 def bounded(bound, m, q, per_q):
     """Return the incoherent scattering function of a material, per electron."""
     place = min(q * per_q, bound.shape[1] - 1.001)

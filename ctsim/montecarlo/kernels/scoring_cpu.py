@@ -14,7 +14,7 @@ PRIMARY, SINGLE, MULTIPLE, SQUARED = 0, 1, 2, 3
 """Planes of an image: signal of photons by how often they scattered, and the squared signal of all that did."""
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy")
 def _score(images, order, v, u, share, signals, energy):
     """Add a scattered photon's share to the cell at (v, u) within 0 … 1."""
     rows, columns = images.shape[1:]
@@ -23,7 +23,7 @@ def _score(images, order, v, u, share, signals, energy):
     images[SQUARED, j, i] += share * at(signals[1], energy)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy")
 def aim(ray, way, x, y, z):
     """Set `way` to the ray from `ray`'s place to (x, y, z), and its length."""
     dx, dy, dz = x - ray[0], y - ray[1], z - ray[2]
@@ -32,7 +32,7 @@ def aim(ray, way, x, y, z):
     way[3], way[4], way[5], way[6] = dx / length, dy / length, dz / length, length
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy")
 def _grid(beam, way, u, v):
     """Return the share of photons that the anti-scatter grid lets pass: 1 for the source's own direction."""
     pose, extent, normal, _, _, ratio = beam
