@@ -3,5 +3,4 @@
 import ctsim
 
 scan = ctsim.simulate_scene(ctsim.find_scene("quick", "lung-Fe"))
-for method in ("nmar", "splat"):
-    ctsim.score_volume(ctsim.reconstruct_scan(scan, method), scan)
+ctsim.score_volume(ctsim.reconstruct_scan(scan, "nmar"), scan, protocols=["tissue"])
