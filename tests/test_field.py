@@ -19,7 +19,8 @@ from ctsim.reconstruct.field import methods
 from ctsim.reconstruct.field.data import Data, held_out_views, subsets
 from ctsim.reconstruct.field.encoding import Encoding
 from ctsim.reconstruct.field.grid import Grid, overlaps
-from ctsim.reconstruct.field.network import evaluate, first_parameters
+from ctsim.reconstruct.field.kernels import network_reference
+from ctsim.reconstruct.field.network import first_parameters
 from ctsim.reconstruct.field.physics import SERIES, Bins, Curve, Mono, Park, log_sinhc
 from ctsim.reconstruct.field.run import Given
 from ctsim.reconstruct.projector import forward_columns
@@ -50,10 +51,15 @@ class ExactGrid:
         units = np.eye(len(self.grid), dtype=np.float32)
         images = [self.grid.project(torch.from_numpy(u), np.arange(5)).numpy() for u in units]
         self.matrix = torch.from_numpy(np.stack(images, -1).astype(np.float64))
-        self.columns = self.grid.columns
+        self.columns, self.at_points = self.grid.columns, self.grid.at_points
 
     def project(self, values, views):
         return self.matrix[views] @ values
+
+
+def points_of(grid):
+    """Return the places of a grid's points, [point, (y, x, z)]."""
+    return np.stack([at[k] for at, k in zip(grid.axes(), np.nonzero(grid.inside()), strict=True)], 1)
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +117,8 @@ def test_gradients_are_finite_differences(name, power, chosen):
     """In float64, by every parameter of the network and some of the table."""
     physics = PHYSICS[name](chosen)
     grid = physics.grid.grid
-    encoding = Encoding.of(grid.points(), (2, 4), 5)
+    encoding = Encoding.of(grid, (2, 4), 5)
+    rows, shares, _ = network_reference.encode(points_of(grid), (2, 4), 5)
     parameters = first_parameters(encoding, 2, 3, len(physics.scales), 7, torch.float64)
     random = np.random.default_rng(4)
     parameters["table"] *= 1e4  # else the network is next to linear
@@ -121,7 +128,7 @@ def test_gradients_are_finite_differences(name, power, chosen):
     scale = 0.03 * torch.tensor(physics.scales, dtype=torch.float64)
 
     def loss():
-        values = evaluate(encoding, parameters, scale)
+        values = network_reference.evaluate(rows, shares, parameters, scale)
         misfit, penalty = data.misfit(physics.line_integrals(values, VIEWS), VIEWS), physics.penalty(values)
         return misfit if penalty is None else misfit + penalty
 
@@ -239,7 +246,7 @@ def test_points_stand_at_the_centres_of_their_voxels(chosen):
     grid = Grid.of(GEOMETRY, chosen)
     z, y, x = np.nonzero(chosen)
     expected = {((j + 0.5) * 1.5 / 6, (i + 0.5) / 6, (k + 0.5) * 2 / 6) for k, j, i in zip(z, y, x, strict=True)}
-    assert {tuple(np.round(p, 12)) for p in grid.points()} == {tuple(np.round(p, 12)) for p in expected}
+    assert {tuple(np.round(p, 12)) for p in points_of(grid)} == {tuple(np.round(p, 12)) for p in expected}
 
 
 def test_a_finer_grid_is_read_as_means_over_voxels():
@@ -262,7 +269,7 @@ def test_parks_hardening_is_the_closed_form(b):
 
 
 def test_a_seed_draws_the_first_parameters():
-    encoding = Encoding.of(np.random.default_rng(0).random((9, 3)), (2, 4), 5)
+    encoding = Encoding.of(Grid.of(GEOMETRY, np.ones(GEOMETRY.n_voxel, bool)), (2, 4), 5)
     first, again, other = (first_parameters(encoding, 2, 3, 1, seed) for seed in (1, 1, 2))
     for name, drawn in first.items():
         assert torch.equal(drawn, again[name])

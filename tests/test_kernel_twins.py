@@ -203,6 +203,14 @@ def test_slopes_are_normalised_by_the_smoothed_root(threads, delta):
     np.testing.assert_allclose(field, expected, rtol=0, atol=20 * U)
 
 
+def test_smoothed_slopes_are_those_of_the_reference_and_their_roots(threads):
+    x, field, sums = normal(*SHAPE), np.empty((3, *SHAPE), np.float32), np.empty(SHAPE[0])
+    tv_cpu.smoothed_slopes(x, RATIOS, 1e-3, field, sums)
+    np.testing.assert_allclose(field, tv_reference.normalised_slopes(x, RATIOS, np.inf, 1e-3), rtol=0, atol=20 * U)
+    roots = np.sqrt((tv_reference.slopes(x, RATIOS) ** 2).sum(0) + 1e-6)
+    np.testing.assert_allclose(sums, roots.sum((1, 2)), rtol=10 * U)
+
+
 def test_carving_marks_the_pixel_that_a_voxel_falls_on(threads):
     geometry = Geometry(
         dso=60.0, dsd=110.0, n_voxel=SHAPE, d_voxel=(2.0, 1.5, 1.2), n_detector=(4, 6), d_detector=(2.1, 2.3),

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from ctsim.geometry import Geometry
+from ctsim.kernels.lanes import WIDTH, decay, load, spread, store
 from ctsim.reconstruct.splat.columns import LatticeProjector
 from ctsim.reconstruct.splat.kernels import separable_cpu as kernels
 from ctsim.reconstruct.splat.kernels import splat_reference as reference
-from ctsim.reconstruct.splat.kernels.lanes import WIDTH, decay, load, spread, store
 from ctsim.reconstruct.splat.lattice import Lattice
 from ctsim.reconstruct.splat.project import CUTOFF, Projector
 

@@ -8,8 +8,8 @@ import pytest
 from test_splat_project import GEOMETRIES, SMALL, one, splats, with_
 
 from ctsim.errors import InputError
+from ctsim.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.kernels import gradient_reference as reference
-from ctsim.reconstruct.splat.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.kernels.splat_reference import forward_views
 from ctsim.reconstruct.splat.model import Splats
 from ctsim.reconstruct.splat.project import Projector

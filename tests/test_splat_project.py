@@ -9,9 +9,9 @@ import pytest
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat import project
 from ctsim.reconstruct.splat.kernels import splat_reference as reference
-from ctsim.reconstruct.splat.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.model import Splats
 from ctsim.reconstruct.splat.project import Projector
 

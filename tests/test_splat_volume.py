@@ -8,9 +8,9 @@ import torch
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.kernels.lanes import WIDTH
 from ctsim.reconstruct.projector import forward
 from ctsim.reconstruct.splat.kernels import splat_reference as reference
-from ctsim.reconstruct.splat.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.model import Splats
 from ctsim.reconstruct.splat.project import Projector
 from ctsim.reconstruct.splat.volume import voxelise, voxelise_adjoint

@@ -25,10 +25,10 @@ from ctsim.benchmarks.studies.stress.suite import Machine, Rod, Scene, load
 from ctsim.detector.noise import Noise
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.kernels.lanes import WIDTH
 from ctsim.reconstruct import log, starved
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reconstruct.splat import course, level, ordered
-from ctsim.reconstruct.splat.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.learner import seed_splats
 from ctsim.reconstruct.splat.loss import l1_ssim
 from ctsim.reconstruct.splat.objective import SSIM_RANGE, Objective

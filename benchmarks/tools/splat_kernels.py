@@ -17,10 +17,10 @@ from ctsim.benchmarks.cli import guarded
 from ctsim.benchmarks.engine.host import commit, in_turns, machine
 from ctsim.benchmarks.engine.table import simple
 from ctsim.errors import InputError
+from ctsim.kernels.lanes import WIDTH
 from ctsim.phantoms.scanners import preset
 from ctsim.reconstruct.splat.columns import LatticeProjector
 from ctsim.reconstruct.splat.fast import finer
-from ctsim.reconstruct.splat.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.lattice import Lattice
 from ctsim.reconstruct.splat.model import Splats
 from ctsim.reconstruct.splat.project import Projector

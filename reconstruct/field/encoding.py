@@ -1,95 +1,238 @@
-"""The multiresolution hash encoding of points that do not move.
+"""A field μ(x) = s · squareplus(w2ᵀ · relu(w1ᵀ · h(x) + b1) + b2) at the voxels of a grid, h being a hash encoding.
 
 Müller, Evans, Schied and Keller, ACM Trans. Graph. 41, 2022, doi:10.1145/3528223.3530127. A level is a lattice of
 cubes; the features of a point are those of the corners of its cube, interpolated trilinearly, level after level. A
 level whose corners fit into its table has an entry for each ("dense"), any other finds them by the paper's hash.
-As the points stay, all levels together are one sparse matrix, and its transpose, which is stored, too, takes
-gradients back: no entry is looked up twice, and no two threads add to one place.
+The points are voxels and do not move. So every corner is looked up once, interpolation is a product along each axis,
+and the corners of each entry are listed, which takes gradients back without two threads that add to one place.
+squareplus(z) = (z + √(z² + 4))/2 is 1 at 0 (Barron, arXiv:2112.11687, with b = 4).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ctsim.reconstruct.field.kernels import sparse_cpu
+from ctsim.kernels.lanes import WIDTH
+from ctsim.reconstruct.field.grid import Grid
+from ctsim.reconstruct.field.kernels import lattice_cpu, network_cpu
 
 PRIMES = (1, 2654435761, 805459861)  # Müller et al., section 3
-PARTS = 64  # that the rows of a matrix are shared out in
-CORNERS = 8
+TASKS = 16  # that the points are shared out in; each has gradients of its own
+ENTRIES, COLUMNS = 4096, 64  # entries and lattice columns in a task of those
+MULTIPLE = 4  # of inputs and of neurons, as the kernels need
+Ints, Floats = NDArray[np.int32], NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Matrix:
-    """A sparse matrix in compressed rows: the arguments of `sparse_cpu.multiply`, and its number of rows."""
+class Level:
+    """The lattice of one level about the points.
 
-    parts: NDArray[np.int64]
-    starts: NDArray[np.int64]
-    columns: NDArray[np.int32]
-    values: NDArray[np.float32]
+    `lower` is the lower corner of each voxel along y, x and z, `share` that of the upper one. `used` says which corners
+    [y, x, z] some point needs, and `rows` which of the level's rows in the table each of them has.
+    """
+
+    lower: tuple[Ints, ...]
+    share: tuple[Floats, ...]
+    used: NDArray[np.bool_]
+    rows: NDArray[np.int64]
+    n_rows: int
+    dense: bool
 
     @classmethod
-    def of(cls, starts: NDArray[np.int64], columns: NDArray[np.int32], values: NDArray[np.float32]) -> "Matrix":
-        """Share the rows out so that each part has as many entries."""
-        wanted = np.linspace(0, starts[-1], min(PARTS, max(starts.size - 1, 1)) + 1)
-        parts = np.searchsorted(starts, wanted).astype(np.int64)
-        parts[-1] = starts.size - 1
-        return cls(parts=np.unique(parts), starts=starts, columns=columns, values=values)
+    def of(cls, grid: Grid, resolution: int, table: int) -> "Level":
+        """Lay `resolution` cubes along the longest axis, with at most 2^`table` entries."""
+        inside, lower, share = grid.inside(), [], []
+        for at in grid.axes():
+            scaled = at * resolution
+            first = np.clip(np.floor(scaled), 0, resolution - 1).astype(np.int32)
+            lower.append(first)
+            share.append((scaled - first).astype(np.float32))
+        origin = tuple(int(first[0]) for first in lower)
+        corners = tuple(first - start for first, start in zip(lower, origin, strict=True))
+        used = _around(inside, corners)
+        sizes = [int(first[-1]) + 2 for first in lower]
+        dense = math.prod(sizes) <= 1 << table
+        if dense:
+            rows = np.arange(np.count_nonzero(used))
+        else:
+            at = (a.astype(np.int64) + start for a, start in zip(np.nonzero(used), origin, strict=True))
+            y, x, z = (a * prime for a, prime in zip(at, PRIMES, strict=True))
+            slots = (y ^ x ^ z) % (1 << table)
+            taken = np.zeros(1 << table, bool)
+            taken[slots] = True
+            rows = (np.cumsum(taken) - 1)[slots]
+        n_rows = int(rows.max()) + 1
+        return cls(lower=corners, share=tuple(share), used=used, rows=rows, n_rows=n_rows, dense=dense)
 
-    def times(self, table: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Return the product with a table [column, feature]: [row, feature]."""
-        out = np.zeros((self.starts.size - 1, table.shape[1]), table.dtype)
-        sparse_cpu.multiply(self.parts, self.starts, self.columns, self.values, np.ascontiguousarray(table), out)
+
+def _around(inside: NDArray[np.bool_], corners: tuple[Ints, ...]) -> NDArray[np.bool_]:
+    """Return the corners around the voxels `inside`, both [y, x, z]."""
+    for axis, first in enumerate(corners):
+        moved = np.moveaxis(inside, axis, 0)
+        found = np.zeros((int(first[-1]) + 2, *moved.shape[1:]), bool)
+        for voxels, corner in zip(moved, first, strict=True):
+            found[corner] |= voxels
+            found[corner + 1] |= voxels
+        inside = np.moveaxis(found, 0, axis)
+    return np.ascontiguousarray(inside)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lattice:
+    """The lattices of all levels as `lattice_cpu` and `network_cpu` know them, and buffers that each step fills."""
+
+    entry: Ints
+    corners: tuple[NDArray[np.int64], Ints]
+    entry_tasks: NDArray[np.int64]
+    used: NDArray[np.int64]
+    column_tasks: NDArray[np.int64]
+    level: NDArray[np.int64]
+    start: NDArray[np.int64]
+    along_z: tuple[Ints, Floats]
+    between: tuple[Any, ...]
+    columns: tuple[NDArray[np.int64], NDArray[np.int64], Ints]
+    tasks: NDArray[np.int64]
+    places: NDArray[np.int64]
+    held: tuple[NDArray[np.int64], NDArray[np.int64]]
+    buffers: dict[str, Floats] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, grid: Grid, levels: list[Level]) -> "Lattice":
+        """Lay the columns of all levels one after another, z fastest."""
+        n_y, n_x, n_z = (np.array(n) for n in zip(*(level.used.shape for level in levels), strict=True))
+        n_columns = n_y * n_x
+        base, offsets = _starts(n_columns)[:-1], _starts([level.n_rows for level in levels])
+        entry = np.concatenate([_rows(level, first) for level, first in zip(levels, offsets, strict=False)])
+        order = np.argsort(entry, kind="stable").astype(np.int32)
+        unused = np.count_nonzero(entry < 0)
+        corners = (_starts(np.bincount(entry[order[unused:]], minlength=offsets[-1])), order[unused:])
+        of_column = np.repeat(np.arange(len(levels)), n_columns)
+        (low_y, low_x, low_z), (of_y, of_x, of_z) = (
+            [np.stack([getattr(level, name)[axis] for level in levels]) for axis in range(3)]
+            for name in ("lower", "share")
+        )
+        used = np.flatnonzero(np.concatenate([level.used.any(2).reshape(-1) for level in levels]))
+        columns = _columns(grid)
+        tasks = np.searchsorted(columns[1], np.linspace(0, len(grid), TASKS + 1).round())
+        tasks = np.unique(tasks)
+        places, held = _held(tasks, columns[0], low_y, base, n_x)
+        return cls(
+            entry=np.maximum(entry, 0),  # what lies around no point has any row, as it is nowhere read
+            corners=corners,
+            entry_tasks=np.append(np.arange(0, offsets[-1], ENTRIES), offsets[-1]),
+            used=used,
+            column_tasks=np.append(np.arange(0, used.size, COLUMNS), used.size),
+            level=of_column,
+            start=_starts(n_z[of_column]),
+            along_z=(low_z, of_z),
+            between=(base, n_x, low_y, of_y, low_x, of_x),
+            columns=columns,
+            tasks=tasks,
+            places=places,
+            held=held,
+        )
+
+    def buffer(self, name: str, rows: int, length: int) -> Floats:
+        """Return an array that is kept from step to step, zero at first."""
+        if name not in self.buffers or self.buffers[name].shape != (rows, length):
+            self.buffers[name] = np.zeros((rows, length), np.float32)
+        return self.buffers[name]
+
+    def spread(self, table: Floats) -> Floats:
+        """Return a table's features in the lattice columns at each z: [lattice column · feature, z + 8]."""
+        n_f, length = table.shape[1], self.along_z[0].shape[1] + WIDTH
+        out = self.buffer("lattice", self.level.size * n_f, length)
+        lattice_cpu.spread(table, self.entry, self.column_tasks, self.used, self.level, self.start, self.along_z, out)
         return out
+
+    def collect(self, by_lattice: Floats, n_f: int) -> Floats:
+        """Return the gradients by a table from those by the lattice columns of each task."""
+        by_corner = self.buffer("corners", self.entry.size, n_f)
+        lattice_cpu.collapse(
+            by_lattice, self.held, self.column_tasks, self.used, self.level, self.start, self.along_z, by_corner
+        )
+        out = np.empty((self.corners[0].size - 1, n_f), np.float32)
+        lattice_cpu.collect(by_corner, *self.corners, self.entry_tasks, out)
+        return out
+
+
+def _starts(counts: Any) -> NDArray[np.int64]:
+    return np.append(0, np.cumsum(counts)).astype(np.int64)
+
+
+def _rows(level: Level, first: int) -> Ints:
+    """Return the row of each corner of a level, −1 where no point needs it."""
+    rows = np.full(level.used.size, -1, np.int32)
+    rows[level.used.reshape(-1)] = level.rows + first
+    return rows
+
+
+def _columns(grid: Grid) -> tuple[NDArray[np.int64], NDArray[np.int64], Ints]:
+    """Return y and x of each voxel column that has a point, its first point, and z of each point."""
+    n_z, n_y, n_x = grid.geometry.n_voxel
+    y, x, z = np.unravel_index(grid.index, (n_y, n_x, n_z))
+    at, first = np.unique(y * n_x + x, return_index=True)
+    return np.stack([at // n_x, at % n_x], 1), np.append(first, len(grid)), z.astype(np.int32)
+
+
+def _held(
+    tasks: NDArray[np.int64], places: NDArray[np.int64], low_y: Ints, base: NDArray[np.int64], width: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Give each task the rows of lattice columns that its points reach, one level after another.
+
+    Returns how far they lie behind those of the lattices [task + 1, level + 1], in the last place where they begin,
+    and for each lattice column the starts of its places and the places.
+    """
+    n_levels, held = base.size, []
+    behind, n_held = np.zeros((tasks.size, n_levels + 1), np.int64), 0
+    for task in range(tasks.size - 1):
+        behind[task, -1] = n_held
+        first, last = places[tasks[task], 0], places[tasks[task + 1] - 1, 0]
+        for level in range(n_levels):
+            one, end = (base[level] + row * width[level] for row in (low_y[level, first], low_y[level, last] + 2))
+            behind[task, level] = n_held - one
+            held.append(np.arange(one, end))
+            n_held += end - one
+    behind[-1, -1] = n_held
+    lattice = np.concatenate(held)
+    counts = np.bincount(lattice)
+    return behind, (_starts(counts), np.argsort(lattice, kind="stable"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Encoding:
-    """The features of n points: row n·L + l of `matrix` is level l of point n, its columns the rows of the table.
+    """The features of the points of a grid.
 
     `entries` is the number of rows of the table: only those that some point needs. `resolutions` are the numbers of
     cubes along the longest axis, and `dense` says which levels need no hash.
     """
 
-    matrix: Matrix
-    transposed: Matrix
+    lattice: Lattice
+    points: int
     entries: int
     resolutions: tuple[int, ...]
     dense: tuple[bool, ...]
 
     @classmethod
-    def of(cls, points: NDArray[np.float64], resolutions: tuple[int, ...], table: int) -> "Encoding":
-        """Encode points [n, 3], within 0 … 1 along the longest axis, in tables of at most 2^`table` entries a level."""
-        n, n_levels = len(points), len(resolutions)
-        columns, values = np.empty((n, n_levels, CORNERS), np.int32), np.empty((n, n_levels, CORNERS), np.float32)
-        rows, weights = np.empty((n_levels, n * CORNERS), np.int32), np.empty((n_levels, n * CORNERS), np.float32)
-        entries, dense, counts = 0, [], []
-        for level, resolution in enumerate(resolutions):  # one at a time, as sorting all would take more memory
-            at, values[:, level], fits = corners(points, resolution, table)
-            used, at = np.unique(at, return_inverse=True)
-            order = np.argsort(at.reshape(-1), kind="stable")
-            rows[level] = order // CORNERS * n_levels + level
-            weights[level] = values[:, level].reshape(-1)[order]
-            counts.append(np.bincount(at.reshape(-1), minlength=used.size))
-            columns[:, level] = at.reshape(n, CORNERS) + entries
-            entries += used.size
-            dense.append(fits)
-        starts = np.arange(0, columns.size + 1, CORNERS, dtype=np.int64)
-        ends = np.append(0, np.cumsum(np.concatenate(counts))).astype(np.int64)
+    def of(cls, grid: Grid, resolutions: tuple[int, ...], table: int) -> "Encoding":
+        """Encode the points of a grid in tables of at most 2^`table` entries a level."""
+        levels = [Level.of(grid, resolution, table) for resolution in resolutions]
         return cls(
-            matrix=Matrix.of(starts, columns.reshape(-1), values.reshape(-1)),
-            transposed=Matrix.of(ends, rows.reshape(-1), weights.reshape(-1)),
-            entries=entries,
+            lattice=Lattice.of(grid, levels),
+            points=len(grid),
+            entries=sum(level.n_rows for level in levels),
             resolutions=resolutions,
-            dense=tuple(dense),
+            dense=tuple(level.dense for level in levels),
         )
 
-    def __call__(self, table: torch.Tensor) -> torch.Tensor:
-        """Return the features of all points, [point, level · feature], for a table [entry, feature]."""
-        return _Gather.apply(table, self)  # pyright: ignore[reportReturnType]
+    def __call__(self, parameters: dict[str, torch.Tensor], scale: torch.Tensor) -> torch.Tensor:
+        """Return scale · squareplus(w2ᵀ · relu(w1ᵀ · h + b1) + b2) at all points, [point, output]."""
+        given = (parameters[name] for name in ("table", "w1", "b1", "w2", "b2"))
+        return _Evaluate.apply(*given, scale, self)  # pyright: ignore[reportReturnType]
 
 
 def resolutions_of(coarsest: int, finest: int, levels: int | None) -> tuple[int, ...]:
@@ -100,39 +243,41 @@ def resolutions_of(coarsest: int, finest: int, levels: int | None) -> tuple[int,
     return tuple(int(r) for r in np.geomspace(coarsest, finest, n).round()) if n > 1 else (finest,)
 
 
-def corners(
-    points: NDArray[np.float64], resolution: int, table: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64], bool]:
-    """Return the entries [n, 8] of the corners around each point, their weights [n, 8], and whether all fit the table.
-
-    Corner c lies c & 1 cubes further along axis 0, c >> 1 & 1 along axis 1 and c >> 2 along axis 2.
-    """
-    scaled = points * resolution
-    first = np.clip(np.floor(scaled), 0, resolution - 1).astype(np.int64)
-    share = scaled - first
-    sizes = np.max(first, axis=0, initial=0) + 2
-    fits = int(np.prod(sizes)) <= 1 << table
-    at, weights = np.empty((len(points), CORNERS), np.int64), np.empty((len(points), CORNERS))
-    for c in range(CORNERS):
-        step = np.array([c & 1, c >> 1 & 1, c >> 2])
-        i, j, k = (first + step).T
-        if fits:
-            at[:, c] = (i * sizes[1] + j) * sizes[2] + k
-        else:
-            at[:, c] = (i * PRIMES[0] ^ j * PRIMES[1] ^ k * PRIMES[2]) % (1 << table)
-        weights[:, c] = np.prod(np.where(step, share, 1 - share), 1)
-    return at, weights, fits
+def _filled(weights: torch.Tensor, rows: bool, columns: bool) -> Floats:
+    """Return weights with zeros up to multiples of 4."""
+    missing = [-n % MULTIPLE * fill for n, fill in zip(weights.shape, (rows, columns), strict=True)]
+    return np.pad(weights.detach().numpy(), [(0, n) for n in missing])
 
 
-class _Gather(torch.autograd.Function):
+class _Evaluate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, table: torch.Tensor, encoding: Encoding) -> torch.Tensor:
-        ctx.encoding = encoding
-        features = encoding.matrix.times(table.detach().numpy())
-        return torch.from_numpy(features.reshape(-1, len(encoding.resolutions) * table.shape[1]))
+    def forward(ctx: Any, table, w1, b1, w2, b2, scale, encoding) -> torch.Tensor:
+        lattice, n_f = encoding.lattice, table.shape[1]
+        network = (
+            _filled(w1, True, True), _filled(b1[None], False, True), _filled(w2, True, False),
+            b2[None].detach().numpy().copy(), scale.numpy(),
+        )  # fmt: skip
+        values = lattice.spread(np.ascontiguousarray(table.detach().numpy()))
+        out = np.empty((encoding.points, w2.shape[1]), np.float32)
+        network_cpu.forward(lattice.tasks, lattice.columns, values, n_f, lattice.between, network, out)
+        ctx.lattice, ctx.network, ctx.values, ctx.sizes = lattice, network, values, (*w1.shape, n_f)
+        return torch.from_numpy(out)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, None]:
-        (gradient,), levels = gradients, len(ctx.encoding.resolutions)
-        by_rows = gradient.detach().numpy().reshape(-1, gradient.shape[1] // levels)
-        return torch.from_numpy(ctx.encoding.transposed.times(by_rows)), None
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        lattice, (n_i, n_j, n_f) = ctx.lattice, ctx.sizes
+        held = lattice.buffer("held", lattice.places[-1, -1] * n_f, ctx.values.shape[1])
+        gradient = np.ascontiguousarray(gradients[0].numpy())
+        by_w1, by_b1, by_w2, by_b2 = network_cpu.backward(
+            lattice.tasks,
+            lattice.columns,
+            ctx.values,
+            n_f,
+            lattice.between,
+            ctx.network,
+            gradient,
+            lattice.places,
+            held,
+        )
+        found = (lattice.collect(held, n_f), by_w1[:n_i, :n_j], by_b1[:n_j], by_w2[:n_j], by_b2)
+        return *(torch.from_numpy(np.ascontiguousarray(g)) for g in found), None, None

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ctsim.reconstruct.field.data import Data, held_out_views, subsets
 from ctsim.reconstruct.field.encoding import Encoding, resolutions_of
 from ctsim.reconstruct.field.grid import Grid
-from ctsim.reconstruct.field.network import Adam, evaluate, first_parameters, rate_share
+from ctsim.reconstruct.field.network import Adam, first_parameters, rate_share
 from ctsim.reconstruct.field.physics import Physics
 from ctsim.reconstruct.primary import Readings
 from ctsim.reconstruct.settings import about
@@ -60,7 +60,7 @@ class Fit:
         self.physics, self.grid, self.data, self.settings = physics, grid, data, settings
         finest = max(grid.whole.n_voxel)
         levels = resolutions_of(settings.coarsest, finest, settings.levels)
-        self.encoding = Encoding.of(grid.points(), levels, settings.table)
+        self.encoding = Encoding.of(grid, levels, settings.table)
         self.scale = torch.tensor([unit * s for s in physics.scales], dtype=torch.float32)
         first = first_parameters(self.encoding, settings.features, settings.width, len(physics.scales), settings.seed)
         self.adam = Adam(parameters=first, rate=settings.rate)
@@ -112,7 +112,7 @@ class Fit:
 
     def objective(self, parameters: dict[str, torch.Tensor], views: NDArray[np.int64]) -> torch.Tensor:
         """Return the misfit of some views and the penalty."""
-        values = evaluate(self.encoding, parameters, self.scale)
+        values = self.encoding(parameters, self.scale)
         misfit = self.data.misfit(self.physics.line_integrals(values, views), views)
         penalty = self.physics.penalty(values)
         return misfit if penalty is None else misfit + penalty
@@ -120,12 +120,12 @@ class Fit:
     def now(self) -> torch.Tensor:
         """Return the field as it is, [point, output]."""
         with torch.no_grad():
-            return evaluate(self.encoding, self.adam.parameters, self.scale)
+            return self.encoding(self.adam.parameters, self.scale)
 
     def found(self) -> torch.Tensor:
         """Return the field that met the held-out views best, if there are any, else the last: [point, output]."""
         with torch.no_grad():
-            return evaluate(self.encoding, self.best or self.adam.parameters, self.scale)
+            return self.encoding(self.best or self.adam.parameters, self.scale)
 
     def _judge(self) -> None:
         with torch.no_grad():

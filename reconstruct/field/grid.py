@@ -57,19 +57,32 @@ class Grid:
     def __len__(self) -> int:
         return self.index.size
 
-    def points(self) -> NDArray[np.float64]:
-        """Return the centres [point, (y, x, z)], from 0 to 1 along the whole grid's longest axis."""
+    def inside(self) -> NDArray[np.bool_]:
+        """Return which voxels of the box are points, [y, x, z]."""
         n_z, n_y, n_x = self.geometry.n_voxel
-        at = np.stack(np.unravel_index(self.index, (n_y, n_x, n_z)), 1)
-        first, size = (np.array([a[1], a[2], a[0]], np.float64) for a in (self.box, self.whole.d_voxel))
-        longest = max(n * d for n, d in zip(self.whole.n_voxel, self.whole.d_voxel, strict=True))
-        return np.asarray((at + first + 0.5) * size / longest, np.float64)
+        found = np.zeros(n_y * n_x * n_z, bool)
+        found[self.index] = True
+        return found.reshape(n_y, n_x, n_z)
+
+    def axes(self) -> tuple[NDArray[np.float64], ...]:
+        """Return the centres of the box's voxels along y, x and z, from 0 to 1 along the whole grid's longest axis."""
+        sizes = self.whole.d_voxel
+        longest = max(n * d for n, d in zip(self.whole.n_voxel, sizes, strict=True))
+        numbers = (
+            np.arange(n, dtype=np.float64) + first for n, first in zip(self.geometry.n_voxel, self.box, strict=True)
+        )
+        z, y, x = ((number + 0.5) * d / longest for number, d in zip(numbers, sizes, strict=True))
+        return y, x, z
 
     def columns(self, values: torch.Tensor) -> torch.Tensor:
         """Put values [point] into the box, 0 elsewhere: [y, x, z]."""
         n_z, n_y, n_x = self.geometry.n_voxel
         empty = torch.zeros(n_y * n_x * n_z, dtype=values.dtype)
         return empty.index_put((torch.from_numpy(self.index),), values).view(n_y, n_x, n_z)
+
+    def at_points(self, columns: torch.Tensor) -> torch.Tensor:
+        """Return the values of the box [y, x, z] at the points: [point]."""
+        return columns.reshape(-1)[torch.from_numpy(self.index)]
 
     def of_volume(self, volume: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return a volume's values [z, y, x] at the points: [point]."""
@@ -113,4 +126,4 @@ class _Project(torch.autograd.Function):
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, None, None]:
         images = np.ascontiguousarray(gradients[0].detach().float().numpy())
         columns = adjoint_columns(images, ctx.grid.geometry, ctx.views)
-        return torch.from_numpy(columns.reshape(-1)[ctx.grid.index]).to(ctx.kind), None, None
+        return ctx.grid.at_points(torch.from_numpy(columns)).to(ctx.kind), None, None

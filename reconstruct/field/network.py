@@ -1,7 +1,6 @@
-"""The network of a field, μ(x) = s · squareplus(W2 · relu(W1 · h(x) + b1) + b2), and the steps of Adam that train it.
+"""The parameters of a field's network, and the steps of Adam that train them.
 
-Adam is that of Kingma and Ba, ICLR 2015, arXiv:1412.6980; squareplus that of Barron, arXiv:2112.11687, with b = 4,
-which is 1 at 0. Everything works in float32 and float64, so that gradients can be compared with finite differences.
+Adam is that of Kingma and Ba, ICLR 2015, arXiv:1412.6980.
 """
 
 import math
@@ -18,11 +17,6 @@ FIRST = 1e-4  # greatest first entry of a table (Müller et al. 2022)
 BETAS, EPSILON = (0.9, 0.99), 1e-15  # of Adam, as Müller et al. train tables
 TABLE_RATE = 2.0  # of a table, times the learning rate
 Parameters = dict[str, torch.Tensor]
-
-
-def squareplus(x: torch.Tensor) -> torch.Tensor:
-    """Return (x + √(x² + 4)) / 2."""
-    return 0.5 * (x + torch.sqrt(x * x + 4))
 
 
 def first_parameters(
@@ -42,12 +36,6 @@ def first_parameters(
         "w2": drawn(1 / math.sqrt(width), width, outputs),
         "b2": torch.zeros(outputs, dtype=kind),
     }
-
-
-def evaluate(encoding: Encoding, parameters: Mapping[str, torch.Tensor], scale: torch.Tensor) -> torch.Tensor:
-    """Return the field at all points, [point, output], in the unit of `scale` [output]."""
-    hidden = torch.relu_(torch.addmm(parameters["b1"], encoding(parameters["table"]), parameters["w1"]))
-    return scale * squareplus(torch.addmm(parameters["b2"], hidden, parameters["w2"]))
 
 
 @dataclass(slots=True, kw_only=True)

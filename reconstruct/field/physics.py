@@ -6,13 +6,15 @@ integrals (`Grid.project`).
 
 import math
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ctsim.reconstruct.field.grid import Grid, Views
+from ctsim.reconstruct.kernels import tv_cpu
+from ctsim.reconstruct.splat.kernels import curve_cpu
 
 Image = NDArray[np.float32]
 SERIES = 0.1  # below which log(sinh b / b) is its series
@@ -156,9 +158,7 @@ class Curve:
 
     def densities_of(self, u: torch.Tensor) -> torch.Tensor:
         """Return ρa and ρb, [point, 2]."""
-        last = self.slopes.shape[0] - 1
-        piece = (torch.bucketize(u.detach(), self.knots, right=True) - 1).clamp(0, last)
-        return self.densities[piece] + self.slopes[piece] * (u - self.knots[piece])[:, None]
+        return _Densities.apply(u, self)  # pyright: ignore[reportReturnType]
 
     def line_integrals(self, values: torch.Tensor, views: Views) -> torch.Tensor:
         """Return P with the scatter, without it where a reading is a bound."""
@@ -173,12 +173,41 @@ class Curve:
 
     def penalty(self, values: torch.Tensor) -> torch.Tensor | None:
         """Return total variation."""
-        if not self.tv:
-            return None
-        volume = self.grid.columns(values[:, 0]) / self.knots[1]
-        squares = torch.full_like(volume, SMOOTH**2)
-        n_y, n_x, n_z = volume.shape
-        squares[: n_y - 1] += (self.ratios[0] * (volume[1:] - volume[:-1])) ** 2
-        squares[:, : n_x - 1] += (self.ratios[1] * (volume[:, 1:] - volume[:, :-1])) ** 2
-        squares[:, :, : n_z - 1] += (self.ratios[2] * (volume[:, :, 1:] - volume[:, :, :-1])) ** 2
-        return self.tv * torch.sqrt(squares).sum() / math.prod(self.grid.whole.n_voxel)
+        return _Variation.apply(values[:, 0], self) if self.tv else None  # pyright: ignore[reportReturnType]
+
+
+class _Densities(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, u: torch.Tensor, curve: Curve) -> torch.Tensor:
+        knots, densities, slopes = (t.double().numpy() for t in (curve.knots, curve.densities, curve.slopes))
+        ctx.u, ctx.knots, ctx.slopes = u.detach().contiguous().numpy(), knots, slopes
+        out = np.empty((u.numel(), 2), ctx.u.dtype)
+        curve_cpu.evaluate(ctx.u, knots, densities, slopes, 1.0, out)
+        return torch.from_numpy(out)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, None]:
+        out = np.empty_like(ctx.u)
+        curve_cpu.transpose(ctx.u, ctx.knots, ctx.slopes, gradients[0].contiguous().numpy(), out)
+        return torch.from_numpy(out), None
+
+
+class _Variation(torch.autograd.Function):
+    """Total variation, its root rounded; the gradient is worked out along with it."""
+
+    @staticmethod
+    def forward(ctx: Any, u: torch.Tensor, curve: Curve) -> torch.Tensor:
+        water, grid = float(curve.knots[1]), curve.grid
+        volume = grid.columns(u.detach() / water).numpy()
+        ratios = np.array(curve.ratios, volume.dtype)
+        field, sums = np.empty((3, *volume.shape), volume.dtype), np.empty(len(volume))
+        tv_cpu.smoothed_slopes(volume, ratios, SMOOTH, field, sums)
+        by_volume = np.empty_like(volume)
+        tv_cpu.transposed(field, ratios, by_volume)
+        weight = curve.tv / math.prod(grid.whole.n_voxel)
+        ctx.gradient = grid.at_points(torch.from_numpy(by_volume)) * (weight / water)
+        return torch.tensor(weight * float(sums.sum()), dtype=u.dtype)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, None]:
+        return gradients[0] * ctx.gradient, None

@@ -89,6 +89,20 @@ def normalised_slopes(x, ratios, per_delta, least, field):
                 field[0, i, j, k], field[1, i, j, k], field[2, i, j, k] = u * a / root, v * b / root, w * c / root
 
 
+@njit(parallel=True, cache=True, error_model="numpy")
+def smoothed_slopes(x, ratios, least, field, sums):
+    """Fill `field` with slopes over their smoothed root √(|D x|² + least²), and `sums` float64 [y] with the roots'."""
+    for i in prange(x.shape[0]):
+        total = 0.0
+        for j in range(x.shape[1]):
+            for k in range(x.shape[2]):
+                a, b, c = _slope(x, i, j, k, ratios)
+                root = math.sqrt(a * a + b * b + c * c + least * least)
+                total += root
+                field[0, i, j, k], field[1, i, j, k], field[2, i, j, k] = a / root, b / root, c / root
+        sums[i] = total
+
+
 @njit(parallel=True, cache=True)
 def transposed(field, ratios, gradient):
     """Fill `gradient` [y, x, z] with Dᵀ field."""

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.geometry import Geometry
+from ctsim.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.kernels import separable_cpu as kernels
-from ctsim.reconstruct.splat.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.kernels.splat_cpu import DEPTH, DUAL_U, DUAL_V
 from ctsim.reconstruct.splat.lattice import Lattice
 from ctsim.reconstruct.splat.project import Projector

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.kernels.lanes import WIDTH
 from ctsim.reconstruct.projector import Views, view_indices
 from ctsim.reconstruct.splat.kernels import gradient_cpu
 from ctsim.reconstruct.splat.kernels import splat_cpu as kernels
-from ctsim.reconstruct.splat.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.model import Splats
 
 CUTOFF = 3.5

@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.kernels import voxelise_cpu as kernels
-from ctsim.reconstruct.splat.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.model import Splats
 from ctsim.reconstruct.splat.project import CUTOFF
 

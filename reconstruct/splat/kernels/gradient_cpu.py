@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from ctsim.reconstruct.splat.kernels.lanes import WIDTH, add, fma, load, mul, ramp, spread, total
+from ctsim.kernels.lanes import WIDTH, add, fma, load, mul, ramp, spread, total
 from ctsim.reconstruct.splat.kernels.splat_cpu import (
     C_UU,
     C_UV,

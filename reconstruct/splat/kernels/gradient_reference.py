@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.reconstruct.splat.kernels.lanes import WIDTH
+from ctsim.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.kernels.splat_reference import rotation_matrices, shadow, spreads, weights
 
 Array = NDArray[np.floating]

@@ -20,8 +20,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from ctsim.kernels.once import compiled_once
-from ctsim.reconstruct.splat.kernels.lanes import (
+from ctsim.kernels.lanes import (
     WIDTH,
     add,
     decay,
@@ -40,6 +39,7 @@ from ctsim.reconstruct.splat.kernels.lanes import (
     sub,
     upper,
 )
+from ctsim.kernels.once import compiled_once
 from ctsim.reconstruct.splat.kernels.splat_cpu import (
     BOX,
     CUTOFF,

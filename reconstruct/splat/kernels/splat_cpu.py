@@ -23,7 +23,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from ctsim.reconstruct.splat.kernels.lanes import (
+from ctsim.kernels.lanes import (
     WIDTH,
     below,
     div,

@@ -15,7 +15,7 @@ Shapes and cameras are those of `splat_cpu`; images are [view, channel · v, u +
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.reconstruct.splat.kernels.lanes import WIDTH
+from ctsim.kernels.lanes import WIDTH
 
 Array = NDArray[np.floating]
 

@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from ctsim.reconstruct.splat.kernels.lanes import WIDTH, exp, fma, load, mul, ramp, spread, store, total
+from ctsim.kernels.lanes import WIDTH, exp, fma, load, mul, ramp, spread, store, total
 from ctsim.reconstruct.splat.kernels.splat_cpu import CHUNKS, LARGEST
 
 SLABS = 16  # at most this many slabs of slices; a task adds splats to a slab in their order
