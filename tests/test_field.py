@@ -119,7 +119,7 @@ def test_gradients_are_finite_differences(name, power, chosen):
     grid = physics.grid.grid
     encoding = Encoding.of(grid, (2, 4), 5)
     rows, shares, _ = network_reference.encode(points_of(grid), (2, 4), 5)
-    parameters = first_parameters(encoding, 2, 3, len(physics.scales), 7, torch.float64)
+    parameters = {n: p.double() for n, p in first_parameters(encoding, 2, 3, len(physics.scales), 7).items()}
     random = np.random.default_rng(4)
     parameters["table"] *= 1e4  # else the network is next to linear
     parameters["b2"] += torch.from_numpy(random.random(len(physics.scales)))  # else bins may be equal, a kink
@@ -317,12 +317,12 @@ def _interrupted(scan, told):
 def test_held_out_views_choose_the_field_that_is_returned(scan, monkeypatch):
     """A fit that runs away after its third turn returns that turn's field."""
     judged = iter([3.0, 2.0, 1.0] + [5.0] * 100)
-    real = Data.misfit
+    real = Data.misfits
 
-    def misfit(self, found, views):
-        return torch.tensor(next(judged)) if not found.requires_grad else real(self, found, views)
+    def misfits(self, found, views):
+        return torch.tensor([next(judged)]) if not found.requires_grad else real(self, found, views)
 
-    monkeypatch.setattr(Data, "misfit", misfit)
+    monkeypatch.setattr(Data, "misfits", misfits)
     volume = methods.naf(scan, steps=40, views=6)
     turn = len(subsets(np.arange(11), 6, 0, 0))
     held = volume.details["held_out"]

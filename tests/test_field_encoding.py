@@ -73,6 +73,7 @@ CASES = [
     ((7, 12, 30), (2, 1.5, 1), (3, 8, 30), TABLE, 3, 5, 3),
     ((11, 6, 5), (3, 1, 1), (2,), 19, 1, 1, 2),
     ((5, 40, 6), (1, 1, 1), (8, 15, 25, 40), 19, 2, 16, 8),
+    ((5, 5, 60), (1, 5, 0.25), (4, 60), 19, 4, 8, 1),  # twenty cubes a voxel: most corners are beside none
 ]
 
 
@@ -108,10 +109,11 @@ def test_the_field_and_its_gradients_are_those_of_the_reference(
     found = values_and_gradients(encoding, torch.float32, lambda p: p.clone())
     expected = values_and_gradients(reference, torch.float64, lambda p: p.clone())
     sums = values_and_gradients(reference, torch.float64, torch.abs)
-    terms = len(grid) + features * len(levels) + width + 20  # of the longest sum, and what a term is a product of
-    for one, other, total in zip(found, expected, sums, strict=True):
+    terms = features * len(levels) + width + 20  # of the longest sum of a value, and what a term is a product of
+    for number, (one, other, total) in enumerate(zip(found, expected, sums, strict=True)):
         assert one.shape == other.shape
-        assert bool(((one - other).abs() <= terms * U * 2 * total).all())  # 2: squareplus' slope is ½ at 0, not 1
+        roundings = terms + len(grid) * (number > 0)  # gradients are sums over points
+        assert bool(((one - other).abs() <= roundings * U * 2 * total).all())  # 2: squareplus' slope is ½ at 0, not 1
 
 
 def test_no_bit_depends_on_the_number_of_threads():
@@ -120,26 +122,65 @@ def test_no_bit_depends_on_the_number_of_threads():
     grid = grid_of((70, 20, 24), 2)
     encoding = Encoding.of(grid, (8, 24, 70), 10)
     before, results = numba.get_num_threads(), []
-    for threads in (1, 2):
-        numba.set_num_threads(threads)
-        parameters = {n: p.requires_grad_() for n, p in first_parameters(encoding, 4, 32, 2, 1).items()}
-        values = encoding(parameters, torch.tensor([1.0, 2.0]))
-        gradients = torch.autograd.grad((values * values.detach()).sum(), list(parameters.values()))
-        results.append([values.detach(), *gradients])
-    numba.set_num_threads(before)
+    try:
+        for threads in (1, 2):
+            numba.set_num_threads(threads)
+            results.append(_passes(encoding, first_parameters(encoding, 4, 32, 2, 1)))
+    finally:
+        numba.set_num_threads(before)
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
-def test_a_second_pass_has_the_gradients_of_the_first():
-    """Buffers are kept from step to step."""
-    grid = grid_of((9, 12, 10), 4)
-    encoding = Encoding.of(grid, (3, 12), TABLE)
-    parameters = {n: p.requires_grad_() for n, p in first_parameters(encoding, 4, 8, 1, 1).items()}
-    passes = []
-    for _ in range(2):
-        values = encoding(parameters, torch.ones(1))
-        passes.append(torch.autograd.grad((values**2).sum(), list(parameters.values())))
-    assert all(torch.equal(a, b) and bool(a.any()) for a, b in zip(*passes, strict=True))
+def _passes(encoding, given):
+    parameters = {n: p.clone().requires_grad_() for n, p in given.items()}
+    values = encoding(parameters, torch.linspace(1, 2, given["b2"].numel()))
+    return [values.detach(), *torch.autograd.grad((values * values.detach()).sum(), list(parameters.values()))]
+
+
+def test_buffers_pass_nothing_on():
+    """Between the halves of a pass another may come, and what a buffer held does not matter."""
+    encoding = Encoding.of(grid_of((9, 12, 10), 4), (3, 12), TABLE)
+    one, other = (first_parameters(encoding, 4, 8, 1, seed) for seed in (1, 2))
+    expected = _passes(encoding, one)
+    for name in ("copies", "corners"):
+        encoding.lattice.buffers[name].fill(np.nan)
+    parameters = {n: p.clone().requires_grad_() for n, p in one.items()}
+    values = encoding(parameters, torch.ones(1))
+    _passes(encoding, other)
+    found = torch.autograd.grad((values * values.detach()).sum(), list(parameters.values()))
+    assert all(torch.equal(a, b) and bool(a.any()) for a, b in zip(found, expected[1:], strict=True))
+
+
+@pytest.mark.parametrize("chosen", [(3, 2, 1), (slice(0, 150, 149), 2, 2), (slice(None), 1, 3), (4, slice(None), 2)])
+def test_few_points_are_enough(chosen):
+    """One voxel, two with a gap of several blocks between, a column, a row: fewer than tasks."""
+    inside = np.zeros((150, 7, 5), bool)
+    inside[chosen] = True
+    grid = Grid.of(msgspec.structs.replace(GEOMETRY, n_voxel=inside.shape), inside)
+    encoding = Encoding.of(grid, (2, 7), TABLE)
+    rows, weights, _ = network_reference.encode(points_of(grid), (2, 7), TABLE)
+    given = first_parameters(encoding, 2, 3, 1, 0)
+    given["table"] *= 1e4
+    expected = network_reference.evaluate(rows, weights, {n: p.double() for n, p in given.items()}, torch.ones(1))
+    found, *gradients = _passes(encoding, given)
+    assert torch.allclose(found.double(), expected, rtol=1e-6) and all(g.isfinite().all() for g in gradients)
+
+
+def test_what_is_no_number_is_seen():
+    encoding = Encoding.of(grid_of((9, 12, 10), 4), (3, 12), TABLE)
+    given = first_parameters(encoding, 4, 8, 1, 1)
+    given["table"][0] = np.nan
+    assert _passes(encoding, given)[0].isnan().any()
+
+
+@pytest.mark.parametrize("name", ["table", "w1", "b1", "w2", "b2", "scale"])
+def test_shapes_and_types_are_checked_before_a_kernel_sees_them(name):
+    encoding = Encoding.of(grid_of((9, 12, 10), 4), (3, 12), TABLE)
+    given = first_parameters(encoding, 4, 8, 2, 1) | {"scale": torch.ones(2)}
+    for wrong in (given[name][1:], given[name].double()):
+        changed = given | {name: wrong}
+        with pytest.raises(ValueError, match=r" must be float32 \("):
+            encoding(changed, changed["scale"])
 
 
 def test_levels_double_up_to_the_finest():

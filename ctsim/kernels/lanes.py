@@ -168,20 +168,20 @@ def fma(typingctx, a, b, c):
 
 @_operation
 def positive(typingctx, a):
-    """Return max(a, 0)."""
+    """Return max(a, 0), and NaN where a is."""
 
     def codegen(context, builder, signature, args):
-        return _call(builder, "maxnum", args[0], _same(0.0))
+        return builder.select(builder.fcmp_ordered("<", args[0], _same(0.0)), _same(0.0), args[0])
 
     return lanes(lanes), codegen
 
 
 @_operation
 def where_positive(typingctx, a, b):
-    """Return b where a > 0, else 0."""
+    """Return b where a > 0 or NaN, else 0."""
 
     def codegen(context, builder, signature, args):
-        return builder.select(builder.fcmp_ordered(">", args[0], _same(0.0)), args[1], _same(0.0))
+        return builder.select(builder.fcmp_unordered(">", args[0], _same(0.0)), args[1], _same(0.0))
 
     return lanes(lanes, lanes), codegen
 

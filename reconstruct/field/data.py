@@ -31,10 +31,14 @@ class Data:
 
     def misfit(self, found: torch.Tensor, views: Views) -> torch.Tensor:
         """Return the mean of weight · |p − P|^power over the pixels of some views; `found` is P [view, v, u]."""
+        return self.misfits(found, views).mean()
+
+    def misfits(self, found: torch.Tensor, views: Views) -> torch.Tensor:
+        """Return weight · |p − P|^power of each pixel, [view, v, u]."""
         weights = torch.from_numpy(self.weights[views]).to(found.dtype)
         lacking = torch.from_numpy(self.p[views]).to(found.dtype) - found
         lacking = torch.where(weights < 0, lacking.clamp(min=0), lacking)
-        return (weights.abs() * (lacking.abs() if self.power == 1 else lacking * lacking)).mean()
+        return weights.abs() * (lacking.abs() if self.power == 1 else lacking * lacking)
 
 
 def held_out_views(n_views: int) -> Views:

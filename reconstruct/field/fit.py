@@ -130,7 +130,8 @@ class Fit:
     def _judge(self) -> None:
         with torch.no_grad():
             paths = self.physics.line_integrals(self.now(), self.held_out)
-            misfit = float(self.data.misfit(paths, self.held_out))
+            terms = self.data.misfits(paths, self.held_out).numpy()
+        misfit = float(terms.mean(dtype=np.float64))  # by numpy, as torch's mean depends on the number of threads
         self.idle += 1
         if misfit < self.best_misfit:
             self.best = {name: p.clone() for name, p in self.adam.parameters.items()}
@@ -167,8 +168,8 @@ class Fit:
             steps, self.view_updates, self.best_step, self.idle = state["numbers"].tolist()
             before, self.loss, self.best_misfit = state["reals"].tolist()
             self.adam.restore(state, steps)
-            kept = {k.removeprefix("best."): v for k, v in state.items() if k.startswith("best.")}
-            self.best = {name: torch.from_numpy(kept[name]) for name in self.adam.parameters} if kept else {}
+            kept = {k.removeprefix("best."): torch.from_numpy(v) for k, v in state.items() if k.startswith("best.")}
+            self.best = {name: kept[name].view_as(p) for name, p in self.adam.parameters.items()} if kept else {}
         except (KeyError, TypeError, ValueError) as error:
             raise checkpoint.damaged(error) from None
         return Stopwatch(before + stopwatch.seconds, stopwatch.limit)

@@ -19,14 +19,12 @@ TABLE_RATE = 2.0  # of a table, times the learning rate
 Parameters = dict[str, torch.Tensor]
 
 
-def first_parameters(
-    encoding: Encoding, features: int, width: int, outputs: int, seed: int, kind: torch.dtype = torch.float32
-) -> Parameters:
+def first_parameters(encoding: Encoding, features: int, width: int, outputs: int, seed: int) -> Parameters:
     """Draw the parameters to start from: tables next to 0, so that all points start at squareplus(0) = 1."""
     generator = torch.Generator().manual_seed(seed)
 
     def drawn(greatest: float, *shape: int) -> torch.Tensor:
-        return (torch.rand(shape, generator=generator, dtype=kind) * 2 - 1) * greatest
+        return (torch.rand(shape, generator=generator, dtype=torch.float32) * 2 - 1) * greatest
 
     inputs = features * len(encoding.resolutions)
     return {
@@ -34,7 +32,7 @@ def first_parameters(
         "w1": drawn(1 / math.sqrt(inputs), inputs, width),
         "b1": drawn(1 / math.sqrt(inputs), width),
         "w2": drawn(1 / math.sqrt(width), width, outputs),
-        "b2": torch.zeros(outputs, dtype=kind),
+        "b2": torch.zeros(outputs, dtype=torch.float32),
     }
 
 

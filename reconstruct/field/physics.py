@@ -177,6 +177,8 @@ class Curve:
 
 
 class _Densities(torch.autograd.Function):
+    """The material curve at each point."""
+
     @staticmethod
     def forward(ctx: Any, u: torch.Tensor, curve: Curve) -> torch.Tensor:
         knots, densities, slopes = (t.double().numpy() for t in (curve.knots, curve.densities, curve.slopes))

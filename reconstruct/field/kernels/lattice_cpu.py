@@ -40,14 +40,14 @@ def spread(table, entry, tasks, used, level, start, along_z, out):
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def collapse(sums, held, tasks, used, level, start, along_z, out):
+def collapse(sums, copies, tasks, used, level, start, along_z, out):
     """Take gradients by the lattice columns along z to those by corners: the transpose of `spread`, but for the table.
 
-    `sums` [held column · feature, z or more] holds a lattice column once for each task that adds to it: `held` has
-    the starts [lattice column + 1] of its places, and the places. `out` [corner, feature].
+    `sums` [copy · feature, z or more] holds a lattice column once for each task that adds to it: `copies` has
+    the starts [lattice column + 1] of a lattice column's copies, and the copies. `out` [corner, feature].
     """
     first, share = along_z
-    starts, places = held
+    starts, numbers = copies
     n_f, n_z = out.shape[1], first.shape[1]
     for task in prange(tasks.size - 1):
         line, corners = np.empty(n_z, np.float32), np.empty(first[:, n_z - 1].max() + 2, np.float32)
@@ -57,8 +57,8 @@ def collapse(sums, held, tasks, used, level, start, along_z, out):
             n = start[column + 1] - at
             for f in range(n_f):
                 line[:] = ZERO
-                for place in range(starts[column], starts[column + 1]):
-                    own = sums[places[place] * n_f + f]
+                for copy in range(starts[column], starts[column + 1]):
+                    own = sums[numbers[copy] * n_f + f]
                     for z in range(n_z):
                         line[z] += own[z]
                 corners[:n] = ZERO

@@ -1,14 +1,14 @@
 """The network of a field at all points, and its gradients, on the CPU.
 
 A block of up to 64 points of a voxel column is worked on at a time, so that features and neurons stay in the cache;
-the backward pass works them out again. Products with the weights keep eight sums in registers. A task has some rows
-of voxels, and sums of its own: results are bitwise equal for any number of threads. float32.
+the backward pass works them out again. Products with the weights keep eight sums in registers. A task has a run of
+voxel columns, and sums of its own: results are bitwise equal for any number of threads. float32.
 
 A column of voxels stands between four lattice columns of each level (`lattice_cpu`); `between` has, for each level,
 the first lattice column and how many stand in a row, and for y and for x the lower corner and the share of the upper
 one of each voxel, [level, y] and [level, x]. `columns` has y and x of each voxel column [column, 2], its first point
-[column + 1], and z of each point. `tasks` are voxel columns, too: task k has those from `tasks[k]` to the next.
-Weights are those of `evaluate`, with neurons and inputs filled up with zeros to multiples of 4.
+[column + 1], and z of each point. Task k has the voxel columns from `tasks[k]` to the next. Nothing is checked here:
+inputs and neurons are filled up with zeros to multiples of `MULTIPLE`.
 """
 
 import numpy as np
@@ -17,7 +17,8 @@ from numba import njit, prange
 from ctsim.kernels.lanes import WIDTH, add, div, fma, load, mul, pick, positive, spread, sqrt, store, where_positive
 from ctsim.kernels.once import compiled_once
 
-BLOCK = 64
+BLOCK = 8 * WIDTH  # a multiple of 4 · WIDTH, which `_sums` takes at a time
+MULTIPLE = 4  # of inputs and neurons, as their products take so many at a time
 ZERO, HALF, ONE, FOUR = np.float32(0), np.float32(0.5), np.float32(1), np.float32(4)
 _MATRIX = "float32[:,::1]"
 _COLUMNS = "Tuple((int64[:,::1], int64[::1], int32[::1]))"
@@ -50,15 +51,15 @@ def _blend(lattice, between, at, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _blend_back(gradient, between, at, place, sums):
+def _blend_back(gradient, between, at, behind, sums):
     """Add the gradients by a block's features, [input, point], to those by lattice columns.
 
-    `place[level]` is where the columns of a task lie in `sums`, less where they lie in the lattices.
+    `behind[level]` is by how much a task's own columns in `sums` lie behind those of the lattices.
     """
     base, width, first_y, share_y, first_x, share_x = between
     y, x, z, n, n_f = at
     for level in range(base.size):
-        column = place[level] + base[level] + first_y[level, y] * width[level] + first_x[level, x]
+        column = behind[level] + base[level] + first_y[level, y] * width[level] + first_x[level, x]
         a, b, c, d = _weights(share_y[level, y], share_x[level, x])
         va, vb, vc, vd = spread(a), spread(b), spread(c), spread(d)
         for f in range(n_f):
@@ -203,7 +204,7 @@ def _squareplus(x, n, slope, out):
 
 @compiled_once("int64", "int64", _COLUMNS, _MATRIX, "int64", _BETWEEN, _NETWORK, _MATRIX)
 def _forward_task(column, end, columns, lattice, n_f, between, network, out):
-    places, firsts, z_of = columns
+    yx, firsts, z_of = columns
     w1, b1, w2, b2, scale = network
     n_o = w2.shape[1]
     inputs, neurons = np.zeros((w1.shape[0], BLOCK), np.float32), np.zeros((w1.shape[1], BLOCK), np.float32)
@@ -213,7 +214,7 @@ def _forward_task(column, end, columns, lattice, n_f, between, network, out):
         while point < last:
             z = z_of[point]
             n = min(z_of[last - 1] + 1 - z, BLOCK)
-            _blend(lattice, between, (places[c, 0], places[c, 1], z, n, n_f), inputs)
+            _blend(lattice, between, (yx[c, 0], yx[c, 1], z, n, n_f), inputs)
             _neurons(w1, b1, inputs, n, neurons)
             _sums(w2, b2, neurons, n, sums)
             _squareplus(sums, n, False, values)
@@ -242,8 +243,8 @@ def forward(tasks, columns, lattice, n_f, between, network, out):
     "int64", "int64", _COLUMNS, _MATRIX, "int64", _BETWEEN, _NETWORK, _MATRIX, "int64[::1]", _MATRIX,
     f"UniTuple({_MATRIX}, 4)",
 )  # fmt: skip
-def _backward_task(column, end, columns, lattice, n_f, between, network, gradient, place, by_lattice, by_weights):
-    places, firsts, z_of = columns
+def _backward_task(column, end, columns, lattice, n_f, between, network, gradient, behind, by_lattice, by_weights):
+    yx, firsts, z_of = columns
     w1, b1, w2, b2, scale = network
     n_o = w2.shape[1]
     inputs, by_inputs = np.zeros((w1.shape[0], BLOCK), np.float32), np.zeros((w1.shape[0], BLOCK), np.float32)
@@ -255,7 +256,7 @@ def _backward_task(column, end, columns, lattice, n_f, between, network, gradien
         while point < last:
             z = z_of[point]
             n = min(z_of[last - 1] + 1 - z, BLOCK)
-            at = (places[c, 0], places[c, 1], z, n, n_f)
+            at = (yx[c, 0], yx[c, 1], z, n, n_f)
             by_sums[:] = ZERO  # a voxel between points is none
             while point < last and z_of[point] < z + n:
                 for o in range(n_o):
@@ -268,33 +269,33 @@ def _backward_task(column, end, columns, lattice, n_f, between, network, gradien
             _by_neurons(w2, neurons, by_sums, n, by_neurons, (by_w2, by_b2, by_b1))
             _by_weights(inputs, by_neurons, n, by_w1)
             _by_inputs(w1, by_neurons, n, by_inputs)
-            _blend_back(by_inputs, between, at, place, by_lattice)
+            _blend_back(by_inputs, between, at, behind, by_lattice)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _backward(task, tasks, columns, lattice, n_f, between, network, gradient, places, by_lattice, by_weights):
+def _backward(task, tasks, columns, lattice, n_f, between, network, gradient, behind, by_lattice, by_weights):
     by_w1, by_b1, by_w2, by_b2 = by_weights
     for k in prange(tasks.size - 1):
-        own, place = (by_w1[k], by_b1[k], by_w2[k], by_b2[k]), places[k]
-        for row in range(n_f * place[-1], n_f * places[k + 1, -1]):
+        own = (by_w1[k], by_b1[k], by_w2[k], by_b2[k])
+        for row in range(n_f * behind[k, -1], n_f * behind[k + 1, -1]):
             for z in range(by_lattice.shape[1]):
                 by_lattice[row, z] = ZERO
         _backward_task(
-            task, tasks[k], tasks[k + 1], columns, lattice, n_f, between, network, gradient, place, by_lattice, own
+            task, tasks[k], tasks[k + 1], columns, lattice, n_f, between, network, gradient, behind[k], by_lattice, own
         )
 
 
-def backward(tasks, columns, lattice, n_f, between, network, gradient, places, by_lattice):
+def backward(tasks, columns, lattice, n_f, between, network, gradient, behind, by_lattice):
     """Take gradients by the field [point, output] back: fill `by_lattice`, and return those by w1, b1, w2 and b2.
 
-    `by_lattice` [held column · feature, z + 8] has columns of its own for each task: `places` [task + 1, level + 1]
-    says by how much they lie behind those of the lattices, and in the last place where they begin.
+    `by_lattice` [copy · feature, z + 8] has lattice columns of its own for each task: `behind` [task + 1, level + 1]
+    says by how much they lie behind those of the lattices, and in the last place where the task's begin.
     """
     w1, _, w2, _, _ = network
     (n_i, n_j), n_o = w1.shape, w2.shape[1]
     sums = tuple(np.zeros((tasks.size - 1, n, WIDTH), np.float32) for n in (n_i * n_j, n_j, n_j * n_o, n_o))
     _backward(
-        _backward_task.address(), tasks, columns, lattice, n_f, between, network, gradient, places, by_lattice, sums
+        _backward_task.address(), tasks, columns, lattice, n_f, between, network, gradient, behind, by_lattice, sums
     )
-    by_w1, by_b1, by_w2, by_b2 = (s.astype(np.float64).sum((0, 2)).astype(np.float32) for s in sums)
+    by_w1, by_b1, by_w2, by_b2 = (s.sum((0, 2), dtype=np.float64).astype(np.float32) for s in sums)
     return by_w1.reshape(n_i, n_j), by_b1, by_w2.reshape(n_j, n_o), by_b2

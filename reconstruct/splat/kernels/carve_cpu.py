@@ -35,8 +35,8 @@ def _carve_slice(pose, blocked, z, y, x, state):
     nx, ny, nz = nx / height, ny / height, nz / height
     ux, uy, uz = [(pose[6 + k] * vv - pose[9 + k] * uv) / det for k in range(3)]
     vx, vy, vz = [(pose[9 + k] * uu - pose[6 + k] * uv) / det for k in range(3)]
-    u_middle = 0.5 * (n_u - 1) - (ax * ux + ay * uy + az * uz)
-    v_middle = 0.5 * (n_v - 1) - (ax * vx + ay * vy + az * vz)
+    u_end = 0.5 * n_u - (ax * ux + ay * uy + az * uz)
+    v_end = 0.5 * n_v - (ax * vx + ay * vy + az * vz)
     cz = z - pose[2]
     for j in range(y.size):
         cy = y[j] - pose[1]
@@ -47,6 +47,6 @@ def _carve_slice(pose, blocked, z, y, x, state):
             cx = x[i] - pose[0]
             depth = cx * nx + of_depth
             over = 1 / depth
-            u, v = (cx * ux + of_u) * over + u_middle, (cx * vx + of_v) * over + v_middle
-            if depth > 0 and -0.5 <= u < n_u - 0.5 and -0.5 <= v < n_v - 0.5:
-                state[j, i] = 1 if blocked[np.uint32(v + 0.5), np.uint32(u + 0.5)] else -1
+            u, v = (cx * ux + of_u) * over + u_end, (cx * vx + of_v) * over + v_end  # in pixels from the first's edge
+            if depth > 0 and 0 <= u < n_u and 0 <= v < n_v:
+                state[j, i] = 1 if blocked[np.uint32(v), np.uint32(u)] else -1  # unsigned: no wrap-around is looked for

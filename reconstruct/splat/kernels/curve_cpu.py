@@ -18,7 +18,7 @@ def _piece(knots, value):
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def evaluate(u, knots, densities, slopes, unit, out):
-    """Write both densities of each unknown over `unit`, `out` float32 [unknown, 2]."""
+    """Write both densities of each unknown over `unit`, `out` [unknown, 2]."""
     over = 1 / unit
     for i in prange(u.size):
         k = _piece(knots, u[i])
@@ -29,7 +29,7 @@ def evaluate(u, knots, densities, slopes, unit, out):
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def transpose(u, knots, slopes, sums, out):
-    """Write how sums by both densities [unknown, 2] change with each unknown, `out` float32 [unknown]."""
+    """Write how sums by both densities [unknown, 2] change with each unknown, `out` [unknown]; slopes are float32."""
     for i in prange(u.size):
         k = _piece(knots, u[i])
         out[i] = np.float32(slopes[k, 0]) * sums[i, 0] + np.float32(slopes[k, 1]) * sums[i, 1]
