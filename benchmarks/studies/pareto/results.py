@@ -166,8 +166,9 @@ def _values(p: Point, names: Iterable[str]) -> list[str]:
 
 # --- the figure ---------------------------------------------------------------------------------------
 
-DPI, WIDE, HIGH = 150, 9.0, 4.6
-MARKERS, STYLES = ("o", "^", "s", "D"), ("-", "--", ":", "-.")  # by group
+DPI, WIDE, HIGH, LONG = 150, 11.0, 4.6, 16  # LONG: entries of a legend, from which on it has two columns
+MARKERS = ("o", "^", "s", "D", "P", "v", "*")  # by group, in which colours begin again
+STYLES = ("-", "--", ":", "-.", (0, (5, 1)), (0, (1, 1)), (0, (3, 1, 1, 1, 1, 1)))
 COLOURS = (*TABLEAU_COLORS.values(), "#aec7e8", "#ffbb78", "#98df8a", "#ff9896", "#c5b0d5", "#c49c94", "#f7b6d2")
 FRONT, KNEE = "#202020", "#d00000"
 AXES: dict[Part, tuple[str, str]] = {
@@ -193,11 +194,10 @@ def figure(every: Sequence[Point]) -> Figure:
 
 def _scene(axes: Axes, every: Sequence[Point]) -> None:
     handles: list[Any] = []
-    known = list(dict.fromkeys(p.curve for p in every))
     for k, group in enumerate(groups(every)):
-        for curve, mine in parted(group, lambda p: p.curve).items():
+        for c, (curve, mine) in enumerate(parted(group, lambda p: p.curve).items()):
             x, y = zip(*sorted(p.pair for p in mine), strict=True)  # a default may stand anywhere on its curve
-            look = {"color": COLOURS[known.index(curve) % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)]}
+            look = {"color": COLOURS[c % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)]}
             handles += axes.plot(x, y, markersize=5, linewidth=0.8, label=pictured(curve), **look)
         x, y = zip(*(p.pair for p in front(group)), strict=True)
         style, label = STYLES[k % len(STYLES)], pictured(f"front: {group[0].group}")
@@ -218,4 +218,5 @@ def _scene(axes: Axes, every: Sequence[Point]) -> None:
         axis.set_major_formatter("{x:g}")
         axis.set_minor_locator(LogLocator(subs=(2, 5)))
         axis.set_minor_formatter("{x:g}")
-    axes.legend(handles=handles, loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=8, frameon=False)
+    look = {"fontsize": 8, "frameon": False, "ncol": 1 if len(handles) < LONG else 2}
+    axes.legend(handles=handles, loc="center left", bbox_to_anchor=(1.01, 0.5), **look)
