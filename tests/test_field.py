@@ -314,6 +314,11 @@ def _interrupted(scan, told):
         return methods.naf(scan, seconds=12, **told).details["steps"]
 
 
+def test_a_field_states_the_grid_it_is_fitted_on(scan):
+    """Tables warn where labels lie on it."""
+    assert methods.naf(scan, steps=1).details["grid"] == [15, 15, 15]  # 60 mm in cubes of 6 mm over 1.5
+
+
 def test_held_out_views_choose_the_field_that_is_returned(scan, monkeypatch):
     """A fit that runs away after its third turn returns that turn's field."""
     judged = iter([3.0, 2.0, 1.0] + [5.0] * 100)

@@ -144,6 +144,7 @@ class Fit:
             "steps": self.adam.steps,
             "parameters": self.parameters,
             "points": len(self.grid),
+            "grid": list(self.grid.whole.n_voxel),  # what labels on the same grid would flatter
             "levels": [f"{n} {'dense' if d else 'hashed'}" for n, d in self.levels()],
             "misfit": self.loss if math.isfinite(self.loss) else None,
             "view_updates": self.view_updates,
