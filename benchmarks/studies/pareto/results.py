@@ -218,5 +218,5 @@ def _scene(axes: Axes, every: Sequence[Point]) -> None:
         axis.set_major_formatter("{x:g}")
         axis.set_minor_locator(LogLocator(subs=(2, 5)))
         axis.set_minor_formatter("{x:g}")
-    look = {"fontsize": 8, "frameon": False, "ncol": 1 if len(handles) < LONG else 2}
-    axes.legend(handles=handles, loc="center left", bbox_to_anchor=(1.01, 0.5), **look)
+    columns = 1 if len(handles) < LONG else 2
+    axes.legend(handles=handles, loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=8, frameon=False, ncol=columns)
