@@ -4,14 +4,16 @@ Everything random is drawn in the units of the box (half its shortest edge = 1) 
 draws that does not depend on the grid, so one seed is one object at every resolution.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctsim.geometry import Triple
+from ctsim.kernels import paint_cpu
 
 Field = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
@@ -91,7 +93,7 @@ class Canvas:
         label: int,
         inside: Inside,
         box: tuple[ArrayLike, ArrayLike] = ((-9, -9, -9), (9, 9, 9)),
-        over: Sequence[int] | None = None,
+        over: tuple[int, ...] | None = None,
     ) -> None:
         """Paint where `inside(x, y, z)` holds within the box (low corner, high corner; x, y, z)."""
         low, high = np.asarray(box[0]), np.asarray(box[1])
@@ -102,7 +104,7 @@ class Canvas:
         mask = inside(x[None, None, :], y[None, :, None], z[:, None, None])
         view = self.labels[cut[2], cut[1], cut[0]]
         if over is not None:
-            mask = mask & np.isin(view, over)
+            mask = mask & _flags(over)[view]
         view[np.broadcast_to(mask, view.shape)] = label
 
     def ellipsoid(
@@ -111,45 +113,32 @@ class Canvas:
         centre: ArrayLike,
         radii: ArrayLike,
         frame: NDArray[np.float64] | None = None,
-        over: Sequence[int] | None = None,
+        over: tuple[int, ...] | None = None,
     ) -> None:
         """Paint an ellipsoid; the rows of `frame` are its axes (default x, y, z)."""
-        c, r = np.asarray(centre, float), np.asarray(radii, float) * np.ones(3)
+        c, r = np.asarray(centre, np.float64), np.asarray(radii, np.float64) * np.ones(3)
         rows = np.eye(3) if frame is None else frame
-
-        def inside(x: Field, y: Field, z: Field) -> Mask:
-            p = [x - np.float32(c[0]), y - np.float32(c[1]), z - np.float32(c[2])]
-            along = (row[0] * p[0] + row[1] * p[1] + row[2] * p[2] for row in rows)
-            return np.asarray(sum((q / k) ** 2 for q, k in zip(along, r, strict=True)) <= 1)
-
-        reach = np.sqrt(((rows * r[:, None]) ** 2).sum(0))
-        self.fill(label, inside, (c - reach, c + reach), over)
+        paint_cpu.ellipsoid(self.labels, self.axes, label, c, r, rows, _flags(over))
 
     def capsule(
-        self, label: int, a: ArrayLike, b: ArrayLike, radii: tuple[float, float], over: Sequence[int] | None = None
+        self, label: int, a: ArrayLike, b: ArrayLike, radii: tuple[float, float], over: tuple[int, ...] | None = None
     ) -> None:
         """Paint a round-ended rod from a to b whose radius runs from radii[0] to radii[1]."""
-        p, q = np.asarray(a, np.float64), np.asarray(b, np.float64)
-        d = q - p
-        length2 = float(d @ d) or 1e-12
-        r0, r1 = radii
+        self.tube(label, np.stack([a, b]), radii, over)
 
-        def inside(x: Field, y: Field, z: Field) -> Mask:
-            px, py, pz = (w - np.float32(o) for w, o in zip((x, y, z), p, strict=True))
-            t = np.clip((px * np.float32(d[0]) + py * np.float32(d[1]) + pz * np.float32(d[2])) / length2, 0, 1)
-            t = t.astype(np.float32)
-            gap = (px - t * np.float32(d[0])) ** 2 + (py - t * np.float32(d[1])) ** 2 + (pz - t * np.float32(d[2])) ** 2
-            return gap <= (r0 + t * np.float32(r1 - r0)) ** 2
-
-        r = max(radii)
-        self.fill(label, inside, (np.minimum(p, q) - r, np.maximum(p, q) + r), over)
-
-    def tube(self, label: int, points: ArrayLike, radii: ArrayLike, over: Sequence[int] | None = None) -> None:
+    def tube(self, label: int, points: ArrayLike, radii: ArrayLike, over: tuple[int, ...] | None = None) -> None:
         """Paint a chain of capsules through the points [k, 3]; one radius, or one per point."""
-        at = np.asarray(points, np.float64)
-        r = np.broadcast_to(np.asarray(radii, np.float64), (len(at),))
-        for k in range(len(at) - 1):
-            self.capsule(label, at[k], at[k + 1], (float(r[k]), float(r[k + 1])), over)
+        at = np.asarray(points, np.float64).reshape(-1, 3)
+        r = np.asarray(radii, np.float64) * np.ones(len(at))
+        paint_cpu.tube(self.labels, self.axes, label, at, r, _flags(over))
+
+
+@cache
+def _flags(over: tuple[int, ...] | None) -> Mask:
+    """Flag the labels that may be replaced: a table of all 256."""
+    flags = np.full(256, over is None)
+    flags[list(over or ())] = True
+    return flags
 
 
 Branch = tuple[NDArray[np.float64], NDArray[np.float64], float, float]
