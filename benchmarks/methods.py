@@ -7,12 +7,8 @@ that they are annotated with; one called `device` is always "cpu". Its module ma
 within one class of inputs. `--method "cmd:./mine {scan} {out}"` runs a program (`ctsim.benchmarks.program`).
 """
 
-import ast
 import difflib
-import functools
-import hashlib
 import importlib
-import importlib.util
 import inspect
 import os
 import pkgutil
@@ -26,13 +22,13 @@ import msgspec
 import msgspec.inspect
 import tyro
 
+from ctsim.benchmarks.versions import code_version
 from ctsim.errors import InputError
 from ctsim.reconstruct.settings import Parameter, build, convert, parameters_of
 
 if TYPE_CHECKING:
     from ctsim.types import Scan, Volume
 
-OURS = ("ctsim",)
 PROGRAM = "cmd:"
 """A method's name that begins so is the command of a program."""
 RUNS_PROGRAM = "ctsim.benchmarks.program"
@@ -323,46 +319,6 @@ def parse_overrides(settings: tuple[str, ...], names: tuple[str, ...]) -> dict[s
             found[method][parameter] = msgspec.json.decode(text)
         except (msgspec.DecodeError, RecursionError):
             found[method][parameter] = text
-    return found
-
-
-@functools.cache
-def code_version(module: str) -> str:
-    """Hash the sources of `module` and of what it imports from its own package and from ctsim, directly or not."""
-    roots = {*OURS, module.partition(".")[0]}
-    digest = hashlib.sha256()
-    for name, source in sorted(_sources(module, roots).items()):
-        digest.update(name.encode() + b"\0" + source + b"\0")
-    return digest.hexdigest()[:16]
-
-
-def _sources(module: str, roots: set[str]) -> dict[str, bytes]:
-    """Return the sources of `module` and of what it imports within the packages `roots`, directly or not."""
-    found: dict[str, bytes] = {}
-    waiting, plain = [module], set[str]()
-    while waiting:
-        name = waiting.pop()
-        # a name that a module defines is no module, and looking for one there would load the module
-        if name in found or name.partition(".")[0] not in roots or name.rpartition(".")[0] in plain:
-            continue
-        try:
-            spec = importlib.util.find_spec(name)
-        except (ImportError, AttributeError, ValueError):
-            continue  # `from package import value` names no module
-        if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
-            continue
-        with open(spec.origin, "rb") as file:
-            found[name] = file.read()
-        if not spec.submodule_search_locations:
-            plain.add(name)
-        package = name if spec.submodule_search_locations else name.rpartition(".")[0]
-        for node in ast.walk(ast.parse(found[name])):
-            if isinstance(node, ast.Import):
-                waiting += [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom):
-                origin = package.rsplit(".", node.level - 1)[0] + "." if node.level else ""
-                base = (origin + (node.module or "")).strip(".")
-                waiting += [*(f"{base}.{alias.name}" for alias in node.names), base]  # `base` is looked at first
     return found
 
 

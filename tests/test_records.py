@@ -5,7 +5,7 @@ import msgspec
 import pytest
 from run_records import make_record
 
-from ctsim.benchmarks import cli, methods
+from ctsim.benchmarks import cli, methods, versions
 from ctsim.benchmarks.engine.host import host, measured
 from ctsim.benchmarks.engine.record import Store, done
 from ctsim.benchmarks.scores.score import Score
@@ -139,13 +139,14 @@ def test_code_version_follows_imports(tmp_path, monkeypatch):
     (package / "other.py").write_text("b = 1\n")
     (package / "unrelated.py").write_text("c = 1\n")
     monkeypatch.syspath_prepend(tmp_path)
-    versions = []
+    seen = []
     for name, text in [("", ""), ("helper", "a = 2\n"), ("other", "b = 2\n"), ("unrelated", "c = 2\n")]:
         if name:
             (package / f"{name}.py").write_text(text)
-        methods.code_version.cache_clear()
-        versions.append(methods.code_version("my_lab_pkg.net"))
-    assert len(set(versions)) == 3 and versions[2] == versions[3]
+        versions.code_version.cache_clear()
+        versions._read.cache_clear()
+        seen.append(versions.code_version("my_lab_pkg.net"))
+    assert len(set(seen)) == 3 and seen[2] == seen[3]
 
 
 def test_settings_are_parsed_and_refused():

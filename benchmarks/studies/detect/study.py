@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from ctsim.benchmarks.engine import study
 from ctsim.benchmarks.engine.record import Record, Task
 from ctsim.benchmarks.engine.table import Table
-from ctsim.benchmarks.methods import Method, chosen, code_version
+from ctsim.benchmarks.methods import Method, chosen
 from ctsim.benchmarks.scores.observer import LEAST
 from ctsim.benchmarks.studies.detect import DEFAULT, PAIRS, Flags, tables
 from ctsim.benchmarks.studies.detect.records import Pair
 from ctsim.benchmarks.studies.detect.suite import load, named
+from ctsim.benchmarks.versions import code_version
 from ctsim.errors import InputError
 
 MEASURE = "ctsim.benchmarks.studies.detect.measure"  # by name: it loads torch

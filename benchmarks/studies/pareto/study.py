@@ -17,12 +17,13 @@ from ctsim.benchmarks.engine import host, study
 from ctsim.benchmarks.engine.record import Record, Task
 from ctsim.benchmarks.engine.table import Table
 from ctsim.benchmarks.engine.terminal import Bar
-from ctsim.benchmarks.methods import code_version, find
+from ctsim.benchmarks.methods import find
 from ctsim.benchmarks.scores import score
 from ctsim.benchmarks.studies.methods import run
 from ctsim.benchmarks.studies.pareto import Flags, results, suite
 from ctsim.benchmarks.studies.pareto.finding import Part, Timed, TimedRun, points
 from ctsim.benchmarks.studies.pareto.suite import Choice, Effort
+from ctsim.benchmarks.versions import code_version
 from ctsim.dataset.folder import is_complete
 from ctsim.dataset.manifest import read_manifest
 from ctsim.errors import InputError

@@ -15,9 +15,10 @@ from ctsim.beam.quadrature import P_MAX
 from ctsim.benchmarks.engine import host, study
 from ctsim.benchmarks.engine.record import Found, Record, Task, latest
 from ctsim.benchmarks.engine.table import Table, simple
-from ctsim.benchmarks.methods import CONTROLS, TABLE, Method, code_version, find
+from ctsim.benchmarks.methods import CONTROLS, TABLE, Method, find
 from ctsim.benchmarks.studies.stress import Flags, suite
 from ctsim.benchmarks.studies.stress.suite import Scene, load
+from ctsim.benchmarks.versions import code_version
 from ctsim.errors import InputError
 from ctsim.human import human_choice
 
