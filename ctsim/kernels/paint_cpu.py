@@ -11,17 +11,23 @@ from numba import njit
 @njit(cache=True)
 def _cut(axis, low, high):
     """Return the first and one past the last index with low <= axis < high."""
-    return np.searchsorted(axis, low), np.searchsorted(axis, high)
+    first = 0
+    while first < len(axis) and axis[first] < low:
+        first += 1
+    last = first
+    while last < len(axis) and axis[last] < high:
+        last += 1
+    return first, last
 
 
 @njit(cache=True)
 def ellipsoid(labels, axes, label, centre, radii, frame, over):
     """Paint an ellipsoid: centre and radii [3] float64 in x, y, z; the rows of frame [3, 3] are its axes."""
-    box = np.empty((3, 2), np.int64)
+    box, near = np.empty((3, 2), np.int64), np.empty(3, np.float32)
     for k in range(3):
         reach = np.sqrt((frame[0, k] * radii[0]) ** 2 + (frame[1, k] * radii[1]) ** 2 + (frame[2, k] * radii[2]) ** 2)
-        box[k] = _cut(axes[k], centre[k] - reach, centre[k] + reach)
-    near = centre.astype(np.float32)
+        box[k, 0], box[k, 1] = _cut(axes[k], centre[k] - reach, centre[k] + reach)
+        near[k] = centre[k]
     for iz in range(box[2, 0], box[2, 1]):
         z = axes[2][iz] - near[2]
         for iy in range(box[1, 0], box[1, 1]):
@@ -30,8 +36,7 @@ def ellipsoid(labels, axes, label, centre, radii, frame, over):
                 x = axes[0][ix] - near[0]
                 level = 0.0
                 for k in range(3):
-                    along = frame[k, 0] * x + frame[k, 1] * y + frame[k, 2] * z
-                    level += (along / radii[k]) ** 2
+                    level += ((frame[k, 0] * x + frame[k, 1] * y + frame[k, 2] * z) / radii[k]) ** 2
                 if level <= 1 and over[labels[iz, iy, ix]]:
                     labels[iz, iy, ix] = label
 
@@ -45,14 +50,13 @@ def tube(labels, axes, label, points, radii, over):
 
 @njit(cache=True)
 def _rod(labels, axes, label, start, end, r0, r1, over):
-    along = end - start
-    length2 = along[0] ** 2 + along[1] ** 2 + along[2] ** 2
+    r, length2 = max(r0, r1), 0.0
+    box, d, near = np.empty((3, 2), np.int64), np.empty(3, np.float32), np.empty(3, np.float32)
+    for k in range(3):  # expressions of whole arrays take seconds to compile
+        length2 += (end[k] - start[k]) ** 2
+        d[k], near[k] = end[k] - start[k], start[k]
+        box[k, 0], box[k, 1] = _cut(axes[k], min(start[k], end[k]) - r, max(start[k], end[k]) + r)
     length2 = np.float32(length2 if length2 > 0 else 1e-12)
-    r = max(r0, r1)
-    box = np.empty((3, 2), np.int64)
-    for k in range(3):
-        box[k] = _cut(axes[k], min(start[k], end[k]) - r, max(start[k], end[k]) + r)
-    d, near = along.astype(np.float32), start.astype(np.float32)
     r0, grows = np.float32(r0), np.float32(r1 - r0)
     for iz in range(box[2, 0], box[2, 1]):
         z = axes[2][iz] - near[2]
