@@ -15,6 +15,7 @@ from safetensors.torch import load_file, save_file
 
 from ctsim import new_scene, reconstruct_scan, score_volume, simulate_scene
 from ctsim.baselines import limar, nmar
+from ctsim.baselines.learned import data as data_module
 from ctsim.baselines.learned import dictionary, fusion, methods, training
 from ctsim.baselines.learned.inputs import blind, told
 from ctsim.baselines.learned.weights import SHIPPED, Card, trained
@@ -262,10 +263,22 @@ def test_the_twin_as_target_holds_the_same_noise(data, tmp_path, short):
     assert trained("denoise-lite", str(tmp_path / "denoise-lite-twin.safetensors"))[1].target == "twin"
     assert not (tmp_path / "denoise-lite.safetensors").exists()
     names = train_learned.listed(data).names["train"]
-    found = dict(np.load(tmp_path / "inputs" / f"{names[0]}.npz"))
+    (path,) = (tmp_path / "inputs").glob(f"{names[0]}-*.npz")
+    found = dict(np.load(path))
+    assert tuple(found) == data_module.ARRAYS
     stored = open_scan(data / names[0])
     expected = fdk(stored.metal_free.scan).values.numpy() / told(with_mask(stored), limar.Bridging()).water
     np.testing.assert_allclose(found["twin"], expected.clip(-2, 8), atol=4e-3)
+
+
+def test_inputs_are_written_once_for_each_content_of_a_scan(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(data_module, "open_scan", made.append)
+    monkeypatch.setattr(data_module, "arrays", lambda scan: {"fdk": np.zeros(1)})
+    first, again, other = (data_module.prepare(tmp_path, "lung", hashed, tmp_path) for hashed in ("a", "a", "b"))
+    assert first == again != other and len(made) == 2
+    monkeypatch.setattr(data_module, "ARRAYS", ("fdk", "more"))
+    assert data_module.prepare(tmp_path, "lung", "a", tmp_path) != first
 
 
 @pytest.mark.parametrize("name", ["fusion", "denoise-lite"])

@@ -1,8 +1,8 @@
 """What learned rows are trained on: the inputs of a dataset's scans and of their twins, and the truth.
 
-A scene becomes one file NAME.npz of float16 arrays [z, y, x] in multiples of the scan's water: "fdk", "limar", "nmar",
+A scene becomes one file of float16 arrays [z, y, x] in multiples of the scan's water: "fdk", "limar", "nmar",
 "truth" and "twin", which is FDK of the twin; "bare" and "bare_truth", FDK and truth of the twin in the twin's water;
-"metal".
+"metal". The file's name has a hash of the scan's content, so that another scan of that name is another file.
 """
 
 import dataclasses
@@ -22,13 +22,18 @@ from ctsim.dataset.store import StoredScan, open_scan
 from ctsim.errors import InputError
 
 SPLITS = ("train", "val", "test")
+ARRAYS = (*SOURCES, "truth", "twin", "metal", "bare", "bare_truth")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Listed:
-    """The scenes of a dataset by split, and a hash of the content of all scans that are trained or validated on."""
+    """The scenes of a dataset by split, and a hash of the content of all scans that are trained or validated on.
+
+    `hashes` are those of each scan's content, by name.
+    """
 
     names: dict[str, tuple[str, ...]]
+    hashes: dict[str, str]
     digest: str
 
 
@@ -41,7 +46,8 @@ def listed(data: Path) -> Listed:
     if empty := [split for split in SPLITS if not names[split]]:
         raise InputError(f"{data}: no scan in split {empty[0]!r}; expected a dataset of the suite train")
     hashes = sorted(f"{split} {line.content_hash}" for split in SPLITS[:2] for line in by_split[split])
-    return Listed(names=names, digest=hashlib.sha256("\n".join(hashes).encode()).hexdigest())
+    contents = {line.name: line.content_hash for lines in by_split.values() for line in lines}
+    return Listed(names=names, hashes=contents, digest=hashlib.sha256("\n".join(hashes).encode()).hexdigest())
 
 
 def about(
@@ -57,9 +63,10 @@ def about(
     }
 
 
-def prepare(data: Path, name: str, folder: Path) -> Path:
-    """Write the arrays of a scene unless they are there, and return their file."""
-    path = folder / f"{name}.npz"
+def prepare(data: Path, name: str, content_hash: str, folder: Path) -> Path:
+    """Write the arrays of a scene unless those of this content are there, and return their file."""
+    digest = hashlib.sha256(" ".join((content_hash, *ARRAYS)).encode()).hexdigest()
+    path = folder / f"{name}-{digest[:12]}.npz"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(".part.npz")

@@ -3,10 +3,11 @@
     python -m ctsim.benchmarks.tools.train_learned DATA OUT NAME [STEPS] [--twin]
 
 DATA is a dataset with splits (`make-dataset train DATA`), NAME one of fusion, denoise, denoise-lite, dicdnet-lite,
-acdnet-lite and oscnet-lite. The networks' inputs are written into OUT/inputs once. An interrupted training goes on from
-the checkpoint in OUT/NAME, of the same STEPS. OUT/NAME.safetensors and OUT/NAME.json are what
-`baselines/learned/weights` holds. With `--twin` the target is FDK of the metal-free twin in place of the effective
-reference: it holds the scan's own noise, so that nothing is gained by denoising; the files are then OUT/NAME-twin.*.
+acdnet-lite and oscnet-lite. The networks' inputs are written into OUT/inputs once; remove them after a change of FDK,
+LIMAR or NMAR. An interrupted training goes on from the checkpoint in OUT/NAME, of the same STEPS. OUT/NAME.safetensors
+and OUT/NAME.json are what `baselines/learned/weights` holds. With `--twin` the target is FDK of the metal-free twin in
+place of the effective reference: it holds the scan's own noise, so that nothing is gained by denoising; the files are
+then OUT/NAME-twin.*.
 """
 
 import sys
@@ -44,7 +45,8 @@ def main(arguments: list[str]) -> int:
     if len(arguments) == 4 and not arguments[3].isdecimal():
         raise InputError(f"{arguments[3]}: expected a number of steps")
     steps = int(arguments[3]) if len(arguments) == 4 else STEPS[kind_of(name)]
-    train(name, listed(data), {split: scenes(data, out / "inputs", split) for split in SLICES}, out, steps, target)
+    which = listed(data)
+    train(name, which, {split: scenes(data, which, out / "inputs", split) for split in SLICES}, out, steps, target)
     return 0
 
 
@@ -53,9 +55,9 @@ def kind_of(name: str) -> str:
     return "residual" if ARCHITECTURES[name]["kind"] == "residual" else "slices"
 
 
-def scenes(data: Path, folder: Path, split: str) -> list[Scene]:
+def scenes(data: Path, which: Listed, folder: Path, split: str) -> list[Scene]:
     """Return the arrays of a split's scenes; what is not there is written first."""
-    paths = [prepare(data, name, folder) for name in listed(data).names[split]]
+    paths = [prepare(data, name, which.hashes[name], folder) for name in which.names[split]]
     return [dict(np.load(path, allow_pickle=False)) for path in paths]
 
 
