@@ -1,14 +1,16 @@
 """What the tests of the engine let other processes do; imports nothing that takes time."""
 
 import atexit
+import contextlib
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from ctsim.benchmarks.engine import host, process
 from ctsim.benchmarks.engine.process import Pool, Process, Stopped
@@ -21,6 +23,16 @@ def until(true: Callable[[], bool], seconds: float = 30.0) -> None:
     while not true():
         assert time.monotonic() < end
         time.sleep(0.01)
+
+
+@contextlib.contextmanager
+def started(command: Sequence[object], **how: Any) -> Iterator[subprocess.Popen[Any]]:
+    """Start a program that is killed at the end, as a test that fails would wait for it for ever."""
+    with subprocess.Popen([str(word) for word in command], **how) as it:
+        try:
+            yield it
+        finally:
+            it.kill()
 
 
 def lives(pid: int) -> bool:

@@ -8,6 +8,7 @@ import time
 
 import pytest
 from conftest import SMALLEST
+from engine_jobs import started
 from run_records import append
 from test_paper_tables import record
 
@@ -31,9 +32,7 @@ def reconstruct(scan, *, device):
 def stopped(command, arguments, folder, begun):
     """Start a command in `folder`, send it SIGTERM once `begun()` is true, and return its exit code and last words."""
     code = f"import sys; from ctsim.benchmarks.cli import {command}; sys.argv[0] = '{command}'; sys.exit({command}())"
-    with subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, arguments)], cwd=folder, stderr=subprocess.PIPE, text=True
-    ) as child:
+    with started([sys.executable, "-c", code, *arguments], cwd=folder, stderr=subprocess.PIPE, text=True) as child:
         end = time.monotonic() + 60
         while not begun() and child.poll() is None and time.monotonic() < end:
             time.sleep(0.005)

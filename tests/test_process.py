@@ -19,7 +19,7 @@ import numba
 import numpy as np
 import pytest
 import torch
-from engine_jobs import lives, until
+from engine_jobs import lives, started, until
 
 from ctsim.benchmarks.engine import dask, host, process
 from ctsim.benchmarks.engine.dask import Cluster
@@ -266,7 +266,7 @@ IN_POOL = CALLS + "with Pool(2) as pool: list(pool.answers(getattr(jobs, sys.arg
 @pytest.mark.parametrize("code", [IN_PROCESS, IN_POOL])
 def test_they_end_with_a_process_that_is_killed_and_so_do_their_children(tmp_path, code):
     pids = tmp_path / "pids"
-    with subprocess.Popen(script(code, "sleep_in_two", pids), env=ENVIRONMENT) as it:
+    with started(script(code, "sleep_in_two", pids), env=ENVIRONMENT) as it:
         until(pids.exists)
         it.kill()
     until(lambda: not any(map(lives, numbers(pids))))
@@ -274,7 +274,7 @@ def test_they_end_with_a_process_that_is_killed_and_so_do_their_children(tmp_pat
 
 def test_a_call_can_write_down_where_it_stopped_when_its_parent_is_killed(tmp_path):
     pid = tmp_path / "pid"
-    with subprocess.Popen(script(IN_PROCESS, "sleep_and_note", pid), env=ENVIRONMENT) as it:
+    with started(script(IN_PROCESS, "sleep_and_note", pid), env=ENVIRONMENT) as it:
         until(pid.exists)
         it.kill()
     until((tmp_path / "pid.stopped").exists)
@@ -283,7 +283,7 @@ def test_a_call_can_write_down_where_it_stopped_when_its_parent_is_killed(tmp_pa
 
 def test_what_does_not_hear_is_killed_after_its_grace_when_its_parent_is_killed(tmp_path):
     pid = tmp_path / "pid"
-    with subprocess.Popen(script(IN_PROCESS, "sleep_on_with_little_grace", pid), env=ENVIRONMENT) as it:
+    with started(script(IN_PROCESS, "sleep_on_with_little_grace", pid), env=ENVIRONMENT) as it:
         until(pid.exists)
         it.kill()
     until(lambda: not lives(*numbers(pid)))
@@ -488,9 +488,8 @@ def test_a_cluster_that_loses_all_its_workers_goes_on_with_those_that_come(clust
             os.kill(pid, signal.SIGKILL)
         # Dask's own restart of a killed worker fails now and then
         command = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny"]
-        with subprocess.Popen([*command, "--no-dashboard"], stderr=subprocess.DEVNULL) as comes:
+        with started([*command, "--no-dashboard"], stderr=subprocess.DEVNULL):
             assert sorted(a for a in answers if a) == [(0, None), (1, None), (2, None)]
-            comes.terminate()
 
 
 def test_a_client_that_found_no_scheduler_is_gone_before_the_next(monkeypatch):
@@ -507,11 +506,16 @@ def test_a_client_that_found_no_scheduler_is_gone_before_the_next(monkeypatch):
         gc.enable()
 
 
+def whole(file: Path) -> bool:
+    """Whether the file in which a scheduler tells its address is there, and not half of it."""
+    return file.exists() and file.read_text().rstrip().endswith("}")
+
+
 def test_a_scheduler_that_goes_is_one_sentence(tmp_path):
     file = tmp_path / "scheduler.json"
     command = ("-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard", "--scheduler-file", file)
-    with subprocess.Popen([sys.executable, *command], stderr=subprocess.DEVNULL) as scheduler:
-        until(file.exists)
+    with started([sys.executable, *command], stderr=subprocess.DEVNULL) as scheduler:
+        until(lambda: whole(file))
         with Cluster(json.loads(file.read_text())["address"]) as found:
             answers = found.answers(jobs.job, ["one"])
             assert next(answers) is None  # no worker has come yet
@@ -568,9 +572,8 @@ def test_a_scheduler_with_certificates_works_for_those_who_have_them_alone(tmp_p
     with contextlib.ExitStack() as running:
         for module, *words in (scheduler, worker):
             command = [sys.executable, "-m", f"distributed.cli.{module}", *words]
-            started = running.enter_context(subprocess.Popen(command, stderr=subprocess.DEVNULL))
-            running.callback(started.kill)
-            until(file.exists)
+            running.enter_context(started(command, stderr=subprocess.DEVNULL))
+            until(lambda: whole(file))
         address = json.loads(file.read_text())["address"]
         assert address.startswith("tls://")
         with config.set(configured(ours)), Cluster(address) as found:

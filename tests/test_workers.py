@@ -282,10 +282,3 @@ def test_sigterm_ends_the_workers_and_keeps_what_they_noted(serial, tmp_path):
     assert code == 130 and "interrupted" in said and "Traceback" not in said
     assert not any(data.glob(".*.lock"))  # no worker is at it any more
     assert make(data) == 0 and same_data(serial / "data", data)
-
-
-def until(true: Callable[[], bool]) -> None:
-    end = time.monotonic() + 30
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.01)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from engine_jobs import started
 from small_scan import STACKS, content, one_view, write
 
 from ctsim.benchmarks.make_dataset import main
@@ -87,7 +88,7 @@ def test_killed_at_random_moments_it_resumes_to_the_same_bytes(tmp_path, whole):
     rng = np.random.default_rng(5)
     kills = 0
     for _ in range(8):
-        with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as child:
+        with started([sys.executable, "-c", code], stdout=subprocess.PIPE) as child:
             assert child.stdout is not None
             child.stdout.readline()
             try:
