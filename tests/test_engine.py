@@ -283,7 +283,8 @@ def test_what_was_found_may_be_anything_and_is_shown_or_refused(command, tmp_pat
                 inner = inner[k]
             inner[key] = value
             path.write_text(json.dumps(bad) + "\n")
-            for words in (["--table"], ["--dry-run", "--force"]):
+            # what a plan reads of a record does not depend on the kind of damage
+            for words in (["--table"], ["--dry-run", "--force"])[: 1 + (value is None)]:
                 try:
                     seen.add(code := command.call(tmp_path, *words, cases=1))
                 except Exception as error:

@@ -486,7 +486,7 @@ ABSURDITIES = [(path, value) for path, values in ABSURD.items() for value in val
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(
     plain=table(
         {"name": st.just("x"), "phantom": PHANTOM, "scanner": SCANNER, "simulation": SETTINGS, "truth": TRUTH},
