@@ -117,7 +117,7 @@ class Canvas:
     ) -> None:
         """Paint an ellipsoid; the rows of `frame` are its axes (default x, y, z)."""
         c, r = np.asarray(centre, np.float64), np.asarray(radii, np.float64) * np.ones(3)
-        rows = np.eye(3) if frame is None else frame
+        rows = np.ascontiguousarray(np.eye(3) if frame is None else frame, np.float64)  # of one layout, compiled once
         paint_cpu.ellipsoid(self.labels, self.axes, label, c, r, rows, _flags(over))
 
     def capsule(
