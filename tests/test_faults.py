@@ -16,8 +16,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from engine_jobs import until
 from forks import Forks, Run, running
-from test_workers import records_of, scores, tables, until
+from test_workers import records_of, scores, tables
 
 from ctsim.benchmarks import make_dataset
 from ctsim.benchmarks.studies.methods import records
