@@ -4,9 +4,11 @@ import ast
 import functools
 import hashlib
 import importlib.util
+from collections.abc import Iterator
 from typing import NamedTuple
 
 OURS = ("ctsim",)
+_BLOCKS = ("body", "orelse", "finalbody", "handlers", "cases")  # where statements hold statements
 
 
 class _Module(NamedTuple):
@@ -54,7 +56,7 @@ def _read(name: str) -> _Module | None:
 def _imports(source: bytes, package: str) -> list[str]:
     """List what a source within `package` imports, anywhere in it."""
     found: list[str] = []
-    for node in ast.walk(ast.parse(source)):
+    for node in _statements(ast.parse(source)):
         if isinstance(node, ast.Import):
             found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -62,3 +64,11 @@ def _imports(source: bytes, package: str) -> list[str]:
             base = (origin + (node.module or "")).strip(".")
             found += [base, *(f"{base}.{alias.name}" for alias in node.names)]
     return found
+
+
+def _statements(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield all statements within a node; most nodes are parts of expressions, which need not be looked at."""
+    for name in _BLOCKS:
+        for inner in getattr(node, name, ()):
+            yield inner
+            yield from _statements(inner)

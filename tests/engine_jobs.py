@@ -172,3 +172,18 @@ def call_from_here(path: str) -> None:
     with Process() as one, Pool(2) as pool:
         answers = dict(a for a in pool.answers(job, ["one", "two"]) if a is not None)
         write(path, f"{one.run(os.getppid) == os.getpid()} {sorted(a[:3] for a in answers.values())}")
+
+
+def fatal_once(scan: Any, *, device: str) -> Any:
+    """Reconstruct by FDK, but the first process that is asked is killed: CTSIM_TEST_MARK is a file then."""
+    from ctsim.reconstruct.fdk import reconstruct
+
+    try:
+        Path(os.environ["CTSIM_TEST_MARK"]).touch(exist_ok=False)
+    except FileExistsError:
+        return reconstruct(scan)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def hang(scan: Any, *, device: str) -> None:
+    time.sleep(60)

@@ -28,8 +28,8 @@ def scene(recipe: str, seed: int) -> Scene:
         phantom = {{ recipe = "{recipe}", metal = "{METALS.get(recipe, "Fe")}", {size}, n_voxel = [48, 48, 48] }}
         [scene.scanner]
         n_voxel = [32, 32, 32]
-        n_detector = [72, 72]
-        n_views = 6
+        n_detector = [56, 56]
+        n_views = 4
         """
     )
     return found

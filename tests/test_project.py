@@ -244,26 +244,25 @@ def response(materials=MATERIALS):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("tolerance", "views"), [(math.inf, 2), (0.2, 1)])
-def test_intensities_equal_the_reference(tolerance, views):
+@pytest.mark.parametrize(("tolerance", "view"), [(math.inf, 1), (0.2, 0)])
+def test_intensities_equal_the_reference(tolerance, view):
     tracer, g, r = Tracer.of(blobs(solids=INSERTS)), geometry(n_detector=(5, 7), n_views=2, pixel=7.5), response()
     shape = g.n_detector
     everywhere = np.tile(np.array([0, shape[1]]), (shape[0], 1))
     extra = np.random.default_rng(0).uniform(0, 1, shape).astype(np.float32)
-    for view in range(views):
-        pose, background = g.pose_array()[view], tracer.background(g, view)
-        background[-1] += extra
-        arguments = (
-            tracer.bricks[:5], tracer.solids(g, view), pose, work_order(1), everywhere,
-            background, (r.mu, r.w1, r.w2),
-            (r.edge_mu, project.EDGE_THRESHOLD, project.STEP_THRESHOLD, 21, tolerance), True,
-        )  # fmt: skip
-        got, want = np.zeros((2, *shape), np.float32), np.zeros((2, *shape))
-        raytrace_cpu.transmit_view(*arguments, got[0], got[1])
-        raytrace_reference.transmit_view(*arguments, want[0], want[1])
-        # float32 optical thickness up to 40 has an error of 4e-6 absolute, the exponential 4e-7 relative
-        np.testing.assert_allclose(got, want, rtol=1e-5)
-        assert want[0].min() < 0.1 < 0.5 < want[0].max()
+    pose, background = g.pose_array()[view], tracer.background(g, view)
+    background[-1] += extra
+    arguments = (
+        tracer.bricks[:5], tracer.solids(g, view), pose, work_order(1), everywhere,
+        background, (r.mu, r.w1, r.w2),
+        (r.edge_mu, project.EDGE_THRESHOLD, project.STEP_THRESHOLD, 21, tolerance), True,
+    )  # fmt: skip
+    got, want = np.zeros((2, *shape), np.float32), np.zeros((2, *shape))
+    raytrace_cpu.transmit_view(*arguments, got[0], got[1])
+    raytrace_reference.transmit_view(*arguments, want[0], want[1])
+    # float32 optical thickness up to 40 has an error of 4e-6 absolute, the exponential 4e-7 relative
+    np.testing.assert_allclose(got, want, rtol=1e-5)
+    assert want[0].min() < 0.1 < 0.5 < want[0].max()
 
 
 def test_the_exponential_is_accurate_to_its_bound():

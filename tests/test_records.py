@@ -130,11 +130,27 @@ def test_unknown_methods_are_named(name, message):
         methods.find(name)
 
 
+NET = """
+from my_lab_pkg import helper
+
+class Net:
+    def run(self, layers):
+        for layer in layers:
+            match layer:
+                case "last":
+                    try:
+                        import os
+                    except ImportError:
+                        with open(layer):
+                            from . import other
+"""
+
+
 def test_code_version_follows_imports(tmp_path, monkeypatch):
     package = tmp_path / "my_lab_pkg"
     package.mkdir()
     (package / "__init__.py").write_text("")
-    (package / "net.py").write_text("from my_lab_pkg import helper\nfrom . import other\nimport os\n")
+    (package / "net.py").write_text(NET)
     (package / "helper.py").write_text("a = 1\n")
     (package / "other.py").write_text("b = 1\n")
     (package / "unrelated.py").write_text("c = 1\n")

@@ -43,14 +43,14 @@ def test_no_ray_that_meets_a_primitive_lies_outside_its_shadow(kind):
         step = 7 if kind == TORUS else 1  # its reference solves a quartic a ray
         # pixel centres and corners, since both are asked for
         columns = range(view % step, n_u, step)
-        for v, u, shift in ((v, u, s) for v in range(n_v) for u in columns for s in (0.0, -0.5, 0.5)):
+        for v, u, shift in ((v, u, s) for v in range(view % 2, n_v, 2) for u in columns for s in (0.0, -0.5, 0.5)):
             towards = centre + (u + shift - (n_u - 1) / 2) * e_u + (v + shift - (n_v - 1) / 2) * e_v - source
             towards /= np.linalg.norm(towards)
             for p, prim in enumerate(prims):
                 if intersect(prim, *source, *towards, np.empty(4)):
                     assert cast[v, p, 0] <= u + shift <= cast[v, p, 1]
                     met[v, p, u] |= shift == 0
-    assert met.sum() > (40 if kind == TORUS else 300)
+    assert met.sum() > (25 if kind == TORUS else 150)
 
 
 def test_the_shadow_of_a_slanted_rod_is_a_narrow_band():

@@ -38,9 +38,11 @@ def found(folder):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """The command on tiny grids: exit code, what it found, and its folder."""
+    """The command on tiny grids: exit code, what it found, and its folder. A process for each case takes a minute."""
     folder = tmp_path_factory.mktemp("skipping")
-    code = skipping.main([str(folder), "--size", "small", "--repeats", "1"])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(skipping.Skipping, "isolated", False)
+        code = skipping.main([str(folder), "--size", "small", "--repeats", "1"])
     return code, found(folder), folder
 
 

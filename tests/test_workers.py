@@ -38,27 +38,7 @@ name = "rods"
 name = "bare"
 phantom = { metal = "none" }
 """
-METHODS = ("--method", "fdk", "--method", "test_workers:fatal_once")
-
-
-def fatal_once(scan, *, device):
-    """FDK, but the first process that asks is killed."""
-    from ctsim.reconstruct.fdk import reconstruct
-
-    _die_once(Path(os.environ["CTSIM_TEST_MARK"]))
-    return reconstruct(scan)
-
-
-def hang(scan, *, device):
-    time.sleep(60)
-
-
-def _die_once(mark):
-    try:
-        mark.touch(exist_ok=False)
-    except FileExistsError:
-        return
-    os.kill(os.getpid(), signal.SIGKILL)
+METHODS = ("--method", "fdk", "--method", "engine_jobs:fatal_once")
 
 
 def set_mark(path):
@@ -218,7 +198,7 @@ def test_a_clusters_worker_runs_methods_apart_within_a_time_limit(serial, cluste
     assert all(r.cost.isolated for r in records_of(tmp_path / "results"))
     from ctsim.benchmarks.studies.methods.study import main
 
-    words = (serial / "data", tmp_path / "hung", "--method", "test_workers:hang", "--seconds", "2", *flags)
+    words = (serial / "data", tmp_path / "hung", "--method", "engine_jobs:hang", "--seconds", "2", *flags)
     assert main([*map(str, words)]) == 1
     (hung,) = records_of(tmp_path / "hung")
     assert (hung.status, hung.reason) == ("timeout", "did not end within 2 s")
