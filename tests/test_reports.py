@@ -497,6 +497,7 @@ def notebook(name, data, results, figures_folder):
 
 
 def test_in_a_kernel_things_are_displayed(case, monkeypatch, tmp_path):
+    pytest.importorskip("ipywidgets")  # loaded now, as it needs the IPython that is replaced
     shown = []
     shell = SimpleNamespace(kernel=None)
     display = SimpleNamespace(
