@@ -145,10 +145,11 @@ def strike(child: int, target: str, begun: str | None) -> bool:
     if begun is not None and not os.path.exists(begun):
         return False
     workers = []
-    for pid in Path(f"/proc/{child}/task/{child}/children").read_text().split():
-        with contextlib.suppress(OSError):
-            if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes():
-                workers.append(int(pid))
+    for thread in Path(f"/proc/{child}/task").glob("*/children"):
+        for pid in thread.read_text().split():
+            with contextlib.suppress(OSError):
+                if b"process.serve(" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                    workers.append(int(pid))
     if target != "command" and not workers:
         return False
     os.kill(workers[-1] if target == "worker" else child, signal.SIGINT if target == "interrupt" else signal.SIGKILL)

@@ -239,7 +239,7 @@ def test_run_benchmark_with_workers_survives_kills(bench, tmp_path):
     for k in range(3 * max(1, KILLS // 24)):
         results = tmp_path / f"results{k}"
         target = ("command", "worker", "interrupt")[k % 3]
-        ended = bench.score(results, "--workers", "2", seconds=rng.random() * whole.seconds, target=target)
+        ended = bench.score(results, "--workers", "2", seconds=0.7 * rng.random() * whole.seconds, target=target)
         hits += ended.hit
         assert ended.code in {"command": (0, -9), "worker": (0,), "interrupt": (0, 130)}[target], ended.said
         assert "Traceback" not in ended.said, ended.said
@@ -249,7 +249,7 @@ def test_run_benchmark_with_workers_survives_kills(bench, tmp_path):
         kept = path.read_bytes() if path.exists() else b""
         assert bench.score(results, "--workers", "2").code == 0 and bench.same_results(results)
         assert path.read_bytes().startswith(kept[: kept.rfind(b"\n") + 1])  # nothing was lost, or measured again
-    assert hits > KILLS // 24
+    assert hits >= 2 * max(1, KILLS // 24)  # a run may end before its moment
 
 
 def test_no_worker_outlives_a_run_benchmark_that_is_killed(bench, tmp_path):

@@ -19,7 +19,7 @@ from ctsim.tracer.shadow import row_spans
 
 VIEWS, PIXELS = 8, 48
 WINDOWS, WINDOW, FINER = 8, 8, 8  # windows, pixels along a window's side, finer pixels along a pixel's side
-FINER_RAYS = 8  # of a finer pixel at first: with those that it gets where they do not suffice, P is right to 0.01
+FINER_RAYS = 8  # of a finer pixel at first: with those that it gets where they do not suffice, P is right to 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
