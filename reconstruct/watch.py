@@ -72,13 +72,22 @@ def listen(on_progress: OnProgress, *, every: float = 1.0) -> Iterator[None]:
 class Stopwatch:
     """A run's seconds, less what watching it took, and the times at which its watcher is still to be shown one."""
 
-    def __init__(self, seconds: float = 0.0, limit: float = math.inf) -> None:
-        """Start at `seconds`, those of an earlier part of the run, which is to end after `limit`."""
-        self._began, self._paused = time.perf_counter() - seconds, 0.0
-        self.limit, self._told = limit, -math.inf
+    def __init__(self, limit: float = math.inf) -> None:
+        """Start at 0; the run is to end after `limit` seconds. `earlier` are those of the parts before this one."""
+        self._began, self._paused = time.perf_counter(), 0.0
+        self.limit, self.earlier, self._told = limit, 0.0, -math.inf
         self._watcher = _watcher.get()
-        at = self._watcher.at if self._watcher else None
-        self._at = None if at is None else [t for t in at if t > seconds or not seconds]
+        self._at = self._watcher.at if self._watcher else None
+
+    def resume(self, earlier: float) -> None:
+        """Count on from the seconds that an earlier part of the run took; the times within them are not shown."""
+        self._began, self.earlier = self._began - earlier, earlier
+        if self._at is not None:
+            self._at = [t for t in self._at if t > self.seconds]
+
+    def details(self) -> dict[str, float]:
+        """Return what a result says of a run that was interrupted: the seconds before its last part."""
+        return {"earlier_seconds": self.earlier} if self.earlier else {}
 
     @property
     def seconds(self) -> float:

@@ -300,7 +300,8 @@ def test_a_seed_says_all_and_a_fit_goes_on_to_the_same_bit(scan, tmp_path):
     assert methods.naf(scan, seconds=1e-9, **told).details["steps"] == 0
     stopped = _interrupted(scan, told)
     assert 0 < stopped < 12 and list(tmp_path.iterdir())
-    assert torch.equal(methods.naf(scan, **told).values, whole.values)
+    resumed = methods.naf(scan, **told)
+    assert torch.equal(resumed.values, whole.values) and resumed.details["earlier_seconds"] >= 12
     assert not list(tmp_path.iterdir())
     details = whole.details
     assert details["steps"] == 12 and details["held_out"]["misfit"] > 0 and details["parameters"] > 1000

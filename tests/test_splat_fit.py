@@ -13,7 +13,7 @@ from ctsim.benchmarks.make_dataset import main as make_dataset
 from ctsim.benchmarks.methods import find
 from ctsim.benchmarks.scores.metrics import psnr3d
 from ctsim.benchmarks.scores.protocol import tissue_score, truth_of
-from ctsim.benchmarks.studies.methods.attempt import warm_up
+from ctsim.benchmarks.studies.methods.attempt import attempt, warm_up
 from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -419,6 +419,18 @@ def test_a_budget_counts_what_was_spent_before_an_interruption(small, tmp_path):
         found = reconstruct(small.scan, seconds=1000.0, **told)
     assert len(left) == 1 and left[0].seconds > 1000 and left[0].remaining == 0
     assert found.details["view_updates"] < 20 and list(tmp_path.iterdir()) == [file]
+
+
+def test_a_record_counts_the_seconds_before_an_interruption(small, tmp_path):
+    told = {"passes": [1, 1], "checkpoints": str(tmp_path)}
+    begun = attempt(find("splat", told | {"seconds": 1e-9}), small.scan, 0.0).cost
+    (file,) = tmp_path.iterdir()
+    kept = Checkpoint(folder=tmp_path, identity=file.stem)
+    kept.write({**(kept.read() or {}), "seconds": np.array(1000.0)})
+    outcome = attempt(find("splat", told), small.scan, 0.0)
+    assert begun is not None and begun.wall < 1000 and begun.cpu is not None
+    assert outcome.cost is not None and 1000 < outcome.cost.wall < 2000
+    assert outcome.cost.cpu is None and outcome.details["earlier_seconds"] == 1000  # of the last part alone, so unknown
 
 
 def test_warming_up_keeps_nothing_that_a_run_would_go_on_from(small, tmp_path):

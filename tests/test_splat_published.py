@@ -213,6 +213,7 @@ def test_time_that_ran_out_can_be_given_later(tmp_path):
     early = fit_published(sphere(), msgspec.structs.replace(settings, seconds=1e-9))
     assert early.details["view_updates"] == 0 and len(list(tmp_path.iterdir())) == 1
     late = fit_published(sphere(), settings)
+    assert late.details["earlier_seconds"] > 0 and "earlier_seconds" not in early.details
     assert late.details["view_updates"] == 30 and not list(tmp_path.iterdir())
 
 

@@ -59,8 +59,10 @@ def test_times_are_met_by_the_first_iteration_after_them_and_once(clock):
 def test_a_run_that_goes_on_has_the_times_behind_it(clock):
     seen = []
     with watch(lambda updates, seconds, volume: seen.append(seconds), at=[1.0, 11.5]):
-        iterate(clock, Stopwatch(10.0), 3)
-    assert seen == [12.0]
+        stopwatch = Stopwatch()
+        stopwatch.resume(10.0)
+        iterate(clock, stopwatch, 3)
+    assert seen == [12.0] and stopwatch.seconds == 13.0 and stopwatch.details() == {"earlier_seconds": 10.0}
 
 
 def test_without_times_only_whole_iterations_are_shown(clock):

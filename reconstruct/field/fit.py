@@ -161,19 +161,19 @@ class Fit:
         best = {f"best.{name}": p.numpy() for name, p in self.best.items()}
         return {**self.adam.state(), **best, "numbers": numbers, "reals": reals}
 
-    def resume(self, checkpoint: Checkpoint, stopwatch: Stopwatch) -> Stopwatch:
-        """Go on where a checkpoint stands, if it does; return the watch that counts on."""
+    def resume(self, checkpoint: Checkpoint, stopwatch: Stopwatch) -> None:
+        """Go on where a checkpoint stands, if it does, and let the watch count on."""
         if (state := checkpoint.read()) is None:
-            return stopwatch
+            return
         try:
             steps, self.view_updates, self.best_step, self.idle = state["numbers"].tolist()
-            before, self.loss, self.best_misfit = state["reals"].tolist()
+            earlier, self.loss, self.best_misfit = state["reals"].tolist()
             self.adam.restore(state, steps)
             kept = {k.removeprefix("best."): torch.from_numpy(v) for k, v in state.items() if k.startswith("best.")}
             self.best = {name: kept[name].view_as(p) for name, p in self.adam.parameters.items()} if kept else {}
         except (KeyError, TypeError, ValueError) as error:
             raise checkpoint.damaged(error) from None
-        return Stopwatch(before + stopwatch.seconds, stopwatch.limit)
+        stopwatch.resume(earlier)
 
 
 def checkpoint_in(folder: str, identity: str) -> Checkpoint | None:

@@ -102,9 +102,11 @@ def run(scan: Scan, settings: Common, make: Callable[[Given], Model], see: "See 
     fit = Fit(model.physics, given.grid, given.data, settings, given.unit)
     identity = identity_of(scan, msgspec.structs.replace(settings, seconds=math.inf, checkpoints=""))
     if (checkpoint := checkpoint_in(settings.checkpoints, identity)) is not None:
-        stopwatch = fit.resume(checkpoint, stopwatch)
+        fit.resume(checkpoint, stopwatch)
     fit.go(stopwatch, lambda values: given.grid.volume(model.read(values)[0], geometry), checkpoint)
-    return _volume(fit, model, given)
+    volume = _volume(fit, model, given)
+    volume.details.update(stopwatch.details())
+    return volume
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

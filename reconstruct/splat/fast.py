@@ -136,6 +136,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         **({"limitation": "; ".join(limits)} if limits else {}),
         "misfit": fit.misfit if math.isfinite(fit.misfit) else None,
         "view_updates": fit.view_updates,
+        **stopwatch.details(),
         "densities": {"rho_a": rho[0], "rho_b": rho[1]},
     }
     return Volume(
@@ -172,10 +173,10 @@ def _fitted(course: Course, scan: Scan, settings: Settings, stopwatch: Stopwatch
     begun, over = None, False
     if kept is not None and (state := kept.read()) is not None:
         try:
-            begun, before = course.restored(state), float(state["seconds"])
+            begun, earlier = course.restored(state), float(state["seconds"])
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise kept.damaged(error) from None
-        stopwatch = Stopwatch(before + stopwatch.seconds, settings.seconds)
+        stopwatch.resume(earlier)
 
     def proceed(fit: Fit, whole: bool, share: float) -> bool:
         nonlocal over

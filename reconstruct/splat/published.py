@@ -137,11 +137,11 @@ class _Run:
         try:
             self.learner.restore(state)
             self.done, self.best_step, self.idle = state["run.numbers"].tolist()
-            seconds, self.loss, self.best_misfit = state["run.reals"].tolist()
+            earlier, self.loss, self.best_misfit = state["run.reals"].tolist()
         except (KeyError, TypeError, ValueError) as error:
             raise checkpoint.damaged(error) from None
         self.best = {k.removeprefix("best."): v for k, v in state.items() if k.startswith("best.")}
-        self.stopwatch = Stopwatch(seconds + self.stopwatch.seconds, self.stopwatch.limit)
+        self.stopwatch.resume(earlier)
 
     def _found(self) -> tuple[Splats, Response]:
         learner = self.learner
@@ -170,7 +170,7 @@ class _Run:
             "read-out": how,
             "splats": len(splats),
             "view_updates": self.done,
-            "seconds": self.stopwatch.seconds,
+            **self.stopwatch.details(),
             "response": response.described() | {"name": self.settings.response},
             "densities": {f"rho_{c}": density for c, density in zip(self.settings.channels, densities, strict=True)},
         }

@@ -122,6 +122,7 @@ def describe(error: BaseException) -> str:
 def attempt(method: Method, scan: Scan, warm_up_seconds: float) -> Outcome:
     """Run a method in this process and return its outcome; of all exceptions only Ctrl-C is passed on."""
     outcome, usage, view_updates = Outcome(status="error"), None, None if method.program else 0
+    earlier = 0.0
     try:
         with restored():
             with measured() as usage:
@@ -131,6 +132,7 @@ def attempt(method: Method, scan: Scan, warm_up_seconds: float) -> Outcome:
                 usage = volume.details[USAGE]
             else:
                 view_updates = int(volume.details.get("view_updates", scan.geometry.n_views))
+                earlier = float(volume.details.get("earlier_seconds", 0.0))  # of a fit that went on from a checkpoint
             outcome.status, outcome.reason = str(volume.status), volume.reason
             outcome.values = array_of(volume.values)
             outcome.intermediates = attached(volume.details, scan.geometry)
@@ -144,8 +146,8 @@ def attempt(method: Method, scan: Scan, warm_up_seconds: float) -> Outcome:
         outcome = _failure(error)
     assert usage is not None
     outcome.cost = Cost(
-        wall=usage.wall,
-        cpu=usage.cpu,
+        wall=usage.wall + earlier,
+        cpu=None if earlier else usage.cpu,
         peak_bytes=usage.peak_bytes,
         view_updates=view_updates,
         device="cpu",
