@@ -94,6 +94,8 @@ ASKED = {"known": SPECTRUM, "tube": ASSUMED}
 """A splat's `response` -> what it needs then."""
 FITTED = ("splat", "field")
 """Values of a `prior` that is built on an assumed spectrum."""
+KEPT_IN = "checkpoints"
+"""The parameter that says where an unfinished fit is kept: no part of what a record and a table name."""
 GONE = {("splat", "preset"): "presets are methods of their own; expected --method splat-paper or --method splat-r2"}
 """(method, removed parameter) -> what to do instead."""
 WIDEST = 24  # characters; a longer default is not aligned with the others
@@ -106,7 +108,10 @@ def daggered(label: str) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Method:
-    """A method and its parameters as plain JSON values: all in `params`, those not at their default in `overrides`."""
+    """A method and its parameters as plain JSON values: all in `params`, those not at their default in `overrides`.
+
+    Where checkpoints are kept stands in `overrides` alone.
+    """
 
     name: str
     target: str
@@ -118,7 +123,7 @@ class Method:
     @property
     def label(self) -> str:
         """The name with the parameters that differ from the defaults, as tables show it."""
-        given = ", ".join(f"{k}={v}" for k, v in sorted(self.overrides.items()))
+        given = ", ".join(f"{k}={v}" for k, v in sorted(self.overrides.items()) if k != KEPT_IN)
         return f"{self.name}[{given}]" if given and not self.program else self.name
 
     @property
@@ -293,7 +298,7 @@ def _settings(name: str, function: Callable[..., Any], given: dict[str, Any]) ->
         build(cast("Any", function).settings, given, where)
     defaults = {key: _plain(parameter.default) for key, parameter in known.items()}
     changed = {key: plain for key, value in values.items() if (plain := _plain(value)) != defaults[key]}
-    return defaults | changed, changed
+    return defaults | {key: value for key, value in changed.items() if key != KEPT_IN}, changed
 
 
 def _plain(value: Any) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 from ctsim.errors import InputError
 from ctsim.geometry import Triple
 from ctsim.materials import material
+from ctsim.phantoms.fields import LabelGrid
 from ctsim.phantoms.shapes import cylinder
 from ctsim.solids import Solid
 from ctsim.types import Phantom
@@ -20,7 +21,6 @@ REACH = 0.92
 FINEST = 200
 """The finest texture, in correlation lengths along the cube's edge."""
 
-Shape = tuple[int, int, int]
 Millimetres = Annotated[float, msgspec.Meta(ge=1e-3, le=2000)]
 Side = Annotated[int, msgspec.Meta(ge=1, le=2048)]
 InsertCount = Annotated[int, msgspec.Meta(ge=0, le=16)]
@@ -31,6 +31,8 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     height: ClassVar[float] = REACH
     """Height of the object as a share of its cube's edge."""
+    by_layers: ClassVar[bool] = True
+    """Whether a layer of the labels can be drawn without the others."""
 
     n_voxel: tuple[Side, Side, Side] = (96, 96, 96)
     """Label grid (z, y, x) over the cube: how finely the body is drawn, never its shape."""
@@ -94,32 +96,23 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return z, y, x
 
 
-def half_box(n: Shape, d_voxel: Triple) -> float:
-    """Half the shortest edge of the grid in mm: the unit that recipes are drawn in."""
-    return min(k * d for k, d in zip(n, d_voxel, strict=True)) / 2
-
-
-def assemble(
-    labels: np.ndarray,
-    d_voxel: Triple,
-    materials: Sequence[str],
-    solids: Sequence[Solid],
-    shift: Triple = (0.0, 0.0, 0.0),
-) -> Phantom:
+def assemble(labels: np.ndarray, grid: LabelGrid, materials: Sequence[str], solids: Sequence[Solid]) -> Phantom:
     """Make a phantom, adding the solids' materials to the table and clearing labels beyond the reach.
 
     The cleared rim makes the bounding cylinder that scene checks rely on hold for every seed.
     """
-    z, y, x = ((np.arange(k) + 0.5 - k / 2 + s) * d for k, d, s in zip(labels.shape, d_voxel, shift, strict=True))
-    limit = REACH * half_box(labels.shape, d_voxel)
-    labels[:, np.hypot(y[:, None], x) > limit] = 0
-    labels[np.abs(z) > limit] = 0
+    z, y, x = grid.centres()
+    limit, drawn = REACH * grid.half_box, labels[grid.layers]
+    drawn[:, np.hypot(y[:, None], x) > limit] = 0
+    drawn[np.abs(z[grid.layers]) > limit] = 0
     names = list(materials)
     for solid in solids:
         if solid.material not in names:
             names.append(solid.material)
-    z, y, x = (s * d for s, d in zip(shift, d_voxel, strict=True))
-    return Phantom(labels=labels, materials=tuple(names), d_voxel=d_voxel, off_origin=(z, y, x), solids=tuple(solids))
+    z, y, x = (s * d for s, d in zip(grid.shift, grid.d_voxel, strict=True))
+    return Phantom(
+        labels=labels, materials=tuple(names), d_voxel=grid.d_voxel, off_origin=(z, y, x), solids=tuple(solids)
+    )
 
 
 class Validation(Recipe, frozen=True, kw_only=True, tag="validation"):
@@ -128,13 +121,13 @@ class Validation(Recipe, frozen=True, kw_only=True, tag="validation"):
     metal: str = "Al"
 
 
-def validation(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Validation) -> Phantom:
+def validation(grid: LabelGrid, rng: np.random.Generator, params: Validation) -> Phantom:
     """Three rods in a water cylinder (diameter 55 mm in a 60 mm cube), all analytic; labels are air.
 
     The layout is fixed: with the seed only its angle turns (seed-dependent, so that no rod pair
     aligns with the first view by construction).
     """
-    unit = half_box(n, d_voxel)
+    unit = grid.half_box
     half = 0.9 * unit
     solids = [cylinder("water", "water", (55 / 60 * unit, 2 * half), metal=False)]
     turn = rng.uniform(0, 2 * math.pi)
@@ -145,7 +138,7 @@ def validation(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Vali
             diameter = params.insert_mm or (5.0, 6.0, 8.0)[k % 3] * unit / 30
             centre = (0.5 * unit * math.cos(angle), 0.5 * unit * math.sin(angle), 0.0)
             solids.append(cylinder(f"rod{k}", params.metal, (diameter / 2, 1.7 * unit), centre=centre))
-    return assemble(np.zeros(n, np.uint8), d_voxel, ("air",), solids)
+    return assemble(np.zeros(grid.n, np.uint8), grid, ("air",), solids)
 
 
 class MetalRods(Recipe, frozen=True, kw_only=True, tag="metal_rods"):
@@ -154,9 +147,9 @@ class MetalRods(Recipe, frozen=True, kw_only=True, tag="metal_rods"):
     metal: str = "Al6061"
 
 
-def metal_rods(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: MetalRods) -> Phantom:
+def metal_rods(grid: LabelGrid, rng: np.random.Generator, params: MetalRods) -> Phantom:
     """Draw a printed PLA cup with lid, water up to a level, and rods of unequal width set into its floor."""
-    unit = half_box(n, d_voxel)
+    unit = grid.half_box
     level = rng.uniform(0.60, 0.76)
     middle = (0.0, 0.0, (level - 0.78) / 2 * unit)
     solids = [
@@ -172,4 +165,4 @@ def metal_rods(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Meta
             width = params.insert_mm or (4.0, 6.0, 8.0)[k % 3] * unit / 30
             centre = (r * math.cos(angle), r * math.sin(angle), -0.09 * unit)
             solids.append(cylinder(f"rod{k}", params.metal, (width / 2, 1.44 * unit), centre=centre))
-    return assemble(np.zeros(n, np.uint8), d_voxel, ("air",), solids)
+    return assemble(np.zeros(grid.n, np.uint8), grid, ("air",), solids)

@@ -8,9 +8,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.geometry import Triple
-from ctsim.phantoms.bodies import Recipe, Shape, assemble
-from ctsim.phantoms.fields import Canvas, Field, Mask, Noise, frame_along
+from ctsim.phantoms.bodies import Recipe, assemble
+from ctsim.phantoms.fields import Canvas, Field, LabelGrid, Mask, Noise, frame_along
 from ctsim.phantoms.inserts import count, diameter, inserts
 from ctsim.solids import Solid
 from ctsim.types import Phantom
@@ -37,10 +36,10 @@ class Broccoli(Recipe, frozen=True, kw_only=True, tag="broccoli"):
         self.within("forks", 2, 6)
 
 
-def broccoli(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Broccoli) -> Phantom:
+def broccoli(grid: LabelGrid, rng: np.random.Generator, params: Broccoli) -> Phantom:
     """Draw the head; metal: rivets through the stem, then in the crown."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel, shift=params.grid_shift)
+    canvas = Canvas(grid)
     buds = _branches(canvas, body, params)
     grains = body.standard_normal((32, 6, 3))
     grains /= np.linalg.norm(grains, axis=2, keepdims=True)
@@ -51,7 +50,7 @@ def broccoli(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Brocco
         for way in grains[k % len(grains)]:
             canvas.ellipsoid(WATER, at + 0.95 * r * way, 0.36 * r)
     _stem(canvas, body)
-    return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit), params.grid_shift)
+    return assemble(canvas.whole, grid, MATERIALS, _metal(metal, params, canvas.unit))
 
 
 def _stem(canvas: Canvas, rng: np.random.Generator) -> None:

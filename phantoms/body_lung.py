@@ -9,9 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ctsim.geometry import Triple
-from ctsim.phantoms.bodies import Recipe, Shape, assemble
-from ctsim.phantoms.fields import Canvas, Field, Inside, Mask, Noise, supply_tree
+from ctsim.phantoms.bodies import Recipe, assemble
+from ctsim.phantoms.fields import Canvas, Field, Inside, LabelGrid, Mask, Noise, supply_tree
 from ctsim.phantoms.inserts import count, diameter, inserts
 from ctsim.solids import Solid
 from ctsim.types import Phantom
@@ -38,10 +37,10 @@ class Lung(Recipe, frozen=True, kw_only=True, tag="lung"):
         self.within("ribs", 0, 12)
 
 
-def lung(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Lung) -> Phantom:
+def lung(grid: LabelGrid, rng: np.random.Generator, params: Lung) -> Phantom:
     """Draw a thorax; metal: two rods along the spine, then balls in muscle, heart and chest wall."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel, shrink=0.95, shift=params.grid_shift)
+    canvas = Canvas(grid, shrink=0.95)
     wall = _wall(canvas, body)
     _lungs(canvas, body, params.vessels)
     _pleura(canvas, wall)
@@ -49,7 +48,7 @@ def lung(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Lung) -> P
     _ribs(canvas, body, params.ribs, wall)
     _shoulders(canvas, wall)
     _spine(canvas, body, wall)
-    return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit), params.grid_shift)
+    return assemble(canvas.whole, grid, MATERIALS, _metal(metal, params, canvas.unit))
 
 
 class Wall(NamedTuple):

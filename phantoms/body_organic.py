@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Callable
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from ctsim.geometry import Triple
-from ctsim.phantoms.bodies import REACH, Recipe, Shape, assemble
-from ctsim.phantoms.fields import Canvas, Field, Mask, Noise, frame_along
+from ctsim.phantoms.bodies import REACH, Recipe, assemble
+from ctsim.phantoms.fields import Canvas, Field, LabelGrid, Mask, Noise, frame_along
 from ctsim.phantoms.inserts import count, diameter, inserts
 from ctsim.solids import Solid
 from ctsim.types import Phantom
@@ -18,6 +18,7 @@ from ctsim.types import Phantom
 class Walnut(Recipe, frozen=True, kw_only=True, tag="walnut"):
     """Walnut with pins pushed through its shell (Fe by default)."""
 
+    by_layers: ClassVar[bool] = False  # what is loose in it is known by the whole
     metal: str = "Fe"
 
 
@@ -86,10 +87,10 @@ def _drop_crumbs(labels: NDArray[np.uint8], of: int) -> None:
         labels[loose[pieces] & (labels == of)] = 0
 
 
-def walnut(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Walnut) -> Phantom:
+def walnut(grid: LabelGrid, rng: np.random.Generator, params: Walnut) -> Phantom:
     """Draw a shell with seam, two folded kernel halves (fat) joined by a neck, a membrane between, and air gaps."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel, shift=params.grid_shift)
+    canvas = Canvas(grid)
     dents, rough, warp = Noise(body, 9), Noise(body, 8), Noise(body, 4)
     radii = np.array([0.74, 0.70, 0.84]) * (1 + 0.03 * body.uniform(-1, 1, 3))
     folds = _ripples(body, 10.0)
@@ -117,8 +118,8 @@ def walnut(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Walnut) 
         inside[inside] = levels[inside] < 0.85 + 0.015 * grain - np.maximum(fold, cleft)
         return inside
 
-    levels, warped = level(*canvas.grid), warp(*canvas.grid)
-    bend = sum(c * k for c, k in zip(canvas.grid, pose[1], strict=True)) - 0.03 * warped
+    levels, warped = level(*canvas.mesh), warp(*canvas.mesh)
+    bend = sum(c * k for c, k in zip(canvas.mesh, pose[1], strict=True)) - 0.03 * warped
     canvas.fill(1, lambda *_: levels <= 1.0)
     canvas.fill(0, lambda *_: levels <= 0.91)
     canvas.fill(1, lambda *_: (np.abs(bend) < 0.016) & (levels < 0.92))
@@ -135,7 +136,7 @@ def walnut(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Walnut) 
         middle = np.array([0.0, 0.0, 0.14 * (k % 3 - 1)])  # the pins cross the axis at heights of their own
         head = _held(_skin(level, middle, way), 0.9 * d / canvas.unit)
         solids.append(make.pin(f"pin{k}", head, -way, d, 0.95 * canvas.unit))
-    return assemble(canvas.labels, d_voxel, ("air", "cellulose", "adipose"), solids, params.grid_shift)
+    return assemble(canvas.whole, grid, ("air", "cellulose", "adipose"), solids)
 
 
 def _drumstick(z: Field, bump: Field, sink: float = 0.0) -> tuple[Field, Field]:
@@ -153,10 +154,10 @@ JOINTS = (((0.03, 0.0, 0.6), 0.15), ((0.17, 0.02, 0.6), 0.14), ((-0.05, 0, -0.76
 """Middles and radii of the drumstick's knobs; the last two are the ankle's."""
 
 
-def chicken(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Chicken) -> Phantom:
+def chicken(grid: LabelGrid, rng: np.random.Generator, params: Chicken) -> Phantom:
     """Draw skin, fat, muscle bundles, a long bone with marrow and knobs, a splint bone; a wire wound on the skin."""
     body, _ = rng.spawn(2)
-    canvas = Canvas(n, d_voxel, shift=params.grid_shift)
+    canvas = Canvas(grid)
     _, meat, fat, bone = range(4)
     bumps, sheets, spongy = Noise(body, 6), Noise(body, 7), Noise(body, 50)
 
@@ -195,9 +196,7 @@ def chicken(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Chicken
     solids = [
         make.wire(f"wire{k}", _winding(bumps, params.turns, k / total, d / 2 / canvas.unit), d) for k in range(total)
     ]
-    return assemble(
-        canvas.labels, d_voxel, ("air", "soft_tissue", "adipose", "cortical_bone"), solids, params.grid_shift
-    )
+    return assemble(canvas.whole, grid, ("air", "soft_tissue", "adipose", "cortical_bone"), solids)
 
 
 def _winding(bumps: Noise, turns: float, start: float, radius: float) -> NDArray[np.float64]:
@@ -218,10 +217,10 @@ def _winding(bumps: Noise, turns: float, start: float, radius: float) -> NDArray
     return points
 
 
-def bell_pepper(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: BellPepper) -> Phantom:
+def bell_pepper(grid: LabelGrid, rng: np.random.Generator, params: BellPepper) -> Phantom:
     """Draw a hollow lobed wall with skin, ribs within, the seeded core and the stem."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel, shift=params.grid_shift)
+    canvas = Canvas(grid)
     air, water, fibre = range(3)
     wobble, phase, lobes = Noise(body, 4), body.uniform(0, 2 * math.pi), params.lobes
 
@@ -273,4 +272,4 @@ def bell_pepper(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Bel
         out = np.array([math.cos(a), math.sin(a), 0.0])
         head = _held(_skin(level, [0.0, 0.0, metal.uniform(-0.2, 0.15)], out), 0.4 * d / canvas.unit)
         solids.append(make.rivet(f"rivet{k}", head, -out, d, 0.24 * canvas.unit))
-    return assemble(canvas.labels, d_voxel, ("air", "water", "cellulose"), solids, params.grid_shift)
+    return assemble(canvas.whole, grid, ("air", "water", "cellulose"), solids)

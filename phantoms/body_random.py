@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from ctsim.geometry import Triple
-from ctsim.phantoms.bodies import Recipe, Shape, assemble
-from ctsim.phantoms.fields import Canvas, Noise
+from ctsim.phantoms.bodies import Recipe, assemble
+from ctsim.phantoms.fields import Canvas, LabelGrid, Noise
 from ctsim.phantoms.inserts import Inserts, count, diameter, inserts
 from ctsim.solids import Solid
 from ctsim.types import Phantom
@@ -25,10 +24,10 @@ class Random(Recipe, frozen=True, kw_only=True, tag="random"):
         self.within("organs", 0, 500)
 
 
-def random(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Random) -> Phantom:
+def random(grid: LabelGrid, rng: np.random.Generator, params: Random) -> Phantom:
     """Draw a warped ellipsoid of tissue with a fat layer, organs, bones; metal of random kinds inside."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel, shrink=0.95, shift=params.grid_shift)
+    canvas = Canvas(grid, shrink=0.95)
     wobble, texture = Noise(body, 4), Noise(body, 12)
     a, b, c = body.uniform((0.62, 0.55, 0.65), (0.84, 0.8, 0.84))
     power = body.uniform(2.0, 4.0)
@@ -52,7 +51,7 @@ def random(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Random) 
             canvas.ellipsoid(2, place, 0.65 * radii, frame, over=(4,))
     make, d = inserts(params, canvas.unit), diameter(params, 5.0, canvas.unit)
     solids = [_insert(make, metal, k, d, 0.45 * min(a, b, c)) for k in range(count(params, int(metal.integers(1, 6))))]
-    return assemble(canvas.labels, d_voxel, MATERIALS, solids, params.grid_shift)
+    return assemble(canvas.whole, grid, MATERIALS, solids)
 
 
 def _insert(make: Inserts, rng: np.random.Generator, k: int, d: float, reach: float) -> Solid:

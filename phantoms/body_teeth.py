@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ctsim.errors import InputError
-from ctsim.geometry import Triple
-from ctsim.phantoms.bodies import Recipe, Shape, assemble
-from ctsim.phantoms.fields import Canvas, Field, Mask, Noise
+from ctsim.phantoms.bodies import Recipe, assemble
+from ctsim.phantoms.fields import Canvas, Field, LabelGrid, Mask, Noise
 from ctsim.phantoms.inserts import Inserts, count, diameter, inserts
 from ctsim.solids import BOX, Primitive, Solid, Vector
 from ctsim.types import Phantom
@@ -78,10 +77,10 @@ class Tooth(NamedTuple):
     slot: int
 
 
-def teeth(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Teeth) -> Phantom:
+def teeth(grid: LabelGrid, rng: np.random.Generator, params: Teeth) -> Phantom:
     """Draw the jaws; metal: implants under crowns of their own, crowns over whole teeth, and restorations."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel, shrink=0.9, shift=params.grid_shift)
+    canvas = Canvas(grid, shrink=0.9)
     _soft(canvas, body)
     spongy = Noise(body, 56)
     rows = [_row(body, jaw) for jaw in (-1, 1)]
@@ -96,7 +95,7 @@ def teeth(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Teeth) ->
     solids = _metal(metal, params, canvas.unit, rows[0])
     if params.metal != "none":
         solids += _restorations(params, canvas.unit, present, rows[1])
-    return assemble(canvas.labels, d_voxel, MATERIALS, solids, params.grid_shift)
+    return assemble(canvas.whole, grid, MATERIALS, solids)
 
 
 def _arch(t: Field | float) -> tuple[Field, Field]:

@@ -1,8 +1,9 @@
 """A CT volume from a file as a body: grey values become tissue and its density, metal is put into it."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -13,8 +14,9 @@ from ctsim.dataset.arrayfile import MOST
 from ctsim.errors import InputError
 from ctsim.geometry import Triple
 from ctsim.materials import attenuation
-from ctsim.phantoms.bodies import REACH, Millimetres, Recipe, Shape, assemble, half_box
+from ctsim.phantoms.bodies import REACH, Millimetres, Recipe, assemble
 from ctsim.phantoms.ct_file import Ct, digest_of, read_hu, settle, without_metal
+from ctsim.phantoms.fields import LabelGrid, Shape
 from ctsim.phantoms.inserts import count, diameter, inserts
 from ctsim.solids import Solid
 from ctsim.types import Phantom
@@ -33,6 +35,8 @@ class CtVolume(Recipe, frozen=True, kw_only=True, tag="ct_volume"):
 
     Its middle becomes the middle of the cube of `size`. What lies beyond the object's reach is cut off.
     """
+
+    by_layers: ClassVar[bool] = False  # the file is read and resampled as a whole
 
     path: str
     """A folder of DICOM slices, or a file: NIfTI, MetaImage, NRRD, a TIFF stack or .npy array [z, y, x], z upwards."""
@@ -78,22 +82,14 @@ class CtVolume(Recipe, frozen=True, kw_only=True, tag="ct_volume"):
             msgspec.structs.force_setattr(self, key, value)
 
 
-def ct_volume(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: CtVolume) -> Phantom:
+def ct_volume(grid: LabelGrid, rng: np.random.Generator, params: CtVolume) -> Phantom:
     """Resample a CT volume linearly, split it by its HU into tissues of its own density, put metal into it.
 
     Raises InputError for a file that cannot be read, is none of a volume, or is not the recipe's.
     """
     ct = _read(params)
-    labels, density = _tissues(_resampled(ct, params, n, d_voxel), params.kev)
-    phantom = assemble(labels, d_voxel, TISSUES, _inserts(ct, params, half_box(n, d_voxel), rng), params.grid_shift)
-    return Phantom(
-        labels=phantom.labels,
-        materials=phantom.materials,
-        d_voxel=d_voxel,
-        off_origin=phantom.off_origin,
-        density=density,
-        solids=phantom.solids,
-    )
+    labels, density = _tissues(_resampled(ct, grid), params.kev)
+    return replace(assemble(labels, grid, TISSUES, _inserts(ct, params, grid.half_box, rng)), density=density)
 
 
 def _read(params: CtVolume) -> Ct:
@@ -112,15 +108,15 @@ def _read(params: CtVolume) -> Ct:
     return ct
 
 
-def _resampled(ct: Ct, params: CtVolume, n: Shape, d_voxel: Triple) -> NDArray[np.float32]:
+def _resampled(ct: Ct, grid: LabelGrid) -> NDArray[np.float32]:
     """Return mean HU over the voxels of the label grid, middle on middle; −1000 outside the volume.
 
     HU are interpolated at as many places in a voxel as it takes that none of the file's is passed over.
     """
-    hu, spacing = ct.hu, ct.spacing
-    times = np.ceil(np.divide(d_voxel, spacing) - 1e-9).astype(int)
-    step = np.divide(d_voxel, spacing) / times  # in the file's voxels, whose middles are whole numbers
-    first = (0.5 - np.multiply(n, times) / 2 + np.multiply(params.grid_shift, times)) * step
+    hu, spacing, n = ct.hu, ct.spacing, grid.n
+    times = np.ceil(np.divide(grid.d_voxel, spacing) - 1e-9).astype(int)
+    step = np.divide(grid.d_voxel, spacing) / times  # in the file's voxels, whose middles are whole numbers
+    first = (0.5 - np.multiply(n, times) / 2 + np.multiply(grid.shift, times)) * step
     first += np.divide(hu.shape, 2) - 0.5
     low, high = _covered(n, times, first, step, hu.shape)
     fine = (high - low) * times

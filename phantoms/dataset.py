@@ -68,7 +68,7 @@ class _Job:
 def plan_scene(scene: Scene) -> Plan:
     """Plan a scene's simulation. Raises InputError where memory is short."""
     with _memory(scene.name):
-        return _plan(scene, build(scene), scene.resolve())
+        return _plan(scene, build(scene, whole=False), scene.resolve())
 
 
 def _plan(scene: Scene, phantom: Phantom, scanner: Scanner, like: Plan | None = None) -> Plan:
@@ -171,7 +171,7 @@ def simulate_scene(scene: Scene) -> SimulatedScan:
     Raises InputError where memory is short.
     """
     with _memory(scene.name):
-        job = _Job.of(scene, build(scene))
+        job = _Job.of(scene, build(scene, whole=False))
         writer = MemoryWriter(scene.name, scene_id=scene_id(scene), stacks=_stacks(job.plan, job.scanner))
         job.writer = writer
         _simulate([job])

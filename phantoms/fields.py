@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctsim.geometry import Triple
 from ctsim.kernels import paint_cpu
 
+Shape = tuple[int, int, int]
 Field = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 Inside = Callable[[Field, Field, Field], Any]
@@ -57,33 +58,57 @@ class Noise:
         return basis.astype(np.float32)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LabelGrid:
+    """The voxels of a label volume: how many, their edges in mm, their shift in voxels (z, y, x), and what is drawn.
+
+    The shift moves the grid, not the shapes. `layers` are those that are drawn; the others stay air, for a scan that
+    does not see them.
+    """
+
+    n: Shape
+    d_voxel: Triple
+    shift: Triple = (0.0, 0.0, 0.0)
+    layers: slice = field(default_factory=lambda: slice(None))
+
+    @property
+    def half_box(self) -> float:
+        """Half the shortest edge of the grid in mm: the unit that recipes are drawn in."""
+        return min(k * d for k, d in zip(self.n, self.d_voxel, strict=True)) / 2
+
+    def centres(self) -> tuple[Field, Field, Field]:
+        """Return the centres of all voxels along z, y, x in mm."""
+        z, y, x = (
+            (np.arange(k) + 0.5 - k / 2 + s) * d for k, d, s in zip(self.n, self.d_voxel, self.shift, strict=True)
+        )
+        return z, y, x
+
+
 @dataclass(slots=True)
 class Canvas:
     """A label volume that shapes are painted on; later paint covers earlier, unless `over` restricts it.
 
     Coordinates are relative: x, y, z in units of `shrink` times half the shortest edge of the box. `over` lists the
-    labels that may be replaced (None: all). `shift` (z, y, x) moves the grid, not the shapes, by a share of a voxel.
+    labels that may be replaced (None: all). `labels` and the axis z are those of the layers that are drawn, of the
+    `whole` volume.
     """
 
-    n: tuple[int, int, int]
-    d_voxel: Triple
+    grid: LabelGrid
     shrink: float = 1.0
-    shift: Triple = (0.0, 0.0, 0.0)
     unit: float = field(init=False)
+    whole: NDArray[np.uint8] = field(init=False)
     labels: NDArray[np.uint8] = field(init=False)
     axes: tuple[Field, Field, Field] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.unit = self.shrink * min(k * d for k, d in zip(self.n, self.d_voxel, strict=True)) / 2
-        self.labels = np.zeros(self.n, np.uint8)
-        z, y, x = (
-            ((np.arange(k) + 0.5 - k / 2 + s) * d / self.unit).astype(np.float32)
-            for k, d, s in zip(self.n, self.d_voxel, self.shift, strict=True)
-        )
-        self.axes = (x, y, z)
+        self.unit = self.shrink * self.grid.half_box
+        self.whole = np.zeros(self.grid.n, np.uint8)
+        self.labels = self.whole[self.grid.layers]
+        z, y, x = ((at / self.unit).astype(np.float32) for at in self.grid.centres())
+        self.axes = (x, y, z[self.grid.layers])
 
     @property
-    def grid(self) -> tuple[Field, Field, Field]:
+    def mesh(self) -> tuple[Field, Field, Field]:
         """The axes x, y, z, shaped so that they broadcast to [z, y, x]."""
         x, y, z = self.axes
         return x[None, None, :], y[None, :, None], z[:, None, None]

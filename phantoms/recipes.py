@@ -1,6 +1,6 @@
 """The table of recipes: settings type → function that builds the phantom.
 
-Every function is `(n (z, y, x), d_voxel (mm), rng, params) -> Phantom`, seeded and independent of the
+Every function is `(grid of labels, rng, params) -> Phantom`, seeded and independent of the
 grid: shapes are drawn in units of the box, so 64³ and 256³ show the same object.
 """
 
@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 
 from ctsim.errors import InputError
-from ctsim.geometry import Triple
-from ctsim.phantoms.bodies import MetalRods, Recipe, Shape, Validation, metal_rods, validation
+from ctsim.phantoms.bodies import MetalRods, Recipe, Validation, metal_rods, validation
 from ctsim.phantoms.body_broccoli import Broccoli, broccoli
 from ctsim.phantoms.body_lung import Lung, lung
 from ctsim.phantoms.body_organic import BellPepper, Chicken, Walnut, bell_pepper, chicken, walnut
 from ctsim.phantoms.body_random import Random, random
 from ctsim.phantoms.body_teeth import Teeth, teeth
 from ctsim.phantoms.body_volume import CtVolume, ct_volume
+from ctsim.phantoms.fields import LabelGrid
 from ctsim.phantoms.patients.hip import Hip, hip
 from ctsim.phantoms.patients.spine import Spine, spine
 from ctsim.phantoms.texture import textured
@@ -28,7 +28,7 @@ AnyRecipe = (
     Validation | MetalRods | Lung | Teeth | Broccoli | Walnut | Chicken | BellPepper | Random | CtVolume | Hip | Spine
 )
 
-Builder = Callable[[Shape, Triple, np.random.Generator, Any], Phantom]
+Builder = Callable[[LabelGrid, np.random.Generator, Any], Phantom]
 
 BUILDERS: dict[type[Recipe], Builder] = {
     Validation: validation,
@@ -48,17 +48,23 @@ BUILDERS: dict[type[Recipe], Builder] = {
 NAMES = tuple(str(kind.__struct_config__.tag) for kind in BUILDERS)
 
 
-def build_recipe(params: Recipe, seed: int, again: int = 0) -> Phantom:
+def build_recipe(params: Recipe, seed: int, again: int = 0, layers: slice = slice(None)) -> Phantom:
     """Build the phantom of a recipe; the same settings and seed give the same phantom.
 
-    `again` counts further draws of the same individual. Raises `InputError` when nothing is left to scan.
+    `again` counts further draws of the same individual. Of the labels only `layers` are drawn, the others stay air;
+    where a recipe cannot do that, all are drawn. Raises `InputError` when a whole phantom holds nothing to scan.
     """
+    layers = layers if params.by_layers else slice(None)
     name = f"{params.recipe}/{seed}" + (f"/again {again}" if again else "")
     digest = hashlib.sha256(name.encode()).digest()
     rng = np.random.default_rng(np.frombuffer(digest, np.uint32))
-    phantom = BUILDERS[type(params)](params.n_voxel, params.d_voxel, rng, params)
-    if not phantom.labels.any() and not phantom.solids:
+    grid = LabelGrid(n=params.n_voxel, d_voxel=params.d_voxel, shift=params.grid_shift, layers=layers)
+    phantom = BUILDERS[type(params)](grid, rng, params)
+    empty = not phantom.labels[layers].any()
+    if layers != slice(None) and empty:
+        return phantom
+    if empty and not phantom.solids:
         raise InputError(
             f"recipe {params.recipe!r}: the scene is empty at n_voxel = {params.n_voxel}; expected a finer grid"
         )
-    return textured(phantom, params, seed) if params.texture else phantom
+    return textured(phantom, params, seed, layers) if params.texture else phantom

@@ -3,6 +3,7 @@
 import functools
 import hashlib
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from ctsim.dataset.manifest import is_reserved
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry, crosswise
+from ctsim.look import all_rays
 from ctsim.phantoms.identity import identity
 from ctsim.phantoms.recipes import AnyRecipe, build_recipe
 from ctsim.phantoms.scanners import REACH, ScannerSettings
@@ -21,6 +23,7 @@ from ctsim.phantoms.suites import NULL, decode, parse_toml, read_toml, scenes_of
 from ctsim.phantoms.vary import Drawn, expand, individual_of
 from ctsim.phantoms.visible import build_in_view
 from ctsim.settings import Simulation, Truth
+from ctsim.tracer.layers import crossed
 from ctsim.types import Phantom, Scanner
 
 _LATER = {"metal_in_view": False, "drawn": None}  # keys that old ids mean by their default: see `identity`
@@ -85,14 +88,28 @@ def _known_to_image(settings: ScannerSettings, body: tuple[float, float], trunca
     check_geometry(scanner.geometry, body[0], truncated, height=body[1])
 
 
-def build(scene: Scene) -> Phantom:
+def build(scene: Scene, *, whole: bool = True) -> Phantom:
     """Build the scene's phantom, the same for the same recipe and seed.
 
-    Raises InputError where the scene asks for metal in view and there is none.
+    If it need not be `whole`, layers of its labels that no ray crosses, and that the reconstruction grid does not
+    cover, may be left as air. Raises InputError where the scene asks for metal in view and there is none.
     """
+    layers = None if whole else layers_of(scene)
     if scene.metal_in_view:
-        return build_in_view(scene.phantom, scene.seed, scene.resolve().geometry)
-    return build_recipe(scene.phantom, scene.seed)
+        phantom = build_in_view(scene.phantom, scene.seed, scene.resolve().geometry, layers)
+    else:
+        phantom = build_recipe(scene.phantom, scene.seed, layers=slice(None) if layers is None else layers(0.0))
+    return phantom if layers is None or phantom.labels.any() else build(scene)
+
+
+def layers_of(scene: Scene) -> Callable[[float], slice] | None:
+    """Return which layers a scan needs of a body that is moved by so many mm along z; None where it needs all."""
+    scanner, params = scene.resolve(), scene.phantom
+    geometry = all_rays(scanner)
+    if geometry is None or scanner.scatter.level == 3 or not params.by_layers:  # photons scatter in all of it
+        return None
+    z, y, x = (s * d for s, d in zip(params.grid_shift, params.d_voxel, strict=True))
+    return lambda dz: crossed(params.n_voxel, params.d_voxel, (z + dz, y, x), geometry, grid=True)
 
 
 def individual(scene: Scene) -> str:

@@ -30,11 +30,12 @@ def levels() -> NDArray[np.float64]:
     return k / math.sqrt(float(share @ k**2))
 
 
-def textured(phantom: Phantom, params: Recipe, seed: int) -> Phantom:
+def textured(phantom: Phantom, params: Recipe, seed: int, layers: slice = slice(None)) -> Phantom:
     """Split every material of the labels but air into levels of density; the same seed gives the same texture.
 
     The field is a cubic B-spline through random numbers on a lattice of `texture_mm`, drawn in the object's
-    coordinates: another label grid shows the same field. Raises InputError where there are no labels to vary.
+    coordinates: another label grid shows the same field. Only `layers` have labels that are not air. Raises InputError
+    where there are no labels to vary.
     """
     if not phantom.labels.any():
         raise InputError(f"texture: recipe {params.recipe!r} consists of solids, whose density does not vary")
@@ -46,9 +47,10 @@ def textured(phantom: Phantom, params: Recipe, seed: int) -> Phantom:
         for k, d, off in zip(phantom.labels.shape, phantom.d_voxel, phantom.off_origin, strict=True)
     )
     half = LEVELS // 2
-    level = np.clip(np.rint(noise(x, y, z) / STEP), -half, half).astype(np.int16) + half
+    level = np.clip(np.rint(noise(x, y, z[layers]) / STEP), -half, half).astype(np.int16) + half
     relative = 1 + params.texture * levels()
-    used = np.unique(phantom.labels)
+    drawn = phantom.labels[layers]
+    used = np.unique(drawn)
     names = list(phantom.materials)
     table = np.zeros((len(names), LEVELS), np.uint8)
     for k in used[used > 0]:
@@ -57,4 +59,6 @@ def textured(phantom: Phantom, params: Recipe, seed: int) -> Phantom:
             if name not in names:
                 names.append(name)
             table[k, j] = names.index(name)
-    return replace(phantom, labels=table[phantom.labels, level], materials=tuple(names))
+    labels = np.zeros_like(phantom.labels)
+    labels[layers] = table[drawn, level]
+    return replace(phantom, labels=labels, materials=tuple(names))

@@ -8,7 +8,7 @@ import msgspec
 
 from ctsim.beam.spectrum import Tube
 from ctsim.detector.noise import Noise
-from ctsim.phantoms.scene import Scene, build
+from ctsim.phantoms.scene import Scene, build, layers_of
 from ctsim.types import Phantom
 
 MOST, FILES = 16, 200  # scenes made together, and their stacks of views, a file each, that are open
@@ -53,20 +53,23 @@ def _without_metal(scene: Scene) -> Any:
 
 
 def build_all(scenes: Sequence[Scene]) -> list[Phantom]:
-    """Build the phantoms of scenes as `ctsim.phantoms.scene.build` does; those that differ in metal share arrays."""
+    """Build the phantoms of scenes as `ctsim.phantoms.scene.build` does; those that differ in metal share arrays.
+
+    They need not be whole.
+    """
     if len(scenes) == 1:
-        return [build(scenes[0])]
+        return [build(scenes[0], whole=False)]
     bodies: list[tuple[Scene, Phantom]] = []
     made: dict[tuple[int, str], Phantom] = {}
     built: list[Phantom] = []
     for scene in scenes:
         body = next((phantom for other, phantom in bodies if _same_body(other, scene)), None)
         if body is None:
-            body = build(msgspec.structs.replace(scene, phantom=_without_metal(scene)))
+            body = build(msgspec.structs.replace(scene, phantom=_without_metal(scene)), whole=False)
             bodies.append((scene, body))
         key = id(body), scene.phantom.metal
         if key not in made:
-            made[key] = _with_metal(body, scene.phantom.metal) or build(scene)
+            made[key] = _with_metal(body, scene.phantom.metal) or build(scene, whole=False)
         built.append(made[key])
     return built
 
@@ -75,7 +78,11 @@ def _same_body(a: Scene, b: Scene) -> bool:
     """Say whether the phantoms of two scenes are the same but for the recipe's metal."""
     if (_without_metal(a), a.seed, a.metal_in_view) != (_without_metal(b), b.seed, b.metal_in_view):
         return False
-    return not a.metal_in_view or a.resolve().geometry == b.resolve().geometry
+    parts = [layers_of(scene) for scene in (a, b)]
+    if a.metal_in_view:
+        return a.resolve().geometry == b.resolve().geometry and len({part is None for part in parts}) == 1
+    mine, other = (slice(None) if part is None else part(0.0) for part in parts)
+    return mine == other
 
 
 def _with_metal(body: Phantom, metal: str) -> Phantom | None:

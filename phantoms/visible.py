@@ -1,6 +1,7 @@
 """Objects whose metal a scan shows: drawn again until it does, or moved so that a single row meets it."""
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import replace
 
 import msgspec
@@ -19,25 +20,27 @@ from ctsim.types import Phantom
 DRAWS = 20
 PLANES, ACROSS = 64, 48  # heights to choose from, voxels along x and y that tell which of them hold metal
 LOOKED_AT = 8  # views
+NONE = slice(0)  # of the layers: the inserts are where they are without any
 
 
-def build_in_view(params: Recipe, seed: int, geometry: Geometry) -> Phantom:
+def build_in_view(
+    params: Recipe, seed: int, geometry: Geometry, layers: Callable[[float], slice] | None = None
+) -> Phantom:
     """Build a recipe's phantom so that the ray of a pixel's centre meets metal in a view; one without metal as it is.
 
     For a detector of one row the phantom is moved along z, so that the row sees a height drawn from those with metal.
-    Otherwise it is drawn again, with the same settings and seed. Raises InputError where `DRAWS` draws show no metal.
+    Otherwise it is drawn again, with the same settings and seed. `layers(dz)` are those to draw of a body that is moved
+    by `dz` mm, by default all. Raises InputError where `DRAWS` draws show no metal.
     """
     chosen = few_views(geometry.n_views, LOOKED_AT)
     for again in range(DRAWS):
-        phantom = build_recipe(params, seed, again)
-        if not any(solid.metal for solid in phantom.solids):
-            return phantom
-        if geometry.n_detector[0] == 1:
-            phantom = _moved(
-                phantom, _seen_height(geometry) - _metal_height(phantom, f"{params.recipe}/{seed}/{again}")
-            )
-        if metal_share(phantom, geometry, chosen) or metal_share(phantom, geometry):
-            return phantom
+        phantom = build_recipe(params, seed, again, slice(None) if layers is None else NONE)
+        dz, metal = 0.0, any(solid.metal for solid in phantom.solids)
+        if metal and geometry.n_detector[0] == 1:
+            dz = _seen_height(geometry) - _metal_height(phantom, f"{params.recipe}/{seed}/{again}")
+        moved = _moved(phantom, dz)
+        if not metal or metal_share(moved, geometry, chosen) or metal_share(moved, geometry):
+            return moved if layers is None else _moved(build_recipe(params, seed, again, layers(dz)), dz)
     raise InputError(
         f"metal_in_view: none of {DRAWS} draws of recipe {params.recipe!r} with seed {seed} has metal in a view; "
         "expected larger inserts or a larger field of view"
@@ -46,6 +49,8 @@ def build_in_view(params: Recipe, seed: int, geometry: Geometry) -> Phantom:
 
 def _moved(phantom: Phantom, dz: float) -> Phantom:
     """Move a phantom along z by `dz` mm."""
+    if not dz:
+        return phantom
     solids = []
     for solid in phantom.solids:
         pieces = tuple(replace(p, centre=(*p.centre[:2], p.centre[2] + dz)) for p in solid.primitives)

@@ -1,10 +1,16 @@
-"""Layers of the labels that no ray crosses are left out of the tracing, and no reading changes."""
+"""Layers of the labels that no ray crosses are neither drawn nor traced, and no reading changes."""
 
 import msgspec
 import numpy as np
 import pytest
+import torch
 
 from ctsim.geometry import Geometry
+from ctsim.phantoms import dataset
+from ctsim.phantoms.bodies import MetalRods, Validation
+from ctsim.phantoms.recipes import BUILDERS, build_recipe
+from ctsim.phantoms.scanners import ScannerSettings
+from ctsim.phantoms.scene import build, layers_of, parse_suite
 from ctsim.plan import make_plan
 from ctsim.settings import Simulation, Truth
 from ctsim.simulate import simulate_views
@@ -73,3 +79,71 @@ def test_what_most_rays_cross_and_tilted_detectors_are_left_alone():
 def test_a_row_beside_the_body_keeps_one_layer():
     part = layers_seen(phantom(), msgspec.structs.replace(ROW, off_detector=(400.0, 0.0)))
     assert part.labels.shape[0] == 1
+
+
+DRAWN = [kind for kind in BUILDERS if kind.by_layers]
+
+
+@pytest.mark.parametrize("kind", DRAWN, ids=lambda kind: kind.__struct_config__.tag)
+@pytest.mark.parametrize("texture", [0.0, 0.05])
+def test_layers_drawn_alone_are_those_of_the_whole(kind, texture):
+    if texture and kind in (Validation, MetalRods):
+        pytest.skip("solids have no texture")
+    params = kind(n_voxel=(61, 48, 50), grid_shift=(0.3, -0.2, 0.1), texture=texture)
+    whole = build_recipe(params, 3)
+    for part in (slice(0), slice(30, 31), slice(11, 20)):
+        found = build_recipe(params, 3, layers=part)
+        assert found.solids == whole.solids and found.off_origin == whole.off_origin
+        assert not np.delete(found.labels, part, 0).any()
+        mine, all_of_it = (np.array(p.materials)[p.labels[part]] for p in (found, whole))
+        assert np.array_equal(mine, all_of_it)
+
+
+SCENE = """
+name = "row"
+truncated = true
+seed = 4
+phantom = {{ recipe = "{recipe}", n_voxel = [96, 64, 64], grid_shift = [0.2, 0.1, 0.3], texture = {texture} }}
+scanner = {{ n_detector = [1, 70], n_views = 12, n_voxel = [1, 40, 40] }}
+metal_in_view = {in_view}
+truth = {{ twin = true, paths = true }}
+"""
+
+
+def scene(slices=1, **changes):
+    given = {"recipe": "lung", "texture": 0.05, "in_view": "true"} | changes
+    (one,) = parse_suite(SCENE.format(**given))
+    if slices == 1:
+        return one
+    geometry = msgspec.structs.replace(one.resolve().geometry, n_voxel=(slices, 40, 40), d_voxel=(1.5, 1.5, 1.5))
+    return msgspec.structs.replace(one, scanner=ScannerSettings(geometry=geometry))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"in_view": "false"}, {"slices": 5}, {"recipe": "teeth", "texture": 0.0}, {"recipe": "walnut"}],
+    ids=str,
+)
+def test_a_scan_of_one_row_is_that_of_the_whole_body(changes, monkeypatch):
+    one, scans = scene(**changes), []
+    body = build(one, whole=False)
+    n = int(body.labels.any((1, 2)).sum())
+    assert (n < 96 / 4) == (changes.get("recipe") != "walnut")  # whose pieces are known by the whole
+    for whole in (False, True):
+        if whole:
+            monkeypatch.setattr(dataset, "build", lambda scene, **_: build(scene))
+        scans.append(dataset.simulate_scene(one))
+    for mine, other in (scans, [scan.metal_free for scan in scans]):
+        assert torch.equal(mine.scan.counts, other.scan.counts)
+        for kind in ("effective", "50kev"):
+            assert np.array_equal(mine.reference(kind), other.reference(kind))
+    names = [np.array(scan.info.materials) for scan in scans]
+    assert np.array_equal(*(m[scan.labels] for m, scan in zip(names, scans, strict=True)))
+
+
+def test_what_scatters_or_comes_from_a_wide_spot_is_drawn_whole():
+    row = scene()
+    assert layers_of(row) is not None
+    for key, value in (("scatter", {"level": 3}), ("tube", {"focal_spot": {"size": [0.5, 0.5]}})):
+        scanner = msgspec.convert(msgspec.to_builtins(row.scanner) | {key: value}, type(row.scanner))
+        assert layers_of(msgspec.structs.replace(row, scanner=scanner)) is None

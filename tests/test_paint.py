@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ctsim.phantoms.fields import Canvas, frame_along
+from ctsim.phantoms.fields import Canvas, LabelGrid, frame_along
 
 GRID = (31, 40, 37)
 SIDES = (1.5, 1.0, 1.1)
@@ -12,7 +12,7 @@ EDGE = 1e-5  # of a level of about 1: float32 coordinates below 2 are off by les
 
 
 def canvas(label: int = 0) -> Canvas:
-    drawn = Canvas(GRID, SIDES, shrink=0.9, shift=SHIFT)
+    drawn = Canvas(LabelGrid(n=GRID, d_voxel=SIDES, shift=SHIFT), shrink=0.9)
     drawn.labels[:] = label
     return drawn
 

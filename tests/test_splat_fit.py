@@ -433,6 +433,12 @@ def test_a_record_counts_the_seconds_before_an_interruption(small, tmp_path):
     assert outcome.cost.cpu is None and outcome.details["earlier_seconds"] == 1000  # of the last part alone, so unknown
 
 
+def test_where_a_fit_is_kept_is_no_part_of_its_row():
+    kept, plain = find("splat", {"checkpoints": "somewhere", "tv": 1.0}), find("splat", {"tv": 1.0})
+    assert (kept.label, kept.params) == (plain.label, plain.params)
+    assert kept.overrides["checkpoints"] == "somewhere"
+
+
 def test_warming_up_keeps_nothing_that_a_run_would_go_on_from(small, tmp_path):
     assert warm_up(find("splat", {"checkpoints": str(tmp_path)}), small.scan) > 0
     assert not list(tmp_path.iterdir())

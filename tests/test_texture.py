@@ -13,7 +13,7 @@ from ctsim.phantoms.body_lung import Lung
 from ctsim.phantoms.body_random import Random
 from ctsim.phantoms.body_teeth import Teeth
 from ctsim.phantoms.body_volume import CtVolume
-from ctsim.phantoms.fields import Canvas
+from ctsim.phantoms.fields import Canvas, LabelGrid
 from ctsim.phantoms.patients.hip import Hip
 from ctsim.phantoms.recipes import BUILDERS, build_recipe
 from ctsim.phantoms.scene import parse_suite
@@ -208,7 +208,7 @@ def centroid(volume: np.ndarray, d: float) -> np.ndarray:
 
 def test_references_on_a_shifted_grid_are_averages_over_their_voxels() -> None:
     n, size, radii, middle = 61, 60.0, np.array([14.0, 11.0, 17.0]), np.array([3.0, -5.0, 2.0])
-    canvas = Canvas((n, n, n), (size / n,) * 3, shift=SHIFT)
+    canvas = Canvas(LabelGrid(n=(n, n, n), d_voxel=(size / n,) * 3, shift=SHIFT))
     canvas.ellipsoid(1, middle / canvas.unit, radii / canvas.unit)  # x, y, z
     shift = tuple(s * size / n for s in SHIFT)
     phantom = Phantom(labels=canvas.labels, materials=("air", "water"), d_voxel=(size / n,) * 3, off_origin=(*shift,))

@@ -59,9 +59,9 @@ def make_bricks(phantom: Phantom) -> Bricks:
 
 
 def _cut(volume: NDArray) -> NDArray:
-    """Return [brick, SIDE³], zero-padded to whole bricks."""
+    """Return [brick, SIDE³], padded to whole bricks with what is next to them, which keeps these uniform."""
     pad = [(0, -s % SIDE) for s in volume.shape]
-    padded = np.pad(volume, pad) if any(p[1] for p in pad) else volume
+    padded = np.pad(volume, pad, "edge") if any(p[1] for p in pad) else volume
     z, y, x = (s // SIDE for s in padded.shape)
     cut = padded.reshape(z, SIDE, y, SIDE, x, SIDE).transpose(0, 2, 4, 1, 3, 5)
     return np.ascontiguousarray(cut).reshape(z * y * x, SIDE**3)

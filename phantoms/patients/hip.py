@@ -8,9 +8,8 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from ctsim.geometry import Triple
-from ctsim.phantoms.bodies import Recipe, Shape, assemble
-from ctsim.phantoms.fields import Canvas, Field, Inside, Mask, Noise
+from ctsim.phantoms.bodies import Recipe, assemble
+from ctsim.phantoms.fields import Canvas, Field, Inside, LabelGrid, Mask, Noise
 from ctsim.phantoms.inserts import Inserts, count, inserts
 from ctsim.phantoms.patients.tissue import (
     AIR,
@@ -58,10 +57,10 @@ class Hip(Recipe, frozen=True, kw_only=True, tag="hip"):
         self.known("head")
 
 
-def hip(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Hip) -> Phantom:
+def hip(grid: LabelGrid, rng: np.random.Generator, params: Hip) -> Phantom:
     """Draw a pelvis with muscles, bladder, bowel and vessels; metal: a cup, a head and a stem a side."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel, shrink=SHRINK, shift=params.grid_shift)
+    canvas = Canvas(grid, shrink=SHRINK)
     wall = _body(canvas, body)
     _muscles(canvas, body, wall)
     _organs(canvas, body)
@@ -71,7 +70,7 @@ def hip(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Hip) -> Pha
     _sacrum(canvas)
     trabeculae(canvas, body)
     cut(canvas, END)
-    return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit), params.grid_shift)
+    return assemble(canvas.whole, grid, MATERIALS, _metal(metal, params, canvas.unit))
 
 
 class _Wall(NamedTuple):

@@ -8,9 +8,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from ctsim.geometry import Triple
-from ctsim.phantoms.bodies import Recipe, Shape, assemble
-from ctsim.phantoms.fields import Canvas, Field, Inside, Mask, Noise
+from ctsim.phantoms.bodies import Recipe, assemble
+from ctsim.phantoms.fields import Canvas, Field, Inside, LabelGrid, Mask, Noise
 from ctsim.phantoms.inserts import Inserts, count, diameter, inserts
 from ctsim.phantoms.patients.tissue import (
     AIR,
@@ -64,10 +63,10 @@ class Spine(Recipe, frozen=True, kw_only=True, tag="spine"):
             self.known("plug")
 
 
-def spine(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Spine) -> Phantom:
+def spine(grid: LabelGrid, rng: np.random.Generator, params: Spine) -> Phantom:
     """Draw an abdomen with kidneys, aorta, bowel and five vertebrae; metal: screws in pedicles, two rods."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(n, d_voxel, shrink=SHRINK, shift=params.grid_shift)
+    canvas = Canvas(grid, shrink=SHRINK)
     wall = _body(canvas, body)
     _muscles(canvas, wall)
     _organs(canvas, body)
@@ -75,7 +74,7 @@ def spine(n: Shape, d_voxel: Triple, rng: np.random.Generator, params: Spine) ->
         _vertebra(canvas, k)
     trabeculae(canvas, body)
     cut(canvas, END)
-    return assemble(canvas.labels, d_voxel, MATERIALS, _metal(metal, params, canvas.unit), params.grid_shift)
+    return assemble(canvas.whole, grid, MATERIALS, _metal(metal, params, canvas.unit))
 
 
 class _Wall(NamedTuple):

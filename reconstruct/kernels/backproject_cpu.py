@@ -68,27 +68,40 @@ def _pad_transposed(filtered, columns):
                     columns[view, u, v] = filtered[view, row, min(max(u - 1, 0), n_u - 1)]
 
 
-@njit(parallel=True, cache=True, fastmath=FAST)
+@njit(parallel=True, cache=True, fastmath=FAST, error_model="numpy")
 def _add_slice(filtered, cos, sin, orbit, grid, image):
     """Add all views to a volume of one slice, `image` [y, x]: a column of one voxel is not worth its set-up."""
     n_y, n_x = image.shape
     n_view, n_v, n_u = filtered.shape
     z_mm, middle_u, middle_v = grid[3], (n_u - 1) / 2, (n_v - 1) / 2
+    places = np.arange(n_x).astype(np.float32)
     for y in prange(n_y):
-        total = np.zeros(n_x, np.float32)
         y_mm = (y + 0.5 - n_y / 2) * grid[1] + grid[4]
         first, last = n_x, 0  # columns within the field of view
         for x in range(n_x):
             x_mm = (x + 0.5 - n_x / 2) * grid[2] + grid[5]
             if x_mm * x_mm + y_mm * y_mm <= grid[6] * grid[6]:
                 first, last = min(first, x), x + 1
+        n = max(last - first, 0)
+        total = np.zeros(n, np.float32)
+        work = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.float32)
+        from_mm = (first + 0.5 - n_x / 2) * grid[2] + grid[5]
         for view in range(n_view):
             c, s = cos[view], sin[view]
             if n_v == 1:
-                _add_line(filtered[view, 0], c, s, y_mm, z_mm, orbit, grid, first, last, total)
+                along, across = from_mm * c + y_mm * s, y_mm * c - from_mm * s
+                _add_line(
+                    filtered[view, 0],
+                    (orbit[0] - along, across, -grid[2] * c, -grid[2] * s),
+                    z_mm,
+                    orbit,
+                    places,
+                    work,
+                    total,
+                )
                 continue
-            for x in range(first, last):
-                x_mm = (x + 0.5 - n_x / 2) * grid[2] + grid[5]
+            for x in range(n):
+                x_mm = from_mm + x * grid[2]
                 inverse = 1.0 / (orbit[0] - (x_mm * c + y_mm * s))
                 scale = orbit[1] * inverse
                 u = (scale * (y_mm * c - x_mm * s) - orbit[5]) / orbit[3] + middle_u
@@ -103,29 +116,39 @@ def _add_slice(filtered, cos, sin, orbit, grid, image):
                 low = filtered[view, j, i] + t * (filtered[view, j, right] - filtered[view, j, i])
                 high = filtered[view, above, i] + t * (filtered[view, above, right] - filtered[view, above, i])
                 total[x] += np.float32((orbit[0] * inverse) ** 2) * (low + r * (high - low))
-        for x in range(first, last):
-            image[y, x] += total[x]
+        for x in range(n):
+            image[y, first + x] += total[x]
 
 
-@njit(cache=True, fastmath=FAST)
-def _add_line(line, c, s, y_mm, z_mm, orbit, grid, first, last, total):
-    """Add a view of one row to the voxels first…last−1 of a line; without branches, so that it is vector code."""
-    n_x, n_u = total.size, line.size
-    end_u, half_x = n_u - 1.0, n_x / 2
-    middle, x_step, x_off = end_u / 2, grid[2], grid[5]
-    dso, dsd, per_u, off_u = orbit[0], orbit[1], 1 / orbit[3], orbit[5]
-    highest = 0.5 * orbit[2]
-    for x in range(first, last):
-        x_mm = (x + 0.5 - half_x) * x_step + x_off
-        inverse = 1.0 / (dso - (x_mm * c + y_mm * s))
-        scale = dsd * inverse
-        u = (scale * (y_mm * c - x_mm * s) - off_u) * per_u + middle
-        seen = (u >= -0.5) & (u <= end_u + 0.5) & (abs(scale * z_mm - orbit[4]) <= highest)
-        u = min(max(u, 0.0), end_u)
-        i = np.uint32(u)
-        a, b = line[i], line[np.uint32(min(u + 1.0, end_u))]
-        weight = np.float32((dso * inverse) ** 2 if seen else 0.0)
-        total[x] += weight * (a + np.float32(u - i) * (b - a))
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def _add_line(line, view, z_mm, orbit, places, work, total):
+    """Add a view of one row to the voxels of a line of the slice.
+
+    `view` is (distance, across, their steps from one voxel to the next): the first voxel's place along the central ray
+    from the source and across it, in mm. `places` counts voxels, in float32: converting as one goes is no vector code,
+    nor is a check of the divisor. `work` has room for each voxel's column, its share of the next, and its weight.
+    """
+    column, share, weight = work
+    near, step = np.float32(view[0]), np.float32(view[2])
+    per = orbit[1] / orbit[3]
+    side, side_step = np.float32(per * view[1]), np.float32(per * view[3])
+    half = np.float32((line.size - 1) / 2)
+    moved, dso = np.float32(half - orbit[5] / orbit[3]), np.float32(orbit[0])
+    rise, off_v, highest = np.float32(orbit[1] * z_mm), np.float32(orbit[4]), np.float32(0.5 * orbit[2])
+    last, more = np.int32(max(line.size - 2, 0)), np.uint32(min(line.size - 1, 1))
+    for x in range(total.size):
+        inverse = np.float32(1) / (near + places[x] * step)
+        u = (side + places[x] * side_step) * inverse + moved
+        nearer = dso * inverse
+        nearer = nearer * nearer if abs(u - half) <= half + np.float32(0.5) else np.float32(0)
+        weight[x] = nearer if abs(rise * inverse - off_v) <= highest else np.float32(0)
+        u = min(max(u, np.float32(0)), half + half)
+        column[x] = min(np.int32(u), last)
+        share[x] = u - np.float32(column[x])
+    for x in range(total.size):
+        i = np.uint32(column[x])
+        a, b = line[i], line[i + more]
+        total[x] += weight[x] * (a + share[x] * (b - a))
 
 
 @njit(parallel=True, cache=True)

@@ -22,11 +22,13 @@ from ctsim.benchmarks.engine.host import in_turns
 from ctsim.benchmarks.studies.skipping.study import CORE, Skip
 from ctsim.benchmarks.suites import load, select
 from ctsim.phantoms.bodies import Validation
+from ctsim.phantoms.scanners import ScannerSettings
 from ctsim.phantoms.scene import Scene, build, stream_id
 from ctsim.plan import Plan, make_plan
 from ctsim.settings import Truth
 from ctsim.simulate import compact, simulate_views
 from ctsim.tracer.bricks import Bricks, make_bricks
+from ctsim.tracer.layers import layers_seen
 from ctsim.tracer.project import EDGE_THRESHOLD, Response, Tracer, transmit
 from ctsim.tracer.shadow import MOST_TIMES
 from ctsim.types import Phantom, Scanner
@@ -252,6 +254,26 @@ def in_logarithm(one: Signals, other: Signals) -> float:
     return largest([np.log(a) for a in one], [np.log(b) for b in other])
 
 
+def layers(setup: Bench) -> Iterator[Pair]:
+    """Yield the body of a scan of one detector row, drawn where the row sees it, and drawn as a whole."""
+    scene = setup.scene()
+    whole = scene.resolve().geometry
+    geometry = msgspec.structs.replace(whole, n_detector=(1, whole.n_detector[1]), n_voxel=(1, *whole.n_voxel[1:]))
+    one = msgspec.structs.replace(scene, scanner=ScannerSettings(geometry=geometry), truncated=True)
+
+    def labels(whole: bool) -> list[NDArray[np.uint8]]:
+        return [layers_seen(build(one, whole=whole), geometry).labels]
+
+    yield Pair(
+        scene=scene.name,
+        what="layers of the body that one detector row does not see",
+        skipping=partial(labels, False),
+        whole=partial(labels, True),
+        unit="labels",
+        note=f"{len(labels(True)[0])} of {scene.phantom.n_voxel[0]} layers",
+    )
+
+
 def energies(setup: Bench) -> Iterator[Pair]:
     """Yield a scan at the plan's Gauss nodes, and at every energy of the spectrum with the same sub-rays."""
     scan = setup.planned()
@@ -358,6 +380,6 @@ def truth(setup: Bench) -> Iterator[Pair]:
     yield setup.pair("ground truth that is not asked for", asked, all_of_it, difference=image_difference, unit="counts")
 
 
-NAMED = (materials, bricks, rays, energies, edges, refining, twin, truth)
+NAMED = (materials, bricks, rays, layers, energies, edges, refining, twin, truth)
 Cases = dict[str, Callable[[Bench], Iterator[Pair]]]
 CASES: Cases = {case.__name__: case for case in NAMED}
