@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctsim.geometry import Triple
 from ctsim.phantoms import shapes
-from ctsim.phantoms.bodies import Recipe
+from ctsim.phantoms.recipe import Recipe
 from ctsim.solids import Solid, Vector
 
 

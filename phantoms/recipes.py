@@ -11,16 +11,17 @@ from typing import Any
 import numpy as np
 
 from ctsim.errors import InputError
-from ctsim.phantoms.bodies import MetalRods, Recipe, Validation, metal_rods, validation
-from ctsim.phantoms.body_broccoli import Broccoli, broccoli
-from ctsim.phantoms.body_lung import Lung, lung
-from ctsim.phantoms.body_organic import BellPepper, Chicken, Walnut, bell_pepper, chicken, walnut
-from ctsim.phantoms.body_random import Random, random
-from ctsim.phantoms.body_teeth import Teeth, teeth
-from ctsim.phantoms.body_volume import CtVolume, ct_volume
+from ctsim.phantoms.bodies.broccoli import Broccoli, broccoli
+from ctsim.phantoms.bodies.hip import Hip, hip
+from ctsim.phantoms.bodies.lung import Lung, lung
+from ctsim.phantoms.bodies.organic import BellPepper, Chicken, Walnut, bell_pepper, chicken, walnut
+from ctsim.phantoms.bodies.random import Random, random
+from ctsim.phantoms.bodies.rods import MetalRods, Validation, metal_rods, validation
+from ctsim.phantoms.bodies.spine import Spine, spine
+from ctsim.phantoms.bodies.teeth import Teeth, teeth
+from ctsim.phantoms.bodies.volume import CtVolume, ct_volume
 from ctsim.phantoms.fields import LabelGrid
-from ctsim.phantoms.patients.hip import Hip, hip
-from ctsim.phantoms.patients.spine import Spine, spine
+from ctsim.phantoms.recipe import Recipe
 from ctsim.phantoms.texture import textured
 from ctsim.types import Phantom
 

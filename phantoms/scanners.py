@@ -20,7 +20,7 @@ from ctsim.detector.panel import Blur, Lag
 from ctsim.detector.response import Detector
 from ctsim.errors import InputError
 from ctsim.geometry import Count, Geometry, Pair, Triple
-from ctsim.phantoms.bodies import REACH
+from ctsim.phantoms.recipe import REACH
 from ctsim.scatter import Scatter
 from ctsim.types import Scanner
 

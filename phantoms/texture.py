@@ -14,8 +14,8 @@ from scipy.special import erf
 
 from ctsim.errors import InputError
 from ctsim.materials import at_density
-from ctsim.phantoms.bodies import Recipe
 from ctsim.phantoms.fields import Noise
+from ctsim.phantoms.recipe import Recipe
 from ctsim.types import Phantom
 
 LEVELS = 7

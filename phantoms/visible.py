@@ -10,7 +10,7 @@ import numpy as np
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry, few_views
 from ctsim.notes import metal_share
-from ctsim.phantoms.bodies import Recipe
+from ctsim.phantoms.recipe import Recipe
 from ctsim.phantoms.recipes import build_recipe
 from ctsim.solids import pack
 from ctsim.tracer.shadow import primitive_corners

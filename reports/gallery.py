@@ -14,7 +14,7 @@ from ctsim.benchmarks.scalebar import scale_bar
 from ctsim.benchmarks.studies.methods.panels import METAL, cut
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
-from ctsim.phantoms.bodies import Recipe
+from ctsim.phantoms.recipe import Recipe
 from ctsim.phantoms.recipes import BUILDERS, build_recipe
 from ctsim.tracer.voxelise import attenuation_volume, metal_mask
 from ctsim.types import Phantom

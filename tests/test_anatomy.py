@@ -12,10 +12,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ctsim.phantoms.bodies import Recipe
-from ctsim.phantoms.body_lung import Lung
-from ctsim.phantoms.body_random import Random
-from ctsim.phantoms.body_teeth import Teeth
+from ctsim.phantoms.bodies.lung import Lung
+from ctsim.phantoms.bodies.random import Random
+from ctsim.phantoms.bodies.teeth import Teeth
+from ctsim.phantoms.recipe import Recipe
 from ctsim.phantoms.recipes import build_recipe
 from ctsim.solids import CAPSULE, ELLIPSOID, Solid
 from ctsim.types import Phantom

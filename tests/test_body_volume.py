@@ -13,7 +13,7 @@ from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
-from ctsim.phantoms.body_volume import TISSUES, CtVolume
+from ctsim.phantoms.bodies.volume import TISSUES, CtVolume
 from ctsim.phantoms.recipes import build_recipe
 from ctsim.phantoms.scene import parse_suite, scene_id, scene_to_toml, stream_id
 from ctsim.tracer.voxelise import attenuation_volume

@@ -17,7 +17,7 @@ from ct_files import SPACING, corner, oblique, stored, write, write_slices
 from ctsim.errors import InputError
 from ctsim.io.volumes.formats import open_volume
 from ctsim.phantoms import ct_headers
-from ctsim.phantoms.body_volume import TISSUES, CtVolume
+from ctsim.phantoms.bodies.volume import TISSUES, CtVolume
 from ctsim.phantoms.dataset import plan_scene
 from ctsim.phantoms.recipes import build_recipe
 from ctsim.phantoms.scene import build, parse_suite, scene_id

@@ -15,11 +15,11 @@ from ctsim.benchmarks.export import work as export
 from ctsim.benchmarks.make_dataset import main as make_dataset
 from ctsim.io.volumes import dicomwrite, metaimage, nifti
 from ctsim.io.volumes.placed import Placed
-from ctsim.phantoms.bodies import Recipe
-from ctsim.phantoms.body_lung import Lung
-from ctsim.phantoms.body_teeth import Teeth
-from ctsim.phantoms.patients.hip import Hip
-from ctsim.phantoms.patients.spine import Spine
+from ctsim.phantoms.bodies.hip import Hip
+from ctsim.phantoms.bodies.lung import Lung
+from ctsim.phantoms.bodies.spine import Spine
+from ctsim.phantoms.bodies.teeth import Teeth
+from ctsim.phantoms.recipe import Recipe
 from ctsim.phantoms.recipes import build_recipe
 from ctsim.types import Phantom
 

@@ -7,7 +7,7 @@ import torch
 
 from ctsim.geometry import Geometry
 from ctsim.phantoms import dataset
-from ctsim.phantoms.bodies import MetalRods, Validation
+from ctsim.phantoms.bodies.rods import MetalRods, Validation
 from ctsim.phantoms.recipes import BUILDERS, build_recipe
 from ctsim.phantoms.scanners import ScannerSettings
 from ctsim.phantoms.scene import build, layers_of, parse_suite

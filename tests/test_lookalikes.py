@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from ctsim.phantoms.bodies import Recipe
+from ctsim.phantoms.recipe import Recipe
 from ctsim.phantoms.recipes import BUILDERS, build_recipe
 from ctsim.phantoms.scene import load_suite
 from ctsim.solids import Primitive, Solid

@@ -10,9 +10,9 @@ from scipy import ndimage
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation, material
-from ctsim.phantoms.body_teeth import Teeth
-from ctsim.phantoms.patients.hip import Hip
-from ctsim.phantoms.patients.spine import Spine
+from ctsim.phantoms.bodies.hip import Hip
+from ctsim.phantoms.bodies.spine import Spine
+from ctsim.phantoms.bodies.teeth import Teeth
 from ctsim.phantoms.recipes import build_recipe
 from ctsim.solids import Solid
 from ctsim.tracer.voxelise import fractions

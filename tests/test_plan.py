@@ -12,7 +12,7 @@ from ctsim import plan as planning
 from ctsim import simulate
 from ctsim.benchmarks.suites import load
 from ctsim.montecarlo import series
-from ctsim.phantoms.bodies import Validation
+from ctsim.phantoms.bodies.rods import Validation
 from ctsim.phantoms.recipes import build_recipe
 from ctsim.phantoms.scanners import preset
 from ctsim.phantoms.scene import build, parse_suite

@@ -12,7 +12,7 @@ from test_run import GEOMETRY, Double
 
 from ctsim.benchmarks.scalebar import length_of, scale_bar
 from ctsim.errors import InputError
-from ctsim.phantoms.bodies import MetalRods, Validation
+from ctsim.phantoms.bodies.rods import MetalRods, Validation
 from ctsim.phantoms.recipes import BUILDERS, build_recipe
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reports import plots

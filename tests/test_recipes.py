@@ -6,7 +6,7 @@ import pytest
 
 from ctsim.errors import InputError
 from ctsim.materials import material
-from ctsim.phantoms.body_volume import CtVolume
+from ctsim.phantoms.bodies.volume import CtVolume
 from ctsim.phantoms.fields import Noise, supply_tree
 from ctsim.phantoms.recipes import BUILDERS, NAMES, build_recipe
 from ctsim.phantoms.scanners import REACH

@@ -19,7 +19,7 @@ from ctsim.dataset.writer import SceneWriter
 from ctsim.detector.noise import Noise
 from ctsim.detector.response import Detector
 from ctsim.errors import InputError
-from ctsim.phantoms.body_lung import Lung
+from ctsim.phantoms.bodies.lung import Lung
 from ctsim.phantoms.identity import FIRST_KEYS, identity
 from ctsim.phantoms.recipes import BUILDERS, NAMES
 from ctsim.phantoms.scanners import MACHINES, ScannerSettings, preset

@@ -9,12 +9,12 @@ import pytest
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation, mass_attenuation, material, nominal
-from ctsim.phantoms.body_lung import Lung
-from ctsim.phantoms.body_random import Random
-from ctsim.phantoms.body_teeth import Teeth
-from ctsim.phantoms.body_volume import CtVolume
+from ctsim.phantoms.bodies.hip import Hip
+from ctsim.phantoms.bodies.lung import Lung
+from ctsim.phantoms.bodies.random import Random
+from ctsim.phantoms.bodies.teeth import Teeth
+from ctsim.phantoms.bodies.volume import CtVolume
 from ctsim.phantoms.fields import Canvas, LabelGrid
-from ctsim.phantoms.patients.hip import Hip
 from ctsim.phantoms.recipes import BUILDERS, build_recipe
 from ctsim.phantoms.scene import parse_suite
 from ctsim.phantoms.texture import LEVELS, levels

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ctsim.phantoms import dataset
-from ctsim.phantoms.body_teeth import Teeth
-from ctsim.phantoms.body_volume import CtVolume
+from ctsim.phantoms.bodies.teeth import Teeth
+from ctsim.phantoms.bodies.volume import CtVolume
 from ctsim.phantoms.dataset import make_scene, make_scenes
 from ctsim.phantoms.recipes import BUILDERS
 from ctsim.phantoms.scene import Scene, build, parse_suite

@@ -28,7 +28,7 @@ from ctsim.benchmarks.methods import EXTERNAL, TABLE, find, parameters, resolve
 from ctsim.benchmarks.suites import bundled, load
 from ctsim.errors import InputError
 from ctsim.materials import _TABLE as MATERIALS
-from ctsim.phantoms.bodies import Recipe
+from ctsim.phantoms.recipe import Recipe
 from ctsim.phantoms.recipes import BUILDERS
 from ctsim.phantoms.scanners import MACHINES, ScannerSettings
 from ctsim.phantoms.scene import Scene

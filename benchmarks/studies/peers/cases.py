@@ -30,8 +30,8 @@ from ctsim.benchmarks.studies.peers.poly import poly
 from ctsim.benchmarks.studies.peers.study import Flags
 from ctsim.look import present_materials
 from ctsim.materials import attenuation
-from ctsim.phantoms.bodies import Validation
-from ctsim.phantoms.body_lung import Lung
+from ctsim.phantoms.bodies.lung import Lung
+from ctsim.phantoms.bodies.rods import Validation
 from ctsim.phantoms.recipes import build_recipe
 from ctsim.reconstruct.fdk import fdk as ours_fdk
 from ctsim.simulate import compact

@@ -21,7 +21,7 @@ from ctsim.beam.quadrature import full_rule
 from ctsim.benchmarks.engine.host import in_turns
 from ctsim.benchmarks.studies.skipping.study import CORE, Skip
 from ctsim.benchmarks.suites import load, select
-from ctsim.phantoms.bodies import Validation
+from ctsim.phantoms.bodies.rods import Validation
 from ctsim.phantoms.scanners import ScannerSettings
 from ctsim.phantoms.scene import Scene, build, stream_id
 from ctsim.plan import Plan, make_plan

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ctsim.errors import InputError
-from ctsim.phantoms.bodies import Recipe, assemble
 from ctsim.phantoms.fields import Canvas, Field, LabelGrid, Mask, Noise
 from ctsim.phantoms.inserts import Inserts, count, diameter, inserts
+from ctsim.phantoms.recipe import Recipe, assemble
 from ctsim.solids import BOX, Primitive, Solid, Vector
 from ctsim.types import Phantom
 

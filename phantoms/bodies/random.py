@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ctsim.phantoms.bodies import Recipe, assemble
 from ctsim.phantoms.fields import Canvas, LabelGrid, Noise
 from ctsim.phantoms.inserts import Inserts, count, diameter, inserts
+from ctsim.phantoms.recipe import Recipe, assemble
 from ctsim.solids import Solid
 from ctsim.types import Phantom
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from ctsim.phantoms.bodies import REACH, Recipe, assemble
 from ctsim.phantoms.fields import Canvas, Field, LabelGrid, Mask, Noise, frame_along
 from ctsim.phantoms.inserts import count, diameter, inserts
+from ctsim.phantoms.recipe import REACH, Recipe, assemble
 from ctsim.solids import Solid
 from ctsim.types import Phantom
 

@@ -8,10 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from ctsim.phantoms.bodies import Recipe, assemble
-from ctsim.phantoms.fields import Canvas, Field, Inside, LabelGrid, Mask, Noise
-from ctsim.phantoms.inserts import Inserts, count, diameter, inserts
-from ctsim.phantoms.patients.tissue import (
+from ctsim.phantoms.bodies.tissue import (
     AIR,
     BLOOD,
     BONE,
@@ -28,6 +25,9 @@ from ctsim.phantoms.patients.tissue import (
     mirrored,
     trabeculae,
 )
+from ctsim.phantoms.fields import Canvas, Field, Inside, LabelGrid, Mask, Noise
+from ctsim.phantoms.inserts import Inserts, count, diameter, inserts
+from ctsim.phantoms.recipe import Recipe, assemble
 from ctsim.solids import Solid
 from ctsim.types import Phantom
 

@@ -14,10 +14,10 @@ from ctsim.dataset.arrayfile import MOST
 from ctsim.errors import InputError
 from ctsim.geometry import Triple
 from ctsim.materials import attenuation
-from ctsim.phantoms.bodies import REACH, Millimetres, Recipe, assemble
 from ctsim.phantoms.ct_file import Ct, digest_of, read_hu, settle, without_metal
 from ctsim.phantoms.fields import LabelGrid, Shape
 from ctsim.phantoms.inserts import count, diameter, inserts
+from ctsim.phantoms.recipe import REACH, Millimetres, Recipe, assemble
 from ctsim.solids import Solid
 from ctsim.types import Phantom
 

@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.phantoms.bodies import Recipe, assemble
 from ctsim.phantoms.fields import Canvas, Field, LabelGrid, Mask, Noise, frame_along
 from ctsim.phantoms.inserts import count, diameter, inserts
+from ctsim.phantoms.recipe import Recipe, assemble
 from ctsim.solids import Solid
 from ctsim.types import Phantom
 

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ctsim.phantoms.bodies import Recipe, assemble
 from ctsim.phantoms.fields import Canvas, Field, Inside, LabelGrid, Mask, Noise, supply_tree
 from ctsim.phantoms.inserts import count, diameter, inserts
+from ctsim.phantoms.recipe import Recipe, assemble
 from ctsim.solids import Solid
 from ctsim.types import Phantom
 

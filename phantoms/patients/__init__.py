@@ -1,1 +1,0 @@
-"""Bodies of patients with several implants of several metals."""
