@@ -95,7 +95,7 @@ ASKED = {"known": SPECTRUM, "tube": ASSUMED}
 FITTED = ("splat", "field")
 """Values of a `prior` that is built on an assumed spectrum."""
 KEPT_IN = "checkpoints"
-"""The parameter that says where an unfinished fit is kept: no part of what a record and a table name."""
+"""The parameter of our methods that says where an unfinished fit is kept: no part of what a record and a table name."""
 GONE = {("splat", "preset"): "presets are methods of their own; expected --method splat-paper or --method splat-r2"}
 """(method, removed parameter) -> what to do instead."""
 WIDEST = 24  # characters; a longer default is not aligned with the others
@@ -123,7 +123,7 @@ class Method:
     @property
     def label(self) -> str:
         """The name with the parameters that differ from the defaults, as tables show it."""
-        given = ", ".join(f"{k}={v}" for k, v in sorted(self.overrides.items()) if k != KEPT_IN)
+        given = ", ".join(f"{k}={v}" for k, v in sorted(_named(self.name, self.overrides).items()))
         return f"{self.name}[{given}]" if given and not self.program else self.name
 
     @property
@@ -298,7 +298,12 @@ def _settings(name: str, function: Callable[..., Any], given: dict[str, Any]) ->
         build(cast("Any", function).settings, given, where)
     defaults = {key: _plain(parameter.default) for key, parameter in known.items()}
     changed = {key: plain for key, value in values.items() if (plain := _plain(value)) != defaults[key]}
-    return defaults | {key: value for key, value in changed.items() if key != KEPT_IN}, changed
+    return defaults | _named(name, changed), changed
+
+
+def _named(name: str, changed: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings that say what a method does, without where it keeps its state."""
+    return {key: value for key, value in changed.items() if key != KEPT_IN or name not in TABLE}
 
 
 def _plain(value: Any) -> Any:

@@ -124,7 +124,9 @@ def _check_bowtie(scanner: Scanner, rule: EnergyRule) -> None:
 
 
 def present_materials(phantom: Phantom) -> tuple[str, ...]:
-    """Materials of the phantom that occur in its labels or solids, air first."""
+    """Materials of the phantom that occur in its labels or solids, air first; all of one that is not drawn whole."""
+    if phantom.partial:
+        return phantom.materials
     solid = {s.material for s in phantom.solids}
     # label by label takes a fifth of the time of counting all of them, which makes each a larger integer first
     return tuple(m for k, m in enumerate(phantom.materials) if k == 0 or m in solid or (phantom.labels == k).any())

@@ -3,7 +3,7 @@
 import enum
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
@@ -29,7 +29,8 @@ class Phantom:
 
     `labels` is uint8 [z, y, x]; label k is `materials[k]` and label 0 is always air, which does not
     attenuate (the flat field is taken through air). `density` is relative to the material's nominal
-    density, float32 [z, y, x]. `d_voxel` and `off_origin` (z, y, x) are mm.
+    density, float32 [z, y, x]. `d_voxel` and `off_origin` (z, y, x) are mm. `partial` says that layers of the labels
+    are not drawn, so that a material which does not occur in them may be of the body all the same.
     """
 
     labels: NDArray[np.uint8]
@@ -38,6 +39,7 @@ class Phantom:
     off_origin: Triple = (0.0, 0.0, 0.0)
     density: NDArray[np.float32] | None = None
     solids: tuple[Solid, ...] = ()
+    partial: bool = False
 
     def __post_init__(self) -> None:
         if self.labels.ndim != 3 or self.labels.dtype != np.uint8:
@@ -59,15 +61,7 @@ class Phantom:
 
     def without_metal(self) -> "Phantom":
         """Return the same body with its metal inserts taken out."""
-        kept = tuple(s for s in self.solids if not s.metal)
-        return Phantom(
-            labels=self.labels,
-            materials=self.materials,
-            d_voxel=self.d_voxel,
-            off_origin=self.off_origin,
-            density=self.density,
-            solids=kept,
-        )
+        return replace(self, solids=tuple(s for s in self.solids if not s.metal))
 
 
 class Scanner(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

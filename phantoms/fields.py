@@ -34,10 +34,17 @@ class Noise:
         self.coefficients = (rng.standard_normal((cells + 3,) * 3) / (151 / 315) ** 1.5).astype(np.float32)
 
     def __call__(self, x: Field, y: Field, z: Field) -> Field:
-        """Evaluate on the grid spanned by the axes x, y, z."""
-        out = self.coefficients
-        for axis, at in enumerate((z, y, x)):
-            out = np.moveaxis(np.tensordot(self._basis(at.ravel()), out, (1, axis)), 0, axis)
+        """Evaluate on the grid spanned by the axes x, y, z; a layer does not depend on which others there are."""
+        left, weights = self._taps(z.ravel())
+        across, along = self._basis(x.ravel()).T, self._basis(y.ravel())
+        out = np.empty((left.size, along.shape[0], across.shape[1]), np.float32)
+        planes: dict[int, Field] = {}
+        for layer, first, shares in zip(out, left.tolist(), weights, strict=True):
+            # plane by plane: BLAS rounds products of another number of layers differently
+            old, planes = planes, {}
+            for k, share in enumerate(shares, first):
+                planes[k] = old[k] if k in old else along @ self.coefficients[k] @ across
+                np.multiply(planes[k], share, layer) if k == first else np.add(layer, share * planes[k], layer)
         return out
 
     def at(self, points: Field) -> Field:
@@ -47,15 +54,19 @@ class Noise:
             out = np.einsum("ka,ka...->k...", self._basis(points[:, axis]), out)
         return out
 
-    def _basis(self, at: Field) -> Field:
+    def _taps(self, at: Field) -> tuple[NDArray[np.int_], Field]:
+        """Return the first of four coefficients that count at each place, and by how much they do, [place, 4]."""
         t = np.clip((at.astype(np.float64) + 1) / 2, 0, 1) * self.cells
         left = np.minimum(t.astype(int), self.cells - 1)
         f = t - left
         weights = np.stack([(1 - f) ** 3, 3 * f**3 - 6 * f**2 + 4, -3 * f**3 + 3 * f**2 + 3 * f + 1, f**3], 1) / 6
-        basis = np.zeros((len(t), self.cells + 3))
-        for k in range(4):
-            basis[np.arange(len(t)), left + k] = weights[:, k]
-        return basis.astype(np.float32)
+        return left, weights.astype(np.float32)
+
+    def _basis(self, at: Field) -> Field:
+        left, weights = self._taps(at)
+        basis = np.zeros((left.size, self.cells + 3), np.float32)
+        np.put_along_axis(basis, left[:, None] + np.arange(4), weights, 1)
+        return basis
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

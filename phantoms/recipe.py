@@ -110,5 +110,10 @@ def assemble(labels: np.ndarray, grid: LabelGrid, materials: Sequence[str], soli
             names.append(solid.material)
     z, y, x = (s * d for s, d in zip(grid.shift, grid.d_voxel, strict=True))
     return Phantom(
-        labels=labels, materials=tuple(names), d_voxel=grid.d_voxel, off_origin=(z, y, x), solids=tuple(solids)
+        labels=labels,
+        materials=tuple(names),
+        d_voxel=grid.d_voxel,
+        off_origin=(z, y, x),
+        solids=tuple(solids),
+        partial=grid.layers != slice(None),
     )

@@ -106,7 +106,8 @@ def layers_of(scene: Scene) -> Callable[[float], slice] | None:
     """Return which layers a scan needs of a body that is moved by so many mm along z; None where it needs all."""
     scanner, params = scene.resolve(), scene.phantom
     geometry = all_rays(scanner)
-    if geometry is None or scanner.scatter.level == 3 or not params.by_layers:  # photons scatter in all of it
+    scatters = scanner.scatter.level == 3  # photons meet all of it
+    if geometry is None or scatters or not params.by_layers or not scene.simulation.skip:
         return None
     z, y, x = (s * d for s, d in zip(params.grid_shift, params.d_voxel, strict=True))
     return lambda dz: crossed(params.n_voxel, params.d_voxel, (z + dz, y, x), geometry, grid=True)

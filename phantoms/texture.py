@@ -34,8 +34,8 @@ def textured(phantom: Phantom, params: Recipe, seed: int, layers: slice = slice(
     """Split every material of the labels but air into levels of density; the same seed gives the same texture.
 
     The field is a cubic B-spline through random numbers on a lattice of `texture_mm`, drawn in the object's
-    coordinates: another label grid shows the same field. Only `layers` have labels that are not air. Raises InputError
-    where there are no labels to vary.
+    coordinates: another label grid shows the same field. Labels outside of `layers` are air and stay
+    so. Raises InputError where there are no labels to vary.
     """
     if not phantom.labels.any():
         raise InputError(f"texture: recipe {params.recipe!r} consists of solids, whose density does not vary")

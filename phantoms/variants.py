@@ -55,7 +55,7 @@ def _without_metal(scene: Scene) -> Any:
 def build_all(scenes: Sequence[Scene]) -> list[Phantom]:
     """Build the phantoms of scenes as `ctsim.phantoms.scene.build` does; those that differ in metal share arrays.
 
-    They need not be whole.
+    Layers that their scans do not see may be missing.
     """
     if len(scenes) == 1:
         return [build(scenes[0], whole=False)]

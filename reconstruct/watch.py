@@ -73,7 +73,7 @@ class Stopwatch:
     """A run's seconds, less what watching it took, and the times at which its watcher is still to be shown one."""
 
     def __init__(self, limit: float = math.inf) -> None:
-        """Start at 0; the run is to end after `limit` seconds. `earlier` are those of the parts before this one."""
+        """Start at 0; the run is to end after `limit` seconds. `earlier` are those of its parts before this one."""
         self._began, self._paused = time.perf_counter(), 0.0
         self.limit, self.earlier, self._told = limit, 0.0, -math.inf
         self._watcher = _watcher.get()

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ctsim.geometry import Geometry
-from ctsim.phantoms import dataset
+from ctsim.phantoms import dataset, variants
 from ctsim.phantoms.bodies.rods import MetalRods, Validation
 from ctsim.phantoms.recipes import BUILDERS, build_recipe
 from ctsim.phantoms.scanners import ScannerSettings
@@ -94,7 +94,7 @@ def test_layers_drawn_alone_are_those_of_the_whole(kind, texture):
     for part in (slice(0), slice(30, 31), slice(11, 20)):
         found = build_recipe(params, 3, layers=part)
         assert found.solids == whole.solids and found.off_origin == whole.off_origin
-        assert not np.delete(found.labels, part, 0).any()
+        assert found.partial and not whole.partial and not np.delete(found.labels, part, 0).any()
         mine, all_of_it = (np.array(p.materials)[p.labels[part]] for p in (found, whole))
         assert np.array_equal(mine, all_of_it)
 
@@ -137,13 +137,40 @@ def test_a_scan_of_one_row_is_that_of_the_whole_body(changes, monkeypatch):
         assert torch.equal(mine.scan.counts, other.scan.counts)
         for kind in ("effective", "50kev"):
             assert np.array_equal(mine.reference(kind), other.reference(kind))
-    names = [np.array(scan.info.materials) for scan in scans]
-    assert np.array_equal(*(m[scan.labels] for m, scan in zip(names, scans, strict=True)))
+    assert scans[0].info.materials == scans[1].info.materials  # as many channels of paths, whatever the row sees
+    for name in ("labels", "metal"):
+        assert np.array_equal(*(getattr(scan, name) for scan in scans))
+    assert np.array_equal(*(scan.array("paths") for scan in scans))
+
+
+def test_rows_of_one_body_with_several_metals_are_drawn_together(monkeypatch):
+    rows = [
+        msgspec.structs.replace(one, phantom=msgspec.structs.replace(one.phantom, metal=metal))
+        for one in (scene(), scene(in_view="false"), scene(slices=5))
+        for metal in ("Fe", "Ti")
+    ]
+    found = variants.build_all(rows)
+    for one, body in zip(rows, found, strict=True):
+        alone = build(one, whole=False)
+        assert np.array_equal(body.labels, alone.labels) and body.off_origin == alone.off_origin
+        assert body.partial and body.solids == alone.solids
+    assert found[0].labels is found[1].labels and found[0].labels is not found[4].labels
+
+
+def test_a_row_that_sees_no_layer_with_tissue_has_the_whole_body():
+    """At 27 mm, above the thorax and within what may hold a body; far from the source rays hardly rise."""
+    changes = {"dso": 4000.0, "dsd": 8000.0, "d_detector": (0.2, 2.0), "off_origin": (27.0, 0, 0)}
+    geometry = msgspec.structs.replace(scene().resolve().geometry, off_detector=(54.0, 0.0), **changes)
+    one = msgspec.structs.replace(scene(in_view="false"), scanner=ScannerSettings(geometry=geometry))
+    assert layers_of(one)(0.0) != slice(None)
+    body = build(one, whole=False)
+    assert not body.partial and np.array_equal(body.labels, build(one).labels)
 
 
 def test_what_scatters_or_comes_from_a_wide_spot_is_drawn_whole():
     row = scene()
     assert layers_of(row) is not None
+    assert layers_of(msgspec.structs.replace(row, simulation=Simulation(skip=False))) is None
     for key, value in (("scatter", {"level": 3}), ("tube", {"focal_spot": {"size": [0.5, 0.5]}})):
         scanner = msgspec.convert(msgspec.to_builtins(row.scanner) | {key: value}, type(row.scanner))
         assert layers_of(msgspec.structs.replace(row, scanner=scanner)) is None

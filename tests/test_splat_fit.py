@@ -437,6 +437,12 @@ def test_where_a_fit_is_kept_is_no_part_of_its_row():
     kept, plain = find("splat", {"checkpoints": "somewhere", "tv": 1.0}), find("splat", {"tv": 1.0})
     assert (kept.label, kept.params) == (plain.label, plain.params)
     assert kept.overrides["checkpoints"] == "somewhere"
+    named = [find(f"{__name__}:{of_weights.__name__}", {"checkpoints": file}) for file in ("a.pt", "b.pt")]
+    assert named[0].label != named[1].label and named[0].params != named[1].params  # another's is what it says it is
+
+
+def of_weights(scan, *, checkpoints: str = "best.pt"):
+    """A method whose checkpoints are its weights."""
 
 
 def test_warming_up_keeps_nothing_that_a_run_would_go_on_from(small, tmp_path):

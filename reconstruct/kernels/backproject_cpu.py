@@ -125,8 +125,9 @@ def _add_line(line, view, z_mm, orbit, places, work, total):
     """Add a view of one row to the voxels of a line of the slice.
 
     `view` is (distance, across, their steps from one voxel to the next): the first voxel's place along the central ray
-    from the source and across it, in mm. `places` counts voxels, in float32: converting as one goes is no vector code,
-    nor is a check of the divisor. `work` has room for each voxel's column, its share of the next, and its weight.
+    from the source and across it, in mm. `places` counts voxels, in float32: a loop that converts integers, or that
+    checks its divisor, does not become vector code. `work` has room for each voxel's column, its share of the next
+    column, and its weight.
     """
     column, share, weight = work
     near, step = np.float32(view[0]), np.float32(view[2])
@@ -143,7 +144,7 @@ def _add_line(line, view, z_mm, orbit, places, work, total):
         nearer = nearer * nearer if abs(u - half) <= half + np.float32(0.5) else np.float32(0)
         weight[x] = nearer if abs(rise * inverse - off_v) <= highest else np.float32(0)
         u = min(max(u, np.float32(0)), half + half)
-        column[x] = min(np.int32(u), last)
+        column[x] = max(min(np.int32(u), last), np.int32(0))  # NaN in the source's plane
         share[x] = u - np.float32(column[x])
     for x in range(total.size):
         i = np.uint32(column[x])
