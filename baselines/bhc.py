@@ -74,7 +74,8 @@ def bhc_poly(scan: Scan, settings: Settings) -> Volume:
         ):
             added = _terms(metal_length[held], tissue[held]) @ fit.coefficients
             negative += int((added < 0).sum())
-            p[k - views.start][held] -= np.maximum(added, 0).astype(np.float32)
+            whole = np.maximum(p[k - views.start][held], 0)  # metal adds no more than there is
+            p[k - views.start][held] -= np.clip(added, 0, whole).astype(np.float32)
 
     values, shown = mended(trace, first.values, correct, settings)
     reinsert(values, x_0, metal, settings.insert)

@@ -208,6 +208,19 @@ def test_what_pictures_show_is_what_was_backprojected(rods):
     assert 0 < found["prior"][scan.metal.numpy() != 0].max() < 0.05
 
 
+def test_a_fit_gone_wrong_takes_no_more_than_was_measured(rods, monkeypatch):
+    """As from two views, which tell little of six coefficients."""
+    scan, _ = rods
+    real = bhc._fit
+    monkeypatch.setattr(
+        bhc, "_fit", lambda *of: dataclasses.replace(fit := real(*of), coefficients=50 * fit.coefficients)
+    )
+    found = attached(bhc.bhc_poly(scan).details, scan.geometry)
+    measured = line_integrals(scan, int(found["view"]))[0].numpy()
+    trace, less = found["trace"], found["projection"]
+    assert (less[trace] >= np.minimum(measured[trace], 0)).all() and (less[trace] == 0).any()
+
+
 def test_where_no_pixel_of_the_trace_has_a_signal_nothing_is_fitted(starving):
     metal = Metal(mask=starving.metal.numpy() != 0, source="oracle")
     trace, counts = Trace(metal, starving), starving.counts.clone()
