@@ -123,7 +123,7 @@ class Method:
     @property
     def label(self) -> str:
         """The name with the parameters that differ from the defaults, as tables show it."""
-        given = ", ".join(f"{k}={v}" for k, v in sorted(_named(self.name, self.overrides).items()))
+        given = ", ".join(f"{k}={v}" for k, v in sorted(named(self.name, self.overrides).items()))
         return f"{self.name}[{given}]" if given and not self.program else self.name
 
     @property
@@ -298,10 +298,10 @@ def _settings(name: str, function: Callable[..., Any], given: dict[str, Any]) ->
         build(cast("Any", function).settings, given, where)
     defaults = {key: _plain(parameter.default) for key, parameter in known.items()}
     changed = {key: plain for key, value in values.items() if (plain := _plain(value)) != defaults[key]}
-    return defaults | _named(name, changed), changed
+    return defaults | named(name, changed), changed
 
 
-def _named(name: str, changed: dict[str, Any]) -> dict[str, Any]:
+def named(name: str, changed: dict[str, Any]) -> dict[str, Any]:
     """Return the settings that say what a method does, without where it keeps its state."""
     return {key: value for key, value in changed.items() if key != KEPT_IN or name not in TABLE}
 

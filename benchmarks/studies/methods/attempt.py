@@ -25,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 
 from ctsim.benchmarks.engine.host import measured
-from ctsim.benchmarks.methods import KEPT_IN, TABLE, Method
+from ctsim.benchmarks.methods import Method, named
 from ctsim.benchmarks.program import USAGE, ProgramError
 from ctsim.benchmarks.scores.score import NO_TWIN
 from ctsim.benchmarks.studies.methods.records import METAL, Cost
@@ -224,7 +224,7 @@ def warm_up(method: Method, scan: Scan) -> float:
     if method.program:
         return 0.0
     told = {"seconds": WARM} if "seconds" in method.params else {}
-    others = {name: value for name, value in method.overrides.items() if name != KEPT_IN or method.name not in TABLE}
+    others = named(method.name, method.overrides)
     method = dataclasses.replace(method, overrides=others | told)
     with measured() as usage:
         for _ in range(WARM_UPS):
