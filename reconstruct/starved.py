@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ctsim.reconstruct.log import count_floor
 from ctsim.reconstruct.scatter import Scatter
+from ctsim.reconstruct.weights import photon_weights
 from ctsim.types import Scan
 
 SURE = 2.0  # standard deviations of the dark noise that a reading may lie below the truth
@@ -24,14 +25,6 @@ HALF, SPREAD = math.sqrt(2 / math.pi), math.sqrt(1 - 3 / math.pi)
 SIGNIFICANT = 5.0  # standard deviations
 
 Image = NDArray[np.float32]
-
-
-def photon_weights(p: Image, valid: NDArray[np.bool_]) -> Image:
-    """Return the share of photons that came through, exp(−p), of line integrals [view, v, u]; 0 where not `valid`."""
-    weights = np.empty(p.shape, np.float32)
-    for reading, seen, weight in zip(p, valid, weights, strict=True):  # a view at a time stays in the cache
-        weight[...] = np.where(seen, np.exp(-np.maximum(reading, 0)), 0)
-    return weights
 
 
 def weights_and_bounds(scan: Scan, p: Image, valid: NDArray[np.bool_], scatter: Scatter, noise: float) -> Image:

@@ -21,8 +21,8 @@ from ctsim.reconstruct.field.physics import Physics
 from ctsim.reconstruct.log import NO_SIGNAL, finite_or_not, is_blind, line_integrals
 from ctsim.reconstruct.splat.checkpoint import identity_of
 from ctsim.reconstruct.splat.fast import finer
-from ctsim.reconstruct.starved import photon_weights
 from ctsim.reconstruct.watch import Stopwatch
+from ctsim.reconstruct.weights import photon_weights
 from ctsim.types import Scan, Status, Volume
 
 Image = NDArray[np.float32]

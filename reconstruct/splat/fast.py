@@ -33,6 +33,7 @@ from ctsim.reconstruct.splat.response import FILTER, Response, basis_functions, 
 from ctsim.reconstruct.splat.volume import voxelise
 from ctsim.reconstruct.starved import Below, weights_and_bounds
 from ctsim.reconstruct.watch import Stopwatch
+from ctsim.reconstruct.weights import doubt_edges
 from ctsim.types import Scan, Status, Volume
 
 OPEN = 5.0  # standard deviations of an open pixel below which a ray met nothing
@@ -69,6 +70,7 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
         None
     )
     tv: Annotated[float, about("denoising threshold per 100 views", "of water", ge=0, le=1000)] = 0.025
+    edges: Annotated[float, about("difference of neighbours' P that halves an open ray's weight", ge=1e-3)] = 0.5
     fineness: Annotated[float, about("how much finer the finest grid is than the volume's", ge=1, le=16)] = 1.5
     exact: Annotated[bool, about("project splats by their exact line integrals, not by EWA")] = False
     response: Annotated[Literal["tube", "known"], about("beam: assumed, or known from tube and detector")] = "tube"
@@ -103,6 +105,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     finest = finer(scan.geometry, settings.fineness)
     below = Below.of(scan)
     weights = weights_and_bounds(scan, p.numpy(), valid, scatter, below.noise)
+    doubt_edges(p.numpy(), weights, settings.edges)
     data = Data(geometry=finest, p=p.numpy(), weights=weights, scatter=scatter.mean)
     levels = levels_of(data, coarse=(settings.passes or PASSES)[0] > 0)
     filtration = None if clamped.all() else find_filtration(levels, scan, settings)

@@ -10,7 +10,8 @@ from scipy import ndimage
 
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.splat.kernels import carve_cpu
-from ctsim.reconstruct.starved import WEIGHT, photon_weights
+from ctsim.reconstruct.starved import WEIGHT
+from ctsim.reconstruct.weights import photon_weights
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
