@@ -31,7 +31,7 @@ SIDE = 8
 HEAD = '[[scene]]\nname = "own"\nwhat = "a scan of my own"\n'
 METHOD = """
 import torch
-from ctsim.types import Volume
+from ctsim.types import Status, Volume
 
 INPUTS = "nothing"
 seen = []
@@ -45,6 +45,10 @@ def half(scan, *, device="cpu"):
 
 def given_the_mask(scan, *, device="cpu", mask="oracle"):
     return half(scan)
+
+def runaway(scan, *, device="cpu"):
+    values = torch.full(scan.geometry.n_voxel, 1e6)
+    return Volume(values=values, status=Status.DIVERGED, reason="values ran away")
 """
 
 
@@ -197,6 +201,13 @@ def test_the_true_mask_is_for_methods_that_declare_to_be_given_it(own):
         stress_methods.on_scene(name, {}, scene, SIDE, Findings())
     seen = sys.modules["my_lab"].seen
     assert [scan.metal is None for scan in seen] == [True, False]
+
+
+@pytest.mark.parametrize("near", [True, False])
+def test_no_method_may_diverge_where_the_data_determine_the_object(own, near):
+    found = Findings()
+    stress_methods.on_scene("my_lab:runaway", {}, Scene(name="own", what="own", near=near), SIDE, found)
+    assert bool(found.wrong) is near
 
 
 def test_a_scene_that_says_something_else_is_run_again(tmp_path):
