@@ -14,28 +14,28 @@ def photon_weights(p: Image, valid: NDArray[np.bool_]) -> Image:
     return weights
 
 
-def doubt_edges(p: Image, weights: Image, edges: float) -> None:
-    """Lower weights w > 0, in place, to 1/(1/w + (Δ/edges)²): Δ is the range of `p` over 3 × 3 pixels.
+def doubt_edges(p: Image, weights: Image, edges: float, scatter: float = 0.0) -> None:
+    """Lower weights w > 0, in place, to 1/(1/w + (b/edges)²), where b says how sharply `p` bends at a pixel.
 
-    A pixel on an edge averages intensities, and where in it the edge lies no grid tells: its model errs by a share of
-    Δ, an error like noise of variance Δ². Bright rays along a wire's shadow, with all their photons, would otherwise
-    outweigh the dark ones that hold the wire. Dark rays change little, since 1/w is large there. `edges` is the Δ at
-    which an open ray keeps half of its weight. Arrays are [view, v, u]; pixels of weight 0 say nothing of others, and
-    bounds, w < 0, stay as they are.
+    b is the greater of the absolute second differences of `p` along u and v. A pixel averages intensities, and where in
+    it an edge lies no grid tells: what a model misses grows with b, as if 1/w, the variance of a reading in units of an
+    open ray's, were larger. Bright rays along a wire's shadow, with all their photons, would otherwise outweigh the
+    dark ones that hold the wire. `edges` is the b at which an open ray keeps half of its weight; it is chosen, not
+    derived. Arrays are [view, v, u]. Pixels of weight 0 and those beyond the rim bend nothing. Bounds, w < 0, keep
+    their weights; their p lacks `scatter`, S/I0, which that of readings has.
     """
     for reading, weight in zip(p, weights, strict=True):
-        says, silent = weight != 0, np.float32(-np.inf)
-        range_ = _greatest(np.where(says, reading, silent)) + _greatest(np.where(says, -reading, silent))
-        step = np.where(weight > 0, range_ / np.float32(edges), np.float32(0))
-        weight /= 1 + weight * step * step
+        if scatter:
+            reading = np.where(weight < 0, -np.log(np.exp(-reading) + np.float32(scatter)), reading)
+        bend = np.maximum(_bend(reading, weight != 0, 0), _bend(reading, weight != 0, 1)) / np.float32(edges)
+        weight /= 1 + np.maximum(weight, 0) * bend * bend
 
 
-def _greatest(image: Image) -> Image:
-    """Return the greatest of 3 × 3 pixels, of fewer at the rim: [v, u]."""
-    for axis in (0, 1):
-        lines = np.moveaxis(image, axis, 0)
-        found = lines.copy()
-        np.maximum(found[1:], lines[:-1], out=found[1:])
-        np.maximum(found[:-1], lines[1:], out=found[:-1])
-        image = np.moveaxis(found, 0, axis)
-    return image
+def _bend(image: Image, says: NDArray[np.bool_], axis: int) -> Image:
+    """Return the absolute second difference along an axis; a neighbour that says nothing is taken as equal."""
+    values, said = np.moveaxis(image, axis, 0), np.moveaxis(says, axis, 0)
+    step = np.where(said[1:] & said[:-1], np.diff(values, axis=0), np.float32(0))
+    bend = np.zeros_like(values)
+    bend[:-1] += step
+    bend[1:] -= step
+    return np.moveaxis(np.abs(bend), 0, axis)

@@ -237,6 +237,7 @@ def test_dead_pixels_are_left_out_by_weight_0(monkeypatch):
     weighed, told = level.weighted, starved.weights_and_bounds
     everywhere(monkeypatch, "weighted", lambda g, p, valid, *s: weighed(g, p, np.ones_like(valid), *s))
     everywhere(monkeypatch, "weights_and_bounds", lambda scan, p, valid, *s: told(scan, p, np.ones_like(valid), *s))
+    everywhere(monkeypatch, "doubt_edges", lambda *given: None)  # it takes a dead pixel for an edge: 0.13
     # 0.11 and 0.40: what is carved away scores as an empty volume does
     assert masked < 0.2 < 2 * masked < error(given)
 
@@ -252,6 +253,7 @@ def test_starved_rays_count_for_little(monkeypatch):
 
     everywhere(monkeypatch, "weighted", unweighted)
     everywhere(monkeypatch, "weights_and_bounds", lambda scan, p, valid, *s: valid.astype(np.float32))
+    everywhere(monkeypatch, "doubt_edges", lambda *given: None)
     assert 1.4 * weighted < error(given)  # 0.16 and 0.29
 
 

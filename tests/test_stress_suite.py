@@ -49,6 +49,9 @@ def given_the_mask(scan, *, device="cpu", mask="oracle"):
 def runaway(scan, *, device="cpu"):
     values = torch.full(scan.geometry.n_voxel, 1e6)
     return Volume(values=values, status=Status.DIVERGED, reason="values ran away")
+
+def resigned(scan, *, device="cpu"):
+    return Volume(values=torch.zeros(scan.geometry.n_voxel), status=Status.ERROR, reason="no idea")
 """
 
 
@@ -204,9 +207,10 @@ def test_the_true_mask_is_for_methods_that_declare_to_be_given_it(own):
 
 
 @pytest.mark.parametrize("near", [True, False])
-def test_no_method_may_diverge_where_the_data_determine_the_object(own, near):
+@pytest.mark.parametrize("how", ["runaway", "resigned"])
+def test_no_method_may_give_up_where_the_data_determine_the_object(own, how, near):
     found = Findings()
-    stress_methods.on_scene("my_lab:runaway", {}, Scene(name="own", what="own", near=near), SIDE, found)
+    stress_methods.on_scene(f"my_lab:{how}", {}, Scene(name="own", what="own", near=near), SIDE, found)
     assert bool(found.wrong) is near
 
 

@@ -46,7 +46,7 @@ AT_THE_END, FEW, FEWEST, MANY = 0.9, 1e-4, 10, 0.01
 and the share with which a fit has diverged."""
 DARK, UNEXPLAINED, DARK_SHARE = 3.0, 0.6, 1e-4
 """P above which a reading is dark; the root mean square that a fit misses dark readings by at most where metal is
-right (0.1 to 0.4 on scenes of teeth, thorax and hip, 1.0 to 3.6 where it is hollow or smeared); their least share."""
+right (0.1 to 0.4 on scenes of teeth, thorax and hip, 0.6 to 3 where it is hollow or smeared); their least share."""
 Image = NDArray[np.float32]
 
 
@@ -70,7 +70,9 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
         None
     )
     tv: Annotated[float, about("denoising threshold per 100 views", "of water", ge=0, le=1000)] = 0.025
-    edges: Annotated[float, about("difference of neighbours' P that halves an open ray's weight", ge=1e-3)] = 0.5
+    edges: Annotated[
+        float, about("second difference of P between pixels that halves an open ray's weight", ge=1e-3, le=1e6)
+    ] = 0.5
     fineness: Annotated[float, about("how much finer the finest grid is than the volume's", ge=1, le=16)] = 1.5
     exact: Annotated[bool, about("project splats by their exact line integrals, not by EWA")] = False
     response: Annotated[Literal["tube", "known"], about("beam: assumed, or known from tube and detector")] = "tube"
@@ -105,7 +107,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     finest = finer(scan.geometry, settings.fineness)
     below = Below.of(scan)
     weights = weights_and_bounds(scan, p.numpy(), valid, scatter, below.noise)
-    doubt_edges(p.numpy(), weights, settings.edges)
+    doubt_edges(p.numpy(), weights, settings.edges, scatter.mean)
     data = Data(geometry=finest, p=p.numpy(), weights=weights, scatter=scatter.mean)
     levels = levels_of(data, coarse=(settings.passes or PASSES)[0] > 0)
     filtration = None if clamped.all() else find_filtration(levels, scan, settings)

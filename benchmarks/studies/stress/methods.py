@@ -4,9 +4,9 @@ A volume must have the grid's shape, finite values, and status ok or a stated re
 pedestal, the status must not be ok. Its values stay within π·(dso/(dso − r))²·max|P|/pitch, the closed-form bound of
 FDK at radius r: the views' weights sum to 2π, the ramp's absolute values to 1/(2 pitch), and backprojection weighs by
 the square. A voxel that an iterative method fits to a ray through half of it stays below this, too. Where the data
-determine the object, no result may have diverged, and the RMSE over the body, away from metal, must not exceed 0.7 of
-an empty volume's, unless the result states its `limitation`. Elsewhere a result whose status is diverged says itself
-that values ran away; they need only be finite. Of two forms of a scan with the same content a method must give the same
+determine the object, the status must be ok; and unless the result states its `limitation`, the RMSE over the body, away
+from metal, must not exceed 0.7 of an empty volume's. Elsewhere a result whose status is diverged says itself that
+values ran away; they need only be finite. Of two forms of a scan with the same content a method must give the same
 volume.
 """
 
@@ -80,7 +80,7 @@ def _judge(volume: Volume, found: Findings, given: Example, scene: Scene, bounds
     found.finite("the volume", values)
     diverged = volume.status is Status.DIVERGED
     named = volume.status is Status.OK or (volume.status is not Status.NONFINITE and bool(volume.reason))
-    wrong = (scene.near and diverged) or (scene.unlit and volume.status is Status.OK)
+    wrong = volume.status is not Status.OK if scene.near else scene.unlit and volume.status is Status.OK
     found.say(str(volume.status), holds=named and not wrong)
     most = math.inf if diverged else bounds
     found.at_most("greatest value over its bound", float(np.abs(values).max() / bound(given.scan)), most)

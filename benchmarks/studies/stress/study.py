@@ -148,7 +148,7 @@ def _code_of(name: str) -> str:
 
 def _expected(name: str, scene: Scene) -> str:
     bounds = f"{suite.BOUNDS[name]:g} times " if name in suite.BOUNDS else ""
-    words = [f"finite, within {bounds}the bound of values" + ("" if scene.near else " or diverged")]
+    words = [f"finite, within {bounds}the bound of values" + ("; status ok" if scene.near else " or diverged")]
     if scene.unlit:
         words.append("a status other than ok, and its reason")
     if scene.near:
