@@ -15,7 +15,7 @@ def photon_weights(p: Image, valid: NDArray[np.bool_]) -> Image:
 
 
 def doubt_edges(p: Image, weights: Image, edges: float, scatter: float = 0.0) -> None:
-    """Lower weights w > 0, in place, to 1/(1/w + (b/edges)²), where b says how sharply `p` bends at a pixel.
+    """Lower weights w > 0, in place, to 1/(1/w + (b/edges)²), where b says how sharply line integrals `p` bend.
 
     b is the greater of the absolute second differences of `p` along u and v. A pixel averages intensities, and where in
     it an edge lies no grid tells: what a model misses grows with b, as if 1/w, the variance of a reading in units of an

@@ -86,7 +86,7 @@ def wire(n):
 
 @pytest.mark.slow
 def test_a_wire_is_no_disc():
-    """A fit that trusts every bright pixel beside a wire makes discs of its turns."""
+    """A fit that trusts every bright pixel next to a wire makes discs of its turns."""
     scan = simulate_scene(wire(n=44))
     found = [reconstruct_scan(scan, "splat", edges=edges, filtration=0.5) for edges in (EDGES, 1e6)]
     scores = [score_volume(volume, scan, protocols=["tissue", "metal"]) for volume in found]

@@ -78,11 +78,10 @@ def _judge(volume: Volume, found: Findings, given: Example, scene: Scene, bounds
     values = volume.values.numpy()
     said = volume.details.get("limitation") or volume.reason
     found.finite("the volume", values)
-    diverged = volume.status is Status.DIVERGED
     named = volume.status is Status.OK or (volume.status is not Status.NONFINITE and bool(volume.reason))
     wrong = volume.status is not Status.OK if scene.near else scene.unlit and volume.status is Status.OK
     found.say(str(volume.status), holds=named and not wrong)
-    most = math.inf if diverged else bounds
+    most = math.inf if volume.status is Status.DIVERGED else bounds
     found.at_most("greatest value over its bound", float(np.abs(values).max() / bound(given.scan)), most)
     if scene.near and not said:
         found.at_most("error over an empty volume's", given.error(values), NEAR)
