@@ -96,7 +96,7 @@ def fitted_prior(trace: Trace, metal: Metal, scan: Scan, name: str) -> Choice | 
     volume = FITTED[name](scan)
     values, inside = volume.values.numpy().copy(), dilate(metal.mask, SKIN, corners=True)
     values[inside] = 0
-    water = water_value(values) if volume.status is not Status.ERROR else 0.0
+    water = water_value(values) if volume.status is Status.OK else 0.0
     if water <= 0:
         return None
     values[inside] = water

@@ -101,7 +101,8 @@ def guarded(name: str, module: str, arguments: list[str], *, resumes: bool = Tru
         where = f"{error.filename}: " if error.filename else ""
         return _complain(name, f"{where}{error.strerror or error}")
     except KeyboardInterrupt:
-        then = "what was finished is kept, run the same command to go on"
+        forced = "without --force " if "--force" in arguments else ""  # which does all again
+        then = f"what was finished is kept, run the same command {forced}to go on"
         if not resumes:
             then = "it starts from the beginning the next time"
         print(f"\n{name}: interrupted; {then}", file=sys.stderr)

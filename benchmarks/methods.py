@@ -22,7 +22,7 @@ import msgspec
 import msgspec.inspect
 import tyro
 
-from ctsim.benchmarks.versions import code_version
+from ctsim.dataset.versions import code_version
 from ctsim.errors import InputError
 from ctsim.reconstruct.settings import Parameter, build, convert, parameters_of
 

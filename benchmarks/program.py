@@ -10,8 +10,8 @@ import os
 import shlex
 import shutil
 import subprocess
+import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +27,25 @@ from ctsim.io.volumes.formats import FORMATS, open_volume
 from ctsim.types import Scan, Volume
 
 COMMAND, USAGE = "command", "usage"
+SAID = "said"  # file of what a program prints
 SCAN, OUT, MASK = "{scan}", "{out}", "{mask}"
 LONGEST = 200  # characters of what a program says that a reason repeats
 KNOWN = tuple(end for format in FORMATS.values() for end in format.suffixes)
 
 
+class _Ended(msgspec.Struct, frozen=True):
+    """What `launch` writes: the status of wait4, seconds, and bytes."""
+
+    status: int
+    wall: float
+    cpu: float
+    peak_bytes: int
+
+
 class ProgramError(InputError):
-    """A program gave no volume; the message is the whole reason."""
+    """A program gave no volume; the message is the whole reason, `usage` what it used until then."""
+
+    usage: Usage | None = None
 
 
 def words_of(command: str) -> list[str]:
@@ -82,8 +94,14 @@ def reconstruct(scan: Scan, command: str, mask: str = "none") -> Volume:
         out.mkdir()
         write_scan(source, scan)
         places = {SCAN: str(source), OUT: str(out / "volume"), MASK: str(source / "metal.tif")}
-        usage = _run([_filled(word, places) for word in words], Path(folder) / "said")
-        values = _read(out, scan.geometry.n_voxel)
+        code, usage = _run([_filled(word, places) for word in words], Path(folder))
+        try:
+            if code:
+                raise ProgramError(f"the program ended with {how_it_ended(code)}{_last_line(Path(folder) / SAID)}")
+            values = _read(out, scan.geometry.n_voxel)
+        except ProgramError as error:
+            error.usage = usage
+            raise
     return Volume(values=torch.from_numpy(values), details={USAGE: usage})
 
 
@@ -110,24 +128,27 @@ def _filled(word: str, places: dict[str, str]) -> str:
     return word
 
 
-def _run(words: list[str], said: Path) -> Usage:
-    """Run a program to its end; return what it used. Raises ProgramError for an exit code other than 0."""
-    start = time.perf_counter()
-    with said.open("wb") as file:
-        process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT)
+def _run(words: list[str], folder: Path) -> tuple[int, Usage]:
+    """Run a program to its end; return its exit code and what it used. What it says is in the folder."""
+    note = folder / "usage.json"
+    launcher = [sys.executable, "-I", "-S", str(Path(__file__).with_name("launch.py")), str(note)]
+    with (folder / SAID).open("wb") as file:
+        process = subprocess.Popen([*launcher, *words], stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT)
         try:
-            _, status, used = os.wait4(process.pid, 0)
+            ended = process.wait()
         except BaseException:  # Ctrl-C
-            process.kill()
+            process.terminate()
             process.wait()
             raise
-    wall = time.perf_counter() - start
-    process.returncode = code = os.waitstatus_to_exitcode(status)
-    if code:
-        lines = said.read_bytes().decode(errors="replace").strip().splitlines()
-        last = f": {lines[-1].strip()[:LONGEST]}" if lines else ""
-        raise ProgramError(f"the program ended with {how_it_ended(code)}{last}")
-    return Usage(wall=wall, cpu=used.ru_utime + used.ru_stime, peak_bytes=used.ru_maxrss * 1024)
+    if not note.exists():  # there is no such program, or the launcher was killed
+        return ended or 1, Usage()
+    found = msgspec.json.decode(note.read_bytes(), type=_Ended)
+    return os.waitstatus_to_exitcode(found.status), Usage(wall=found.wall, cpu=found.cpu, peak_bytes=found.peak_bytes)
+
+
+def _last_line(said: Path) -> str:
+    lines = said.read_bytes().decode(errors="replace").strip().splitlines()
+    return f": {lines[-1].strip()[:LONGEST]}" if lines else ""
 
 
 def _read(out: Path, shape: tuple[int, int, int]) -> np.ndarray:

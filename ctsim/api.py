@@ -6,7 +6,7 @@ are the same numbers.
 
 import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any, Literal
 
 import numpy as np
@@ -17,8 +17,8 @@ from ctsim.benchmarks.methods import Method, find
 from ctsim.benchmarks.scores.judge import Judge, Twin
 from ctsim.benchmarks.scores.projection import held_out, with_floor
 from ctsim.benchmarks.scores.score import NOT_ASKED, PROJECTION, PROTOCOLS, Score
-from ctsim.benchmarks.studies.methods.attempt import Outcome, array_of, check_volume, checked, scan_for
-from ctsim.benchmarks.studies.methods.records import METAL
+from ctsim.benchmarks.studies.methods.attempt import SCORED, Outcome, array_of, check_volume, checked, scan_for
+from ctsim.benchmarks.studies.methods.records import METAL, TWIN
 from ctsim.benchmarks.suites import load, select
 from ctsim.dataset.truth import ScanWithTruth
 from ctsim.errors import InputError
@@ -26,7 +26,7 @@ from ctsim.human import human_choice
 from ctsim.phantoms.scene import Scene
 from ctsim.phantoms.suites import decode
 from ctsim.simulate import REFERENCE_KEV
-from ctsim.types import Scan, Volume
+from ctsim.types import Scan, Status, Volume
 
 
 def find_scene(suite: str, name: str, *, seed: int | None = None) -> Scene:
@@ -103,17 +103,20 @@ def score_volume(
     Raises
     ------
     InputError
-        Where a volume is not finite or not on the scan's grid, where `scan` is a twin, and for an unknown protocol.
+        Where a volume is not finite or not on the scan's grid, where its method ended with neither "ok" nor "diverged",
+        where `scan` is a twin, and for an unknown protocol or variant.
     """
     protocols = {protocols} if isinstance(protocols, str) else set(protocols)
     if unknown := sorted(protocols - set(PROTOCOLS)):
         raise InputError(f"protocols: expected names among {', '.join(PROTOCOLS)}, got {unknown[0]!r}")
+    if variant not in (METAL, TWIN):
+        raise InputError(f"variant: expected {METAL!r} or {TWIN!r}, got {variant!r}")
     if scan.is_twin:
         raise InputError('expected the scan with metal: score its twin\'s volume with variant="metal_free"')
     values, at_50kev = _arrays(volume, scan)
     pair = Twin(reason=NOT_ASKED) if scan.metal_free is not None else Twin()
     if twin is not None:
-        pair = Twin(values=_arrays(twin, scan)[0])
+        pair = Twin(values=_arrays(twin, scan, (str(Status.OK),))[0])
     judge = _judge_with_views(scan) if variant == METAL and PROJECTION in protocols else _judge(scan)
     found = judge.scores(values, variant, pair, at_50kev)
     return {name: score for name, score in found.items() if name in protocols}
@@ -132,10 +135,12 @@ def _judge_with_views(scan: ScanWithTruth) -> Judge:
 
 
 def _arrays(
-    volume: Volume | NDArray[Any], scan: ScanWithTruth
+    volume: Volume | NDArray[Any], scan: ScanWithTruth, ends: Collection[str] = SCORED
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Return a volume's values, and those at 50 keV of a method that knows energies."""
+    """Return a volume's values, and those at 50 keV of a method that knows energies; it must have one of the `ends`."""
     if isinstance(volume, Volume):
+        if str(volume.status) not in ends:
+            raise InputError(f"the volume's status is {volume.status}, which is not scored: {volume.reason}")
         values, own = array_of(volume.values), volume.at_energy
         at_50kev = None if own is None else array_of(own(REFERENCE_KEV))
     else:

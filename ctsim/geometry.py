@@ -158,8 +158,12 @@ class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     @property
     def is_full_turn(self) -> bool:
-        """Whether the views stand evenly on a whole circle, so that each has an opposite one."""
-        return self.poses is None and self.angles_deg is None and abs(self.arc_deg) >= 360 - 1e-9
+        """Whether the views stand all round a circle, so that each ray has an opposite one, or nearly."""
+        if self.poses is not None:
+            return False
+        if self.angles_deg is None:
+            return abs(self.arc_deg) >= 360 - 1e-9
+        return leaves_none_out(turn_of(self.angles)[-1])
 
     @property
     def fov_radius(self) -> float:
@@ -171,6 +175,23 @@ class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         half, off = self.s_detector[1] / 2, abs(self.off_detector[1])
         edge = half + off if self.is_full_turn and off < half else half - off
         return self.dso * math.sin(math.atan(edge / self.dsd)) if edge > 0 else 0.0
+
+
+def turn_of(
+    angles: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Return the distinct angles (radians) of a turn, which of them each view has, their repeats, and the gaps."""
+    turn = 2 * math.pi
+    angle = np.round(np.mod(angles, turn), 9).astype(np.float64)  # repeated views are one but for rounding
+    angle[angle >= round(turn, 9)] = 0.0
+    distinct, which, repeats = np.unique(angle, return_inverse=True, return_counts=True)
+    return distinct, which, repeats, np.diff(distinct, append=distinct[0] + turn)
+
+
+def leaves_none_out(gaps: NDArray[np.float64]) -> bool:
+    """Say whether gaps between views are those of a whole turn: one over twice as wide as any other was not scanned."""
+    widest = int(np.argmax(gaps))
+    return len(gaps) > 1 and bool(gaps[widest] <= 2.001 * np.max(np.delete(gaps, widest)))
 
 
 def few_views(n_views: int, most: int) -> NDArray[np.int64]:

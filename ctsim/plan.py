@@ -19,6 +19,7 @@ from ctsim.geometry import Geometry
 from ctsim.human import human_bytes, human_time
 from ctsim.look import Looked, density_levels, look
 from ctsim.montecarlo.series import expected_histories
+from ctsim.scaninfo import TWIN
 from ctsim.scatter import open_fraction
 from ctsim.settings import Simulation, Truth
 from ctsim.types import Phantom, Scanner
@@ -202,7 +203,7 @@ def _outputs(metal: bool, scanner: Scanner, truth: Truth, n_tissues: int) -> tup
     if truth.scatter_free and scanner.scatter.level:
         asked.append(Output(name="scatter_free", shape=image, dtype="float32"))
     asked += [Output(name=f"mono_{e:g}kev", shape=image, dtype="float32") for e in truth.mono_kev]
-    twins = [Output(name=f"metal_free/{o.name}", shape=o.shape, dtype=o.dtype) for o in asked]
+    twins = [Output(name=f"{TWIN}{o.name}", shape=o.shape, dtype=o.dtype) for o in asked]
     asked += twins if metal and truth.twin else []
     if metal:
         if truth.trace:

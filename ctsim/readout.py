@@ -12,7 +12,6 @@ from ctsim.types import Scanner
 
 Image = NDArray[np.float32]
 Moments = tuple[Image, Image]
-TWIN = "metal_free/"
 
 
 def panel_of(scanner: Scanner) -> Panel | None:
@@ -41,7 +40,7 @@ class Readout:
     ) -> tuple[NDArray, NDArray]:
         """Draw the counts [v, u] of view k; return them, and what was drawn before the panel acted.
 
-        `moments` (m1, m2) reach the detector; `prefix` is "", or `TWIN` for the twin, whose stream is the same. With
+        `moments` (m1, m2) reach the detector; `prefix` is "", or TWIN for the twin, whose stream is the same. With
         lag, views come in order. `largest` is the scan's `largest_p`, for noise "tigre" only. `known` = (drawn, spans)
         are to be drawn again in those columns only.
         """

@@ -10,6 +10,9 @@ import msgspec
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 
+TWIN = "metal_free/"
+"""Prefix of the names of what the twin without metal has for itself."""
+
 
 class LabelGrid(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The grid that a phantom's body was drawn on: voxels (z, y, x), their size and the middle of the grid in mm."""

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from ctsim.geometry import Geometry
 from ctsim.look import all_rays
 from ctsim.plan import Plan
-from ctsim.readout import TWIN, Image, Moments
+from ctsim.readout import Image, Moments
+from ctsim.scaninfo import TWIN
 from ctsim.tracer.project import Response, Responses, Tracer, path_lengths, transmit_all
 from ctsim.tracer.shadow import join, row_spans
 from ctsim.types import Phantom, Scanner

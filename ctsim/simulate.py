@@ -25,7 +25,8 @@ from ctsim.materials import attenuation
 from ctsim.montecarlo.series import ScatterSeries, scatter_series
 from ctsim.montecarlo.transport import Source
 from ctsim.plan import Plan
-from ctsim.readout import TWIN, Image, Moments, Readout, panel_of
+from ctsim.readout import Image, Moments, Readout, panel_of
+from ctsim.scaninfo import TWIN
 from ctsim.signals import Part, Signals, compact, share_rays
 from ctsim.tracer.kernels.raytrace_cpu import STRIP
 from ctsim.tracer.voxelise import body_attenuation, body_labels, cover_of, label_volume, metal_mask, painted
@@ -225,14 +226,14 @@ class Simulator:
         all_paths = {"trace": (metal > 0).astype(np.uint8), "metal_path": metal, "paths": self._told(lengths)[1:]}
         out: dict[str, NDArray] = {name: all_paths[name] for name in wanted}
         twin = None
-        if "metal_free/counts" in self.names and energies:
+        if f"{TWIN}counts" in self.names and energies:
             twin = self.signals.paths(k, twin=True)
         for energy in energies:
             mu = np.array([0.0, *(attenuation(m, np.array([energy]))[0] for m in self.plan.materials[1:])])
             out[f"mono_{energy:g}kev"] = np.tensordot(mu, lengths, 1).astype(np.float32)
             if twin is not None:
                 mono = np.tensordot(mu, twin[: len(mu)], 1).astype(np.float32)
-                out[f"metal_free/mono_{energy:g}kev"] = mono
+                out[f"{TWIN}mono_{energy:g}kev"] = mono
         return out
 
 
@@ -299,7 +300,7 @@ def truth_volumes(plan: Plan, phantom: Phantom, scanner: Scanner) -> Iterator[tu
     effective = _reference_mu(plan.materials, energies, omega)
     at_50 = _reference_mu(plan.materials, np.array([REFERENCE_KEV]), np.ones(1))
     body = compact(phantom, plan.materials)
-    scans = [("", body)] + ([("metal_free/", body.without_metal())] if plan.runs("metal-free twin") else [])
+    scans = [("", body)] + ([(TWIN, body.without_metal())] if plan.runs("metal-free twin") else [])
     covers = [cover_of(content, geometry) for _, content in scans]
     yield "metal", metal_mask(body, geometry, covers[0])
     # the body is the same with and without metal

@@ -48,7 +48,13 @@ class Scans(Dataset[dict[str, torch.Tensor]]):
             raise InputError(f"items: {unknown[0]!r} is unknown, expected some of {human_choice(ITEMS, unknown[0])}")
         if plane is not None and plane not in AXES:
             raise InputError(f"plane must be 'z', 'y', 'x' or None, got {plane!r}")
-        listed = [(path, entry) for path in shards_of(self.root) for entry in contents(path)]
+        listed = [(path, entry) for path in shards_of(self.root) for entry in contents(path).scans]
+        first: dict[str, Path] = {}
+        for path, entry in listed:
+            if (other := first.setdefault(entry.name, path)) != path:
+                raise InputError(
+                    f"{root}: {other.name} and {path.name} both hold {entry.name}; expected each scan once"
+                )
         self._scans = [(path, entry) for path, entry in listed if not split or entry.split == split]
         if not self._scans:
             known = ", ".join(sorted({entry.split for _, entry in listed if entry.split})) or "no split"

@@ -71,6 +71,12 @@ def refuse_beam(response: str | None, tube: Given | Tube, detector: Given | Dete
             raise InputError(f"{name}: only for response 'known', got it with response {response!r}")
 
 
+def refuse_filtration(response: str | None, filtration: float | None) -> None:
+    """Raise InputError for a filtration (mm) that comes with the response "known", whose tube states its filters."""
+    if response == "known" and filtration is not None:
+        raise InputError("filtration: only for response 'tube', got it with response 'known'; the tube's filters count")
+
+
 def _of(name: str, given: "Given | Kind", kind: type[Kind], defaults: dict[str, Any]) -> Kind:
     given = {} if given is None else given
     if isinstance(given, kind):

@@ -1,10 +1,12 @@
 """Line integrals from counts: the logarithm, its floor, the mask of pixels that hit it, and what all of them mean."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from ctsim.reconstruct.kernels.log_cpu import look_up, take_log
 from ctsim.types import Scan, Status
@@ -51,6 +53,7 @@ class LineIntegrals:
     def __init__(self, scan: Scan) -> None:
         self.scan, self.floor = scan, count_floor(scan)
         self._log_open, self._dead = _log_open(scan.flat.numpy() - np.float32(scan.dark), self.floor)
+        self._filling = Filling.of(self._dead)
         self._table = self._low = None
         if scan.counts.dtype == torch.uint16:
             # 65536 logarithms serve all pixels.
@@ -67,15 +70,52 @@ class LineIntegrals:
         else:
             dark, floor = np.float32(self.scan.dark), np.float32(self.floor)
             take_log(np.asarray(stack, np.float32), dark, floor, self._log_open, self._dead, p, clamped)
+        for image in p if self._filling is not None else ():
+            self._filling.fill(image)
         return p.reshape(counts.shape), clamped.reshape(counts.shape)
+
+
+@dataclass(frozen=True, slots=True)
+class Filling:
+    """How dead pixels are filled: `dead`, the two pixels that each is interpolated between, and the second's share.
+
+    They are flat indices. The neighbours are the nearest pixels of the row that see something, on either side, or else
+    the nearest one at all. Left as they are, dead pixels would read as open air and draw rings.
+    """
+
+    dead: NDArray[np.int64]
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    share: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, dead: NDArray[np.bool_]) -> "Filling | None":
+        """Return how the pixels `dead` [v, u] are filled; None where there are none, or no others."""
+        if not dead.any() or dead.all():
+            return None
+        v, u = np.nonzero(dead)
+        n_u, columns = dead.shape[1], np.arange(dead.shape[1])
+        left = np.maximum.accumulate(np.where(dead, -1, columns), axis=1)[v, u]
+        right = np.minimum.accumulate(np.where(dead, n_u, columns)[:, ::-1], axis=1)[:, ::-1][v, u]
+        both = (left >= 0) & (right < n_u)
+        nearest = ndimage.distance_transform_edt(dead, return_distances=False, return_indices=True)
+        at_v, at_u = np.asarray(nearest)[:, v, u]
+        share = np.where(both, (u - left) / np.maximum(right - left, 1), 0)
+        one, other = (np.where(both, v * n_u + side, at_v * n_u + at_u) for side in (left, right))
+        return cls(v * n_u + u, one.astype(np.int64), other.astype(np.int64), share.astype(np.float32))
+
+    def fill(self, image: NDArray[np.float32]) -> None:
+        """Fill an image [v, u] in place."""
+        flat = image.reshape(-1)
+        flat[self.dead] = flat[self.first] + self.share * (flat[self.second] - flat[self.first])
 
 
 def line_integrals(scan: Scan, view: int | slice) -> tuple[torch.Tensor, torch.Tensor]:
     """Return p = −ln(max(counts − dark, floor) / (flat − dark)), float32, and the mask of clamped pixels, bool.
 
-    Shapes are [v, u] for one view and [view, v, u] for a slice. Both images
-    contain the pedestal. Readings that are not finite, and pixels whose open field is below the floor,
-    count as clamped.
+    Shapes are [v, u] for one view and [view, v, u] for a slice. Both images contain the pedestal. Readings that are not
+    finite, and dead pixels, whose open field is not finite or not above the floor, count as clamped; p of the latter is
+    interpolated (`Filling`).
     """
     p, clamped = LineIntegrals(scan).of(view)
     return torch.from_numpy(p), torch.from_numpy(clamped)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.geometry import Geometry
+from ctsim.geometry import Geometry, leaves_none_out, turn_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,17 +98,11 @@ def _view_steps(geometry: Geometry) -> tuple[NDArray[np.float64], NDArray[np.flo
         place = (np.arange(n, dtype=np.float64) + 0.5) * (arc / n)
         return (place if geometry.arc_deg > 0 else arc - place), step, arc, abs(geometry.arc_deg) > 360 - 1e-6
     turn = 2 * math.pi
-    # Rounding merges repeated views, which then share one step.
-    angle = np.round(np.mod(geometry.angles, turn), 9).astype(np.float64)
-    angle[angle >= round(turn, 9)] = 0.0
-    distinct, which, repeats = np.unique(angle, return_inverse=True, return_counts=True)
+    distinct, which, repeats, gaps = turn_of(geometry.angles)  # repeated views share one step
     if len(distinct) == 1:
         return np.full(n, math.pi), np.full(n, turn / n), turn, True
-    gaps = np.diff(distinct, append=distinct[0] + turn)
     widest = int(np.argmax(gaps))
-    # One gap more than twice as wide as any other is the part that was not scanned.
-    full = bool(gaps[widest] <= 2.001 * np.max(np.delete(gaps, widest)))
-    if full:
+    if leaves_none_out(gaps):
         step = (gaps + np.roll(gaps, 1)) / 2
         return distinct[which], (step / repeats)[which], turn, True
     after = gaps.copy()

@@ -38,8 +38,10 @@ def weights_and_bounds(scan: Scan, p: Image, valid: NDArray[np.bool_], scatter: 
     floor, mean = count_floor(scan), np.float32(scatter.mean)
     usable = np.isfinite(open_field) & (open_field > floor)
     scale = np.where(usable, 1 / np.where(usable, open_field, 1), 0).astype(np.float32)
-    least = max(floor / float(np.median(open_field[usable])), SURE * noise) if usable.any() else 0.0
-    darkest = np.float32(math.hypot(SURE * noise, UNSEEN / scan.i0))
+    typical = float(open_field[usable].mean(dtype=np.float64)) if usable.any() else 1.0
+    faint = np.float32(typical) * scale  # where the open field is weak, as behind a bow-tie, little is a large share
+    least = np.float32(max(floor / typical, SURE * noise)) * faint
+    darkest = np.float32(math.hypot(SURE * noise, UNSEEN / scan.i0)) * faint
     weights = photon_weights(p, valid)
     for view, (reading, weight) in enumerate(zip(p, weights, strict=True)):
         scattered = scatter.of(view, reading.shape)

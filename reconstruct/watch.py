@@ -69,6 +69,19 @@ def listen(on_progress: OnProgress, *, every: float = 1.0) -> Iterator[None]:
         _listener.reset(token)
 
 
+_resumed: contextvars.ContextVar[list[float] | None] = contextvars.ContextVar("resumed", default=None)
+
+
+@contextlib.contextmanager
+def resumed() -> Iterator[list[float]]:
+    """Yield a list that gets the seconds before this part of every fit within that goes on from a checkpoint."""
+    token = _resumed.set(seconds := [])
+    try:
+        yield seconds
+    finally:
+        _resumed.reset(token)
+
+
 class Stopwatch:
     """A run's seconds, less what watching it took, and the times at which its watcher is still to be shown one."""
 
@@ -82,6 +95,8 @@ class Stopwatch:
     def resume(self, earlier: float) -> None:
         """Count on from the seconds that an earlier part of the run took; the times within them are not shown."""
         self._began, self.earlier = self._began - earlier, earlier
+        if (seconds := _resumed.get()) is not None:
+            seconds.append(earlier)
         if self._at is not None:
             self._at = [t for t in self._at if t > self.seconds]
 

@@ -2,5 +2,11 @@
 
 import ctsim
 
-scan = ctsim.simulate_scene(ctsim.find_scene("quick", "lung-Fe"))
+scene = ctsim.new_scene(
+    name="small",
+    phantom={"recipe": "lung", "metal": "Fe", "n_voxel": (48, 48, 48), "size": 60.0},
+    scanner={"preset": "skyscan1273", "n_voxel": (32, 32, 32), "n_detector": (48, 48), "n_views": 12},
+    simulation={"scatter_error": 0.5},
+)
+scan = ctsim.simulate_scene(scene)
 ctsim.score_volume(ctsim.reconstruct_scan(scan, "nmar"), scan, protocols=["tissue"])

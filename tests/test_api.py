@@ -21,7 +21,7 @@ from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
 from ctsim.phantoms.dataset import simulate_scene
 from ctsim.phantoms.scene import load_suite, parse_suite
-from ctsim.types import Scan, Volume
+from ctsim.types import Scan, Status, Volume
 
 NAMES = [name for name in ctsim.__all__ if name != "__version__"]
 
@@ -132,6 +132,21 @@ def test_volumes_that_cannot_be_scored_are_refused(simulated):
             score_volume(values, simulated)
     with pytest.raises(InputError, match='variant="metal_free"'):
         score_volume(np.zeros(shape), simulated.metal_free)
+    with pytest.raises(InputError, match=r"variant: expected 'metal' or 'metal_free', got 'metalfree'"):
+        score_volume(np.zeros(shape), simulated, variant="metalfree")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("status", list(Status))
+def test_what_run_benchmark_does_not_score_is_refused(simulated, status):
+    volume = Volume(values=reconstruct_scan(simulated).values, status=status, reason="it is so")
+    if status in ("ok", "diverged"):
+        assert score_volume(volume, simulated)["tissue"].values
+    else:
+        with pytest.raises(InputError, match=f"status is {status}, which is not scored: it is so"):
+            score_volume(volume, simulated)
+    if status != "ok":
+        with pytest.raises(InputError, match=f"status is {status}"):
+            score_volume(volume.values.numpy(), simulated, twin=volume)
 
 
 def test_a_measured_scan_is_reconstructed_without_truth(simulated):

@@ -1,6 +1,6 @@
-import numba
 import numpy as np
 import pytest
+from by_threads import one_and_several
 
 from ctsim.reconstruct.kernels import backproject_cpu, backproject_reference
 
@@ -59,16 +59,9 @@ def test_a_slice_from_one_long_row(off_v):
 
 
 def test_thread_count_changes_no_bit():
-    before = numba.get_num_threads()
-    results = []
-    try:
-        for threads in {1, before}:
-            numba.set_num_threads(threads)
-            shapes = ((40, 41, 43), (1, 41, 43))
-            results.append([run(backproject_cpu, VIEWS, "detector offset", shape) for shape in shapes])
-    finally:
-        numba.set_num_threads(before)
-    assert all(np.array_equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+    shapes = ((40, 41, 43), (1, 41, 43))
+    one, several = one_and_several(lambda: [run(backproject_cpu, VIEWS, "detector offset", shape) for shape in shapes])
+    assert all(np.array_equal(a, b) for a, b in zip(one, several, strict=True))
 
 
 def test_one_tile_and_many_share_one_compilation():

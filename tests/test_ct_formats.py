@@ -200,7 +200,11 @@ DOUBTFUL = {
     "frames": ({"NumberOfFrames": "4"}, "several frames or colours"),
     "bits": ({"HighBit": 9}, "stores bits 0 to 9 of 16, 12 of them used"),
     "a slope of 0": ({"RescaleSlope": "0"}, "RescaleSlope = 0, expected a positive"),
-    "no HU": ({"RescaleSlope": None}, r"rescale: .* grey values \(uint16\) that cannot be HU"),
+    "an intercept alone": ({"RescaleSlope": None}, "RescaleIntercept = -1024 and no RescaleSlope, expected both"),
+    "no HU": (
+        {"RescaleSlope": None, "RescaleIntercept": None},
+        r"rescale: .* grey values \(uint16\) that cannot be HU",
+    ),
     "directions": (
         {"ImageOrientationPatient": [1, 0, 0, 0, 2, 0]},
         r"has ImageOrientationPatient of the lengths \[1\.0, 2\.0\]",

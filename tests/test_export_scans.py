@@ -20,6 +20,7 @@ from ctsim.dataset.interop import Library, points_to
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.io.scans import exchange
+from ctsim.io.scans import formats as scans
 from ctsim.io.scans.scanfile import Stated
 
 GEOMETRY = Geometry(
@@ -263,6 +264,27 @@ def test_the_pickle_holds_arrays_numbers_and_names_only(tmp_path):
     write_scan(tmp_path / "a.pickle", "naf", measured(HELD["naf"]))
     with (tmp_path / "a.pickle").open("rb") as file:
         assert Arrays(file).load()["mode"] == "cone"
+
+
+def test_a_pickle_is_read_back_as_it_was(tmp_path):
+    """NAF's rays have the detector as (u, v) with v downwards."""
+    given = measured(HELD["naf"])
+    write_scan(tmp_path / "a.pickle", "naf", given)
+    found = scans.open_scan(tmp_path / "a.pickle")
+    for name in ("n_voxel", "d_voxel", "off_origin", "n_detector", "d_detector", "off_detector", "dso", "dsd"):
+        np.testing.assert_allclose(getattr(found.geometry, name), getattr(given.geometry, name), rtol=1e-12)
+    kept = [k for k in range(4) if k % 10]
+    np.testing.assert_array_equal([found.read(k) for k in range(3)], given.p[kept])
+
+
+def test_a_square_detector_whose_axes_cannot_be_told_apart_is_refused(tmp_path):
+    square = msgspec.structs.replace(HELD["naf"], n_detector=(6, 6))
+    write_scan(tmp_path / "a.pickle", "naf", measured(square))
+    with pytest.raises(InputError, match=r"has the dDetector .* on a square detector"):
+        scans.open_scan(tmp_path / "a.pickle")
+    plain = msgspec.structs.replace(square, d_detector=(0.5, 0.5), off_detector=(0.0, 0.0))
+    write_scan(tmp_path / "b.pickle", "naf", measured(plain))
+    assert scans.open_scan(tmp_path / "b.pickle").geometry.d_detector == (0.5, 0.5)
 
 
 @pytest.mark.parametrize(

@@ -3,10 +3,10 @@
 import itertools
 
 import msgspec
-import numba
 import numpy as np
 import pytest
 import torch
+from by_threads import one_and_several
 from test_field import GEOMETRY, points_of
 
 from ctsim.reconstruct.field.encoding import PRIMES, Encoding, resolutions_of
@@ -117,18 +117,10 @@ def test_the_field_and_its_gradients_are_those_of_the_reference(
 
 
 def test_no_bit_depends_on_the_number_of_threads():
-    if numba.config.NUMBA_NUM_THREADS < 2:  # type: ignore[attr-defined]
-        pytest.skip("one core")
     grid = grid_of((70, 20, 24), 2)
     encoding = Encoding.of(grid, (8, 24, 70), 10)
-    before, results = numba.get_num_threads(), []
-    try:
-        for threads in (1, 2):
-            numba.set_num_threads(threads)
-            results.append(_passes(encoding, first_parameters(encoding, 4, 32, 2, 1)))
-    finally:
-        numba.set_num_threads(before)
-    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+    one, several = one_and_several(lambda: _passes(encoding, first_parameters(encoding, 4, 32, 2, 1)))
+    assert all(torch.equal(a, b) for a, b in zip(one, several, strict=True))
 
 
 def _passes(encoding, given):

@@ -41,6 +41,17 @@ def test_a_full_turn_covers_half_the_detector_more_or_nothing(off: float) -> Non
     assert short.fov_radius == pytest.approx(200 * np.sin(np.arctan(max(1.0 - off, 0) / 400)))
 
 
+def test_a_full_turn_that_is_listed_covers_as_much() -> None:
+    # as importers write it: unevenly, the other way round, from anywhere on
+    given = np.cumsum([3.0, *([7.0, 5.0] * 29), 6.0, 3.0])[::-1] + 100
+    turn = with_(off_detector=(0.0, 0.5), n_views=len(given), angles_deg=tuple(given.tolist()))
+    assert turn.fov_radius == with_(off_detector=(0.0, 0.5)).fov_radius
+    part = with_(off_detector=(0.0, 0.5), n_views=30, angles_deg=tuple(given[:30].tolist()))
+    assert not part.is_full_turn and part.fov_radius == with_(off_detector=(0.0, 0.5), arc_deg=200.0).fov_radius
+    once = with_(n_views=1, angles_deg=(10.0,))
+    assert not once.is_full_turn
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

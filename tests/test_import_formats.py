@@ -16,6 +16,7 @@ from ctsim.benchmarks.importing.work import bring
 from ctsim.dataset.store import open_scan
 from ctsim.errors import InputError
 from ctsim.io.scans import formats as scans
+from ctsim.io.scans.openfield import open_field
 from ctsim.io.scans.scanfile import Stated
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.types import Scan
@@ -47,6 +48,18 @@ def same_fdk(stored, true: Scan) -> None:
 def signal_scan() -> Scan:
     flat = torch.from_numpy((FLAT[0] - DARK[0].astype(float)).astype(np.float32))
     return Scan(geometry=GEOMETRY, counts=torch.from_numpy(SIGNAL), flat=flat)
+
+
+@pytest.mark.parametrize("n_views", [2, 3, 24, 40])
+def test_photons_are_told_by_two_different_views(n_views):
+    images = np.random.default_rng(1).poisson(1e4, (n_views, 64, 80)).astype(np.float32)
+    found = open_field(lambda view: images[view], n_views, 0.0)
+    # two strips of 64 x 2 pixels and more: the median deviation of their differences is right to a tenth
+    assert found.photons == pytest.approx(1e4, rel=0.25) and not found.note
+    images[:-1] /= 3  # a body that covers the sides in all views but the last
+    found = open_field(lambda view: images[view], n_views, 0.0)
+    assert found.photons is not None and found.level == pytest.approx(1e4, rel=0.01)
+    assert open_field(lambda view: images[view], 1, 0.0).photons is None
 
 
 @pytest.mark.parametrize("write", [scan_files.dxchange, scan_files.nxtomo])

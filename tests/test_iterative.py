@@ -4,10 +4,10 @@ import functools
 import itertools
 
 import msgspec
-import numba
 import numpy as np
 import pytest
 import torch
+from by_threads import one_and_several
 from iterative_scans import (
     GEOMETRY,
     METHODS,
@@ -176,14 +176,8 @@ def test_watcher_sees_each_iteration(name):
 
 @pytest.mark.parametrize("name", ["os-sart", "fista-tv", "awpcsd", "cgls"])
 def test_thread_count_changes_no_bit(name):
-    before, results = numba.get_num_threads(), []
-    try:
-        for threads in {1, min(2, before)}:
-            numba.set_num_threads(threads)
-            results.append(METHODS[name](sphere(), iterations=2).values)
-    finally:
-        numba.set_num_threads(before)
-    assert all(torch.equal(results[0], other) for other in results)
+    one, several = one_and_several(lambda: METHODS[name](sphere(), iterations=2).values)
+    assert torch.equal(one, several)
 
 
 @pytest.mark.slow

@@ -2,9 +2,9 @@
 
 import dataclasses
 
-import numba
 import numpy as np
 import pytest
+from by_threads import one_and_several
 
 from ctsim.beam.spectrum import Spectrum
 from ctsim.detector.response import Detector
@@ -123,17 +123,10 @@ def test_density_scales_attenuation():
 
 
 def test_the_same_histories_for_any_number_of_threads():
-    phantom, threads = ball("water"), numba.get_num_threads()
-    try:
-        found = []
-        for n in {1, threads}:
-            numba.set_num_threads(n)
-            found.append(image(phantom, 60.0, 20_000, stream="s"))
-    finally:
-        numba.set_num_threads(threads)
-    for other in found[1:]:
-        assert np.array_equal(found[0].scatter, other.scatter) and np.array_equal(found[0].primary, other.primary)
-    assert not np.array_equal(found[0].scatter, image(phantom, 60.0, 20_000, stream="t").scatter)
+    phantom = ball("water")
+    one, several = one_and_several(lambda: image(phantom, 60.0, 20_000, stream="s"))
+    assert np.array_equal(one.scatter, several.scatter) and np.array_equal(one.primary, several.primary)
+    assert not np.array_equal(one.scatter, image(phantom, 60.0, 20_000, stream="t").scatter)
 
 
 def test_energy_is_kept():

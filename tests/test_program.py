@@ -2,8 +2,11 @@
 
 import dataclasses
 import json
+import os
 import shlex
+import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ import torch
 from run_records import run_methods
 
 from ctsim.benchmarks import methods, program
+from ctsim.benchmarks.engine.host import peak_memory
 from ctsim.benchmarks.studies.methods.attempt import attempt
 from ctsim.dataset.store import open_scan
 from ctsim.errors import InputError
@@ -76,6 +80,34 @@ def test_only_a_program_that_names_the_mask_gets_it(tmp_path):
     without, told = python("pass"), python("pass", "{mask}")
     assert (without.mask, without.inputs) == ("none", "counts only")
     assert (told.mask, told.inputs) == ("oracle", "metal mask")
+
+
+def test_memory_is_that_of_the_program(tmp_path):
+    """Not that of the process that started it, which Linux hands down."""
+    np.save(tmp_path / "v.npy", np.ones((5, 7, 11), np.float32))
+    copy = f"cp {tmp_path / 'v.npy'} $2.npy"
+    small = attempt(methods.find(f"cmd:{shlex.join(['sh', '-c', copy, 'sh', '{scan}', '{out}'])}"), SCAN, 0.0)
+    assert small.status == "ok" and 2**20 < small.cost.peak_bytes < 2**25 < peak_memory()
+    large = attempt(python(f"import sys; b = b'x' * 2**27; {WRITE.format(shape=(5, 7, 11))}"), SCAN, 0.0)
+    assert large.cost.peak_bytes > 2**27
+    failing = attempt(python("import sys, time; b = b'x' * 2**27; time.sleep(0.3); sys.exit(1)"), SCAN, 0.0)
+    assert failing.status == "error" and failing.cost.peak_bytes > 2**27 and failing.cost.wall > 0.3
+
+
+def test_an_interruption_ends_the_program(tmp_path, monkeypatch):
+    code = f"import os, time; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(99)"
+
+    def interrupted(process, timeout=None):
+        while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
+            time.sleep(0.01)
+        monkeypatch.undo()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(subprocess.Popen, "wait", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        attempt(python(code), SCAN, 0.0)
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "pid").read_text()), 0)
 
 
 @pytest.mark.parametrize(

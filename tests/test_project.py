@@ -7,6 +7,7 @@ import msgspec
 import numba
 import numpy as np
 import pytest
+from by_threads import one_and_several
 
 from ctsim.beam.quadrature import energy_rule
 from ctsim.beam.spectrum import Tube, spectrum
@@ -308,13 +309,7 @@ def test_results_do_not_depend_on_the_number_of_threads(dense):
     body = blobs(solids=INSERTS)
     tracer = Tracer.of(with_density(body.labels, body.d_voxel, solids=INSERTS) if dense else body)
     g, r = geometry(n_detector=(31, 40), pixel=1.5), response()
-    several = transmit(tracer, g, 1, r)
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        one = transmit(tracer, g, 1, r)
-    finally:
-        numba.set_num_threads(before)
+    one, several = one_and_several(lambda: transmit(tracer, g, 1, r))
     assert np.array_equal(several[0], one[0]) and np.array_equal(several[1], one[1])
 
 

@@ -1,8 +1,8 @@
 import msgspec
-import numba
 import numpy as np
 import pytest
 import torch
+from by_threads import one_and_several
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -151,15 +151,8 @@ def test_view_twice_counts_twice():
 def test_thread_count_changes_no_bit(name):
     geometry = with_(CASES[name], n_voxel=(20, 33, 37))
     volume, projections = arrays(geometry)
-    before, results = numba.get_num_threads(), []
-    try:
-        for threads in {1, min(2, before), before}:
-            numba.set_num_threads(threads)
-            results.append(run(joseph_cpu, geometry, volume, projections, np.float32))
-    finally:
-        numba.set_num_threads(before)
-    for other in results[1:]:
-        assert np.array_equal(results[0][0], other[0]) and np.array_equal(results[0][1], other[1])
+    one, several = one_and_several(lambda: run(joseph_cpu, geometry, volume, projections, np.float32))
+    assert np.array_equal(one[0], several[0]) and np.array_equal(one[1], several[1])
 
 
 def rays(geometry):

@@ -5,12 +5,13 @@ import msgspec
 import pytest
 from run_records import make_record
 
-from ctsim.benchmarks import cli, methods, versions
+from ctsim.benchmarks import cli, methods
 from ctsim.benchmarks.engine.host import host, measured
 from ctsim.benchmarks.engine.record import Store, done
 from ctsim.benchmarks.scores.score import Score
 from ctsim.benchmarks.studies.methods import records, tables
 from ctsim.benchmarks.studies.methods.records import Run, RunRecord
+from ctsim.dataset import versions
 from ctsim.errors import InputError
 
 

@@ -250,6 +250,14 @@ def test_a_rerun_does_only_what_is_missing(tmp_path):
     assert plan.pending([job.task for job in other], records.read(tmp_path), tmp_path) == [other[0].task]
 
 
+def test_two_scans_that_would_be_one_row_are_refused(tmp_path):
+    """NAME with the seed 3, and NAME-s3 of make-dataset --seeds 3."""
+    alone, repeated = double(tmp_path / "a"), dataclasses.replace(double(tmp_path / "b"), name="box-s3")
+    assert plan.repetition(alone) == plan.repetition(repeated) == ("box", 3)
+    with pytest.raises(InputError, match=r"/a and .*/b are the same scene and seed"):
+        plan.jobs([alone, repeated], [methods.find("test_run:good")], anchor=False)
+
+
 def test_a_scans_held_out_views_are_simulated_once(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(judge, "held_out", lambda stored: made.append(stored.content_hash) or "none here")

@@ -53,7 +53,7 @@ def folder(tmp_path_factory) -> Path:
 
 def test_every_scan_is_in_one_shard_of_its_split(folder):
     index = read_index(folder / "data")
-    found = {path.name: [e.name for e in shards.contents(path)] for path in shards.shards_of(folder / "out")}
+    found = {path.name: [e.name for e in shards.contents(path).scans] for path in shards.shards_of(folder / "out")}
     assert sorted(name for names in found.values() for name in names) == sorted(index)
     for path, names in found.items():
         assert len(names) <= 2
@@ -79,7 +79,9 @@ def test_arrays_are_those_of_the_scan(folder):
         assert whole[k][item].dtype == torch.float32
         torch.testing.assert_close(whole[k][item], array, rtol=0, atol=0)
     assert want["trace"].any() and not torch.equal(want["fdk"], want["twin"])
-    (path,) = (p for p in shards.shards_of(folder / "out") if "rods-00001" in [e.name for e in shards.contents(p)])
+    (path,) = (
+        p for p in shards.shards_of(folder / "out") if "rods-00001" in [e.name for e in shards.contents(p).scans]
+    )
     with h5py.File(path) as file:
         assert file["rods-00001"].attrs["scene"] == (stored.folder / "scene.toml").read_text()
 
@@ -161,7 +163,21 @@ def test_shards_that_are_there_are_kept_and_damaged_ones_made_again(folder, caps
     assert main([str(folder / "data"), str(folder / "out"), "--scans-per-shard", "2"]) == 0
     assert first.stat().st_mtime_ns != before[0] and second.stat().st_mtime_ns == before[1]
     assert "8 scans in" in capsys.readouterr().out
-    assert len(shards.contents(first)) == 2
+    assert len(shards.contents(first).scans) == 2
+
+
+def test_a_shard_of_other_scans_or_items_is_not_taken_for_one_of_these(folder, tmp_path):
+    data, out = str(folder / "data"), tmp_path / "out"
+    assert main([data, str(out), "--items", "metal"]) == 0
+    assert main([data, str(out)]) == 0  # all items now
+    assert Scans(out, ("p", "metal"))[0].keys() == {"p", "metal"}
+    (other := out / "train-00007.h5").write_bytes((out / "train-00000.h5").read_bytes())
+    with pytest.raises(InputError, match=r"train-00000\.h5 and train-00007\.h5 both hold rods"):
+        Scans(out)
+    with pytest.raises(InputError, match=r"train-00007\.h5: is not among the shards"):
+        main([data, str(out)])
+    other.unlink()
+    assert main([data, str(out)]) == 0
 
 
 def test_what_is_not_there_is_one_sentence(folder, tmp_path):

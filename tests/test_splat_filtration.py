@@ -70,7 +70,8 @@ def scan_behind(*filters, **changes):
         "tube": {"kvp": 90.0, "filters": [{"material": m, "thickness": t} for m, t in filters]},
     }  # fmt: skip
     phantom = {"recipe": "lung", "metal": "Ti", "n_voxel": [71, 71, 71], "size": 60.0}
-    return ctsim.simulate_scene(ctsim.new_scene(name="lung", seed=1, phantom=phantom, scanner=scanner | changes))
+    told = {"phantom": phantom, "scanner": scanner | changes, "simulation": {"scatter_error": 0.5}}
+    return ctsim.simulate_scene(ctsim.new_scene(name="lung", seed=1, **told))
 
 
 COPPER = (("Al", 2.5), ("Cu", 0.2))

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from by_threads import one_and_several
 
 from ctsim.benchmarks.make_dataset import main as make_dataset
 from ctsim.benchmarks.methods import find
@@ -20,9 +21,10 @@ from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reconstruct.splat import course, fast
-from ctsim.reconstruct.splat.checkpoint import Checkpoint
-from ctsim.reconstruct.splat.course import passes_over
+from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
+from ctsim.reconstruct.splat.course import levels_of, passes_over
 from ctsim.reconstruct.splat.curve import MATERIALS, MaterialCurve
+from ctsim.reconstruct.splat.fast import Settings, finer
 from ctsim.reconstruct.splat.lattice import Lattice
 from ctsim.reconstruct.splat.level import Data, carve, coarser, refined, weighted
 from ctsim.reconstruct.splat.ordered import Fit, bit_reversed, step_length
@@ -257,15 +259,8 @@ def test_progress_goes_from_the_first_subset_to_the_whole(small):
 
 
 def test_the_same_scan_gives_the_same_bits(stored):
-    import numba
-
-    first = reconstruct(stored.scan, passes=(1, 1)).values
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        assert torch.equal(first, reconstruct(stored.scan, passes=(1, 1)).values)
-    finally:
-        numba.set_num_threads(threads)
+    one, several = one_and_several(lambda: reconstruct(stored.scan, passes=(1, 1)).values)
+    assert torch.equal(one, several)
 
 
 def test_exact_splats_make_the_volume_of_ewa_but_for_what_ewa_leaves_out(stored):
@@ -432,6 +427,80 @@ def test_a_record_counts_the_seconds_before_an_interruption(small, tmp_path):
     assert begun is not None and begun.wall < 1000 and begun.cpu is not None
     assert outcome.cost is not None and 1000 < outcome.cost.wall < 2000
     assert outcome.cost.cpu is None and outcome.details["earlier_seconds"] == 1000  # of the last part alone, so unknown
+
+
+def test_a_fit_that_fails_counts_the_seconds_before_an_interruption(small, tmp_path, monkeypatch):
+    told = {"passes": [1, 1], "checkpoints": str(tmp_path)}
+    attempt(find("splat", told | {"seconds": 1e-9}), small.scan, 0.0)
+    (file,) = tmp_path.iterdir()
+    kept = Checkpoint(folder=tmp_path, identity=file.stem)
+    kept.write({**(kept.read() or {}), "seconds": np.array(1000.0)})
+    monkeypatch.setattr("ctsim.reconstruct.splat.fast.typical_length", lambda fit: 1 / 0)
+    outcome = attempt(find("splat", told), small.scan, 0.0)
+    assert outcome.status == "error" and outcome.cost is not None and 1000 < outcome.cost.wall < 2000
+    assert outcome.cost.cpu is None
+
+
+def test_a_fit_of_other_code_or_of_other_data_is_not_gone_on_from(small, monkeypatch):
+    metal = torch.zeros(small.scan.geometry.n_voxel, dtype=torch.bool)
+    other = metal.clone()
+    other[0, 0, 0] = True
+    scans = [small.scan, *(dataclasses.replace(small.scan, metal=mask) for mask in (metal, other))]
+    scans.append(dataclasses.replace(small.scan, floor=3.0))
+    found = [identity_of(scan, Settings(), "splat", "ctsim.reconstruct.splat.fast") for scan in scans]
+    found.append(identity_of(small.scan, Settings(tv=0.1), "splat", "ctsim.reconstruct.splat.fast"))
+    found.append(identity_of(small.scan, Settings(), "naf", "ctsim.reconstruct.splat.fast"))
+    monkeypatch.setattr("ctsim.reconstruct.splat.checkpoint.code_version", lambda module: "of a later commit")
+    found.append(identity_of(small.scan, Settings(), "splat", "ctsim.reconstruct.splat.fast"))
+    assert len({*found}) == len(found) == 7
+
+
+def test_a_filtration_is_refused_where_the_spectrum_is_known():
+    with pytest.raises(InputError, match="filtration: only for response 'tube'"):
+        Settings(response="known", filtration=8.0)
+
+
+@pytest.mark.parametrize(("layers", "thick", "most"), [(32, 1.0, 48), (28, 32 / 28, 42), (16, 2.0, 38), (8, 4.0, 38)])
+def test_the_finest_voxels_are_nearly_cubes(layers, thick, most):
+    geometry = Geometry(
+        dso=400.0,
+        dsd=800.0,
+        n_voxel=(layers, 32, 32),
+        d_voxel=(thick, 1.0, 1.0),
+        n_detector=(96, 96),
+        d_detector=(1.0, 1.0),
+        n_views=30,
+    )
+    fine = finer(geometry, 1.5)
+    assert fine.n_voxel == (most, 48, 48) and max(fine.d_voxel) / min(fine.d_voxel) < 1.27
+    assert np.allclose(np.multiply(fine.n_voxel, fine.d_voxel), np.multiply(geometry.n_voxel, geometry.d_voxel))
+    coarse = finer(msgspec.structs.replace(geometry, d_detector=(4.0, 4.0)), 1.5)  # 2 mm at the axis
+    assert coarse.n_voxel == (max(layers, 16), 32, 32)
+
+
+def test_a_volume_of_flat_voxels_that_no_pixel_divides_says_so(stored):
+    grid = msgspec.structs.replace(stored.geometry, n_voxel=(2, 12, 12), d_voxel=(12.0, 5.0, 5.0))
+    coarse = msgspec.structs.replace(grid, n_detector=(8, 9), d_detector=tuple(2 * d for d in grid.d_detector))
+    scan = stored.scan
+    halves = scan.counts.float().unflatten(1, (8, 2)).unflatten(3, (9, 2)).mean((2, 4))
+    flat = scan.flat.unflatten(0, (8, 2)).unflatten(2, (9, 2)).mean((1, 3))
+    found = reconstruct(dataclasses.replace(scan, geometry=coarse, counts=halves, flat=flat), passes=(0, 1))
+    assert "times as long as wide" in found.details["limitation"]
+    assert "times as long" not in reconstruct(scan, passes=(0, 1)).details.get("limitation", "")
+
+
+def test_a_flat_volume_goes_from_coarse_to_fine_too():
+    geometry = Geometry(
+        dso=400.0,
+        dsd=800.0,
+        n_voxel=(30, 128, 128),
+        d_voxel=(0.5, 0.5, 0.5),
+        n_detector=(8, 8),
+        d_detector=(1.0, 1.0),
+        n_views=8,
+    )
+    levels = levels_of(weighted(geometry, np.zeros((8, 8, 8), np.float32), np.ones((8, 8, 8), np.bool_)), coarse=True)
+    assert [level.geometry.n_voxel for level in levels] == [(15, 64, 64), (30, 128, 128)]
 
 
 def test_where_a_fit_is_kept_is_no_part_of_its_row():

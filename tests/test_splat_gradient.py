@@ -2,9 +2,9 @@
 
 import dataclasses
 
-import numba
 import numpy as np
 import pytest
+from by_threads import one_and_several
 from test_splat_project import GEOMETRIES, SMALL, one, splats, with_
 
 from ctsim.errors import InputError
@@ -141,16 +141,14 @@ def test_densities_have_the_adjoint_and_round_splats_the_sum_of_their_scales():
 
 def test_the_tolerance_does_not_matter_and_threads_change_no_bit():
     given, image = splats(300, "ellipsoids"), loss_image(SMALL)
-    before, results = numba.get_num_threads(), []
-    try:
-        for threads, tolerance in ((1, np.inf), (min(2, before), 0.0), (before, 1e-3)):
-            numba.set_num_threads(threads)
-            got = Projector(geometry=SMALL, tolerance=tolerance).gradient(given, image, 0)
-            results.append([getattr(got, field.name) for field in dataclasses.fields(got)])
-    finally:
-        numba.set_num_threads(before)
-    for other in results[1:]:
-        assert all(np.array_equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+    def gradients():
+        got = [Projector(geometry=SMALL, tolerance=t).gradient(given, image, 0) for t in (np.inf, 0.0, 1e-3)]
+        return [[getattr(one, field.name) for field in dataclasses.fields(one)] for one in got]
+
+    one, several = one_and_several(gradients)
+    for other in (*one[1:], *several):
+        assert all(np.array_equal(a, b) for a, b in zip(one[0], other, strict=True))
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-30, np.nan, np.inf, -np.inf, 1e30])

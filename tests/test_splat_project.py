@@ -3,9 +3,9 @@
 import dataclasses
 
 import msgspec
-import numba
 import numpy as np
 import pytest
+from by_threads import one_and_several
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -311,18 +311,15 @@ def test_columns_beyond_the_detector_are_zero_and_not_read():
 def test_thread_count_changes_no_bit():
     geometry = with_(n_detector=(150, 40), d_detector=(0.3, 1.0), n_views=17)
     projector, given = Projector(geometry=geometry), splats(300, "ellipsoids")
-    before, results = numba.get_num_threads(), []
-    try:
-        for threads in {1, min(2, before), before}:
-            numba.set_num_threads(threads)
-            many = projector.forward(given.shapes(), given.densities)
-            single = projector.forward(given.shapes(), given.densities, [3])
-            results.append((many, single, projector.adjoint(given.shapes(), many)))
-    finally:
-        numba.set_num_threads(before)
-    for other in results[1:]:
-        assert all(np.array_equal(a, b) for a, b in zip(results[0], other, strict=True))
-    many, single, _ = results[0]
+
+    def images():
+        many = projector.forward(given.shapes(), given.densities)
+        single = projector.forward(given.shapes(), given.densities, [3])
+        return many, single, projector.adjoint(given.shapes(), many)
+
+    one, several = one_and_several(images)
+    assert all(np.array_equal(a, b) for a, b in zip(one, several, strict=True))
+    many, single, _ = one
     assert np.array_equal(single[0], many[3])
 
 

@@ -326,7 +326,7 @@ def test_tv_pulls_at_densities_as_its_finite_difference_says():
 
     by_tv = objective(parameters, response, 0, 7).parameters["densities"]
     by_tv = by_tv - plain(parameters, response, 0, 7).parameters["densities"]
-    assert tv(0) > 0.1
+    assert tv(0) > 0.03
     assert by_tv.sum() == pytest.approx((tv(step) - tv(-step)) / (2 * step), rel=0.01)
 
 
@@ -351,7 +351,7 @@ def test_a_step_is_that_of_the_scene_scaled_to_its_unit_cube():
     assert plain(moved, response, 3, 0).loss == published < b.loss
     pairs = [(a.parameters[name], b.parameters[name]) for name in ("scales", "densities")]
     pairs += [(a.parameters["positions"] * unit, b.parameters["positions"]), (a.centres, b.centres)]
-    assert a.loss == pytest.approx(b.loss, rel=1e-5)  # P of float32 counts, to 1e-6
+    assert a.loss == pytest.approx(b.loss, abs=1e-6)  # P of float32 counts
     for one, other in pairs:
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-3 * np.abs(other).max())
 

@@ -5,9 +5,9 @@ import json
 import math
 from typing import get_args
 
-import numba
 import numpy as np
 import pytest
+from by_threads import one_and_several
 
 from ctsim.beam.quadrature import full_rule
 from ctsim.beam.spectrum import Filter, Tube, spectrum
@@ -200,14 +200,8 @@ def test_theta_sums_agree_with_float64(name, basis):
 def test_results_are_bitwise_equal_for_any_number_of_threads():
     response = build("hinge", "klein-nishina")
     la, lb, g = pixels((3, 61, 127))  # several chunks, the last one ragged
-    before, results = numba.get_num_threads(), []
-    try:
-        for threads in {1, before}:
-            numba.set_num_threads(threads)
-            results.append((*evaluate(response, la, lb), theta_sums(response, la, lb, g)))
-    finally:
-        numba.set_num_threads(before)
-    for first, last in zip(results[0], results[-1], strict=True):
+    one, several = one_and_several(lambda: (*evaluate(response, la, lb), theta_sums(response, la, lb, g)))
+    for first, last in zip(one, several, strict=True):
         np.testing.assert_array_equal(first, last)
 
 

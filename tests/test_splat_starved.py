@@ -65,6 +65,19 @@ def test_a_dark_reading_bounds_its_ray_from_below_and_a_bright_one_is_read():
     np.testing.assert_allclose(weights[~starving], np.exp(-read[~starving]), rtol=1e-6)
 
 
+def test_a_faint_open_field_bounds_by_its_own_photons():
+    """Behind a bow-tie a pixel of a fifth of the mean beam sees nothing already at P 1.6 below the others'."""
+    scan = scan_of(np.full(GEOMETRY.shape, 25.0))
+    share = np.ones((32, 40), np.float32)
+    share[:, :4] = 0.2
+    flat = torch.from_numpy(share / share.mean() * np.float32(I0)) + DARK
+    p, weights = bounds_of(dataclasses.replace(scan, flat=flat))
+    dark = np.broadcast_to(weights < 0, p.shape)
+    bright, faint = p[:, :, 4:][dark[:, :, 4:]], p[:, :, :4][dark[:, :, :4]]
+    # the same readings and the same noise over an open field of a fifth: ln 5 lower in every quantile
+    assert np.median(bright) - np.median(faint) == pytest.approx(math.log(5), abs=0.05)
+
+
 def test_scatter_takes_its_share_of_a_bound():
     scan = scan_of(-np.log(np.exp(-np.full(GEOMETRY.shape, 15.0)) + 0.01), noise=0.0)
     p, weights = bounds_of(scan, scatter=0.01)

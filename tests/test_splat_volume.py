@@ -1,10 +1,10 @@
 """Volumes of splats against float64, closed forms, their transpose and the ray-caster."""
 
 import msgspec
-import numba
 import numpy as np
 import pytest
 import torch
+from by_threads import one_and_several
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -132,16 +132,13 @@ def test_adjoint_is_the_transpose(name, kind, mean):
 
 def test_thread_count_changes_no_bit():
     given, geometry = splats(200, "ellipsoids", within=8.0), with_(n_voxel=(37, 20, 33), d_voxel=(0.5, 0.5, 0.5))
-    before, results = numba.get_num_threads(), []
-    try:
-        for threads in {1, min(2, before), before}:
-            numba.set_num_threads(threads)
-            volume = voxelise(given, geometry)
-            results.append((volume, voxelise_adjoint(given, geometry, volume)))
-    finally:
-        numba.set_num_threads(before)
-    for other in results[1:]:
-        assert all(np.array_equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+    def volumes():
+        volume = voxelise(given, geometry)
+        return volume, voxelise_adjoint(given, geometry, volume)
+
+    one, several = one_and_several(volumes)
+    assert all(np.array_equal(a, b) for a, b in zip(one, several, strict=True))
 
 
 @pytest.mark.parametrize("mean", [True, False])

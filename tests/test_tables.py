@@ -66,6 +66,15 @@ def test_ranks_stay_within_an_input_class():
     assert cells(text, "| mask | d")[2] == "50.00"
 
 
+def test_a_label_of_two_classes_of_inputs_is_two_rows_each_with_its_own_numbers():
+    """As after the class of a method has changed and one of two scenes was run again."""
+    first, again = record("net", psnr=20.0), record("net", scene="teeth", psnr=25.0, inputs="mask")
+    text = tables.render([first, again], "md")
+    text = text[text.index("## tissue") :]
+    assert cells(text, "| counts only | net")[2] == "20.00" and cells(text, "| mask | net")[2] == "–"
+    assert "25.00" in cells(text, "| mask | net") and "25.00" not in cells(text, "| counts only | net")
+
+
 def test_captions_state_protocol_region_and_range():
     for form in ("md", "tex"):
         text = tables.render([record(), record(scene="teeth")], form)

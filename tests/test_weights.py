@@ -81,6 +81,7 @@ def wire(n):
             "n_views": 100,
             "i0": 1e5,
         },
+        simulation={"scatter_error": 0.5},  # no score here sees how it is spread
     )
 
 

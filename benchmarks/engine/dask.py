@@ -2,6 +2,8 @@
 
 import gc
 import logging
+import os
+import sys
 import threading
 import time
 from collections import deque
@@ -10,8 +12,6 @@ from concurrent.futures import CancelledError
 from typing import Any, Self
 
 import distributed
-import numba
-import torch
 from distributed.comm.core import CommClosedError
 from distributed.scheduler import KilledWorker
 
@@ -117,8 +117,21 @@ def _alone(function: Function, job: Any) -> tuple[bool, Any]:
     An exception is returned, not raised: one that Dask cannot pickle would be lost, and the client would wait for ever.
     """
     with _ALONE:
-        threads: int = distributed.get_worker().state.nthreads
-        most = numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]
-        numba.set_num_threads(min(threads, most))
-        torch.set_num_threads(threads)
+        _give(distributed.get_worker().state.nthreads)
         return answered(function, job)
+
+
+def _give(threads: int) -> None:
+    """Give kernels and torch so many threads, now or when a job loads them: not every job needs those seconds.
+
+    Dask starts its workers with one thread for OpenMP and MKL.
+    """
+    if (kernels := sys.modules.get("numba")) is not None:
+        kernels.set_num_threads(min(threads, kernels.config.NUMBA_NUM_THREADS))
+    else:
+        most = int(os.environ.get("NUMBA_NUM_THREADS", len(os.sched_getaffinity(0))))
+        os.environ["NUMBA_NUM_THREADS"] = str(min(threads, most))
+    if (tensors := sys.modules.get("torch")) is not None:
+        tensors.set_num_threads(threads)
+    else:
+        os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), str(threads))

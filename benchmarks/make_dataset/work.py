@@ -53,7 +53,8 @@ def run(options: Flags) -> int:
         say(f"make-dataset: {_sentence(error)}")
         return 2
     except KeyboardInterrupt:
-        say("make-dataset: interrupted; the same command goes on from here")
+        forced = " without --force" if options.force else ""
+        say(f"make-dataset: interrupted; the same command{forced} goes on from here")
         return 130
 
 

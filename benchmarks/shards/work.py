@@ -2,7 +2,7 @@
 
 import dataclasses
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -55,6 +55,11 @@ def shards(given: Flags) -> None:
     if given.scans_per_shard < 1:
         raise InputError(f"--scans-per-shard {given.scans_per_shard}: expected 1 or more")
     wanted = list(_divided(given))
+    if others := sorted({*given.out.glob("*.h5")} - {given.out / shard.path.name for shard in wanted}):
+        raise InputError(
+            f"{others[0]}: is not among the shards of {given.data}, so its scans may be read twice; "
+            "delete it, or name another folder"
+        )
     todo = [shard for shard in wanted if not _is_there(shard, form)]
     with open_jobs(given.workers, None) as pool, Bar(len(wanted), "shard", len(wanted) - len(todo)) as bar:
         if pool is None:
@@ -87,21 +92,21 @@ def _divided(given: Flags) -> Iterator[Shard]:
 
 
 def _is_there(shard: Shard, form: ModuleType) -> bool:
-    """Say whether a shard is there with these very scans, and with the items where they are stated."""
+    """Say whether a shard is there with these very scans, for which the same items were asked."""
     if not shard.path.exists():
         return False
     try:
         found = form.contents(shard.path)
     except InputError:
         return False
-    same = [(e.name, e.content_hash) for e in found] == [(s.name, s.content_hash) for s in shard.scans]
-    return same and (not shard.items or all({*e.shapes} == {*shard.items} for e in found))
+    same = [(e.name, e.content_hash) for e in found.scans] == [(s.name, s.content_hash) for s in shard.scans]
+    return same and {*found.items} == {*shard.items}
 
 
 def write(shard: Shard) -> None:
     """Be the worker: reconstruct a shard's scans and write them."""
     form = load(FORMAT, shard.path)
-    form.write(shard.path, (_scan(shard, line, form) for line in shard.scans))
+    form.write(shard.path, (_scan(shard, line, form) for line in shard.scans), shard.items)
 
 
 def _scan(shard: Shard, line: IndexLine, form: ModuleType) -> tuple[Any, dict[str, NDArray[Any]], str]:
@@ -116,7 +121,8 @@ def _scan(shard: Shard, line: IndexLine, form: ModuleType) -> tuple[Any, dict[st
     arrays = arrays_of(stored, shard.items)
     if missing := [item for item in shard.items if item not in arrays]:
         raise InputError(f"--items {missing[0]}: {stored.folder} was written without; see truth in its scene.toml")
-    return entry, arrays, (stored.folder / "scene.toml").read_text(encoding="utf-8")
+    scene = stored.folder / "scene.toml"  # an imported scan has none
+    return entry, arrays, scene.read_text(encoding="utf-8") if scene.exists() else ""
 
 
 def arrays_of(stored: StoredScan, items: tuple[str, ...] = ()) -> dict[str, NDArray[Any]]:
@@ -131,9 +137,12 @@ def arrays_of(stored: StoredScan, items: tuple[str, ...] = ()) -> dict[str, NDAr
         scan = source.scan
         is_stack = item.endswith("p")
         found[item] = LineIntegrals(scan).of(slice(None))[0] if is_stack else reconstruct(scan).values.numpy()
-    found["reference"], found["metal"] = stored.reference("effective"), stored.metal
+    truth: dict[str, Callable[[], NDArray[Any]]] = {
+        "reference": lambda: stored.reference("effective"),
+        "metal": lambda: stored.metal,
+    }
     if "trace.tif" in stored.files:
-        found["trace"] = stored.array("trace")
+        truth["trace"] = lambda: stored.array("trace")
     elif not stored.info.metal:
-        found["trace"] = np.zeros(stored.geometry.shape, np.uint8)
-    return {item: array for item, array in found.items() if not items or item in items}
+        truth["trace"] = lambda: np.zeros(stored.geometry.shape, np.uint8)
+    return found | {item: read() for item, read in truth.items() if not items or item in items}

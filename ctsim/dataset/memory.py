@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.dataset.truth import TWIN, ScanWithTruth
+from ctsim.dataset.truth import ScanWithTruth
 from ctsim.dataset.writer import Stack
 from ctsim.errors import InputError
-from ctsim.scaninfo import ScanInfo
+from ctsim.scaninfo import TWIN, ScanInfo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

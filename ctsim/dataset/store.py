@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from ctsim.dataset import manifest as mf
 from ctsim.dataset.manifest import list_scans, verify
 from ctsim.dataset.tiffstack import map_array
-from ctsim.dataset.truth import TWIN, ScanWithTruth, readings
+from ctsim.dataset.truth import ScanWithTruth, readings
 from ctsim.dataset.writer import SceneWriter, Stack, is_complete
 from ctsim.errors import InputError
-from ctsim.scaninfo import ScanInfo, read_info
+from ctsim.scaninfo import TWIN, ScanInfo, read_info
 
 __all__ = ["SceneWriter", "Stack", "StoredScan", "is_complete", "list_scans", "open_scan", "verify"]
 

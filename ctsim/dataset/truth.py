@@ -9,13 +9,10 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.scaninfo import ScanInfo
+from ctsim.scaninfo import TWIN, ScanInfo
 
 if TYPE_CHECKING:
     from ctsim.types import Scan
-
-TWIN = "metal_free/"
-"""Prefix of the names of what the twin without metal has for itself."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -35,14 +35,20 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Contents(msgspec.Struct, frozen=True, kw_only=True):
-    """What a shard says of itself."""
+    """What a shard says of itself; `items` are those that were asked for, none where it was to hold all there are."""
 
     format: int
     scans: tuple[Entry, ...]
+    items: tuple[str, ...] = ()
 
 
-def write(path: Path, scans: Iterable[tuple[Entry, Mapping[str, NDArray[Any]], str]]) -> None:
-    """Write a shard of (entry without shapes, arrays by item, scene.toml); it appears whole or not at all."""
+def write(
+    path: Path, scans: Iterable[tuple[Entry, Mapping[str, NDArray[Any]], str]], items: tuple[str, ...] = ()
+) -> None:
+    """Write a shard of (entry without shapes, arrays by item, scene.toml); it appears whole or not at all.
+
+    `items` are those that were asked for.
+    """
     entries = []
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as new, h5py.File(new, "w") as file:
@@ -55,10 +61,10 @@ def write(path: Path, scans: Iterable[tuple[Entry, Mapping[str, NDArray[Any]], s
                 )
             shapes = {item: array.shape for item, array in arrays.items()}
             entries.append(msgspec.structs.replace(entry, shapes=shapes))
-        file.attrs[_CONTENTS] = msgspec.json.encode(Contents(format=FORMAT, scans=tuple(entries))).decode()
+        file.attrs[_CONTENTS] = msgspec.json.encode(Contents(format=FORMAT, scans=tuple(entries), items=items)).decode()
 
 
-def contents(path: Path) -> tuple[Entry, ...]:
+def contents(path: Path) -> Contents:
     """Return what a shard holds.
 
     Raises
@@ -75,7 +81,7 @@ def contents(path: Path) -> tuple[Entry, ...]:
         ) from None
     if found.format != FORMAT:
         raise InputError(f"{path}: format {found.format}, this version reads format {FORMAT}")
-    return found.scans
+    return found
 
 
 def shards_of(root: Path) -> Iterator[Path]:

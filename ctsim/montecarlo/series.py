@@ -43,7 +43,7 @@ class ScatterSeries:
 
     coefficients: NDArray[np.float64]
     shape: tuple[int, int, int]
-    is_full_turn: bool
+    periodic: bool
     error: float
     histories: int
 
@@ -55,7 +55,7 @@ class ScatterSeries:
     def view(self, k: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the mean and the mean squared signal of view k, float32 [v, u]."""
         _, n_t, n_v, n_u = self.coefficients.shape
-        along, _ = _waves(np.array([(k + 0.5) / self.shape[0]]), n_t, periodic=self.is_full_turn)
+        along, _ = _waves(np.array([(k + 0.5) / self.shape[0]]), n_t, periodic=self.periodic)
         rows, columns = (_waves(_middles(n), c)[0] for n, c in zip(self.shape[1:], (n_v, n_u), strict=True))
         mean, squared = rows @ np.einsum("t,qtvu->qvu", along[0], self.coefficients) @ columns.T
         return np.maximum(mean, 0.0).astype(np.float32), np.maximum(squared, 0.0).astype(np.float32)
@@ -77,7 +77,8 @@ def scatter_series(
     world = World.of(phantom, source.spectrum.e_max)
     poses, cells = _few(geometry), _cells(geometry)
     sizes = (len(poses), *cells)
-    periodic = (geometry.is_full_turn, False, False)
+    turning = geometry.is_full_turn and geometry.angles_deg is None  # evenly: waves count views
+    periodic = (turning, False, False)
     bases, frequencies = zip(
         *(_waves(_middles(n), n, periodic=p) for n, p in zip(sizes, periodic, strict=True)), strict=True
     )
@@ -104,7 +105,7 @@ def scatter_series(
             series = waves.mean(0) * kept
             # a cell holds the average of a wave over its width
             series /= np.multiply.outer(*(np.sinc(np.arange(n) / (2 * n)) for n in cells))
-            return ScatterSeries(series, geometry.shape, geometry.is_full_turn, error, done * len(poses))
+            return ScatterSeries(series, geometry.shape, turning, error, done * len(poses))
         wanted = 2 * done
 
 

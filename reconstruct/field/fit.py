@@ -149,7 +149,12 @@ class Fit:
             "misfit": self.loss if math.isfinite(self.loss) else None,
             "view_updates": self.view_updates,
             **({"held_out": held} if self.best else {}),
+            **({} if math.isfinite(self.loss) or not self.best else {"limitation": self._broke_off}),
         }
+
+    @property
+    def _broke_off(self) -> str:
+        return f"the loss of step {self.adam.steps} is not finite: the volume is that of step {self.best_step}"
 
     def levels(self) -> list[tuple[int, bool]]:
         """Return the resolution of each level, and whether it needs no hash."""

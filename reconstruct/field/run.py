@@ -100,7 +100,8 @@ def run(scan: Scan, settings: Common, make: Callable[[Given], Model], see: "See 
         return Volume(values=torch.zeros(geometry.n_voxel), details=details | {"view_updates": 0})
     model = make(given)
     fit = Fit(model.physics, given.grid, given.data, settings, given.unit)
-    identity = identity_of(scan, msgspec.structs.replace(settings, seconds=math.inf, checkpoints=""))
+    told = msgspec.structs.replace(settings, seconds=math.inf, checkpoints="")
+    identity = identity_of(scan, told, type(settings).__qualname__, type(settings).__module__)
     if (checkpoint := checkpoint_in(settings.checkpoints, identity)) is not None:
         fit.resume(checkpoint, stopwatch)
     fit.go(stopwatch, lambda values: given.grid.volume(model.read(values)[0], geometry), checkpoint)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ctsim.dataset.arrayfile import read_arrays
 from ctsim.dataset.durable import sweep, write_synced
+from ctsim.dataset.versions import code_version
 from ctsim.errors import InputError
 from ctsim.types import Scan
 
@@ -80,11 +81,11 @@ class Checkpoint:
         sweep(self.folder)
 
 
-def identity_of(scan: Scan, settings: object) -> str:
-    """Hash what a fit depends on: the scan and the settings."""
+def identity_of(scan: Scan, settings: object, method: str, module: str) -> str:
+    """Hash what a fit depends on: the scan, the settings, the method's name, and the code of its `module`."""
     digest = hashlib.blake2b(digest_size=16)
-    numbers = (scan.dark, scan.i0, scan.e_max, str(scan.counts.dtype))
-    digest.update(msgspec.json.encode((scan.geometry, numbers, settings)))
-    for array in (scan.counts, scan.flat):
+    numbers = (scan.dark, scan.i0, scan.e_max, scan.floor, str(scan.counts.dtype), scan.metal is None)
+    digest.update(msgspec.json.encode((scan.geometry, numbers, settings, method, code_version(module))))
+    for array in (scan.counts, scan.flat, *([] if scan.metal is None else [scan.metal != 0])):
         digest.update(np.ascontiguousarray(array.numpy()).data)
     return digest.hexdigest()

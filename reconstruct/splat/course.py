@@ -17,7 +17,7 @@ from ctsim.reconstruct.splat.response import Response
 
 EMPTY, AGAIN = 0.05, 0.3
 """Times water: below the first a voxel of the coarser volume is empty; within the shadows it begins at the second."""
-SMALLEST = 24  # voxels along an axis below which there is no coarser level
+SMALLEST, FLATTEST = 24, 8  # voxels along x and y, and along z, below which there is no coarser level
 PASSES, MOST = (3, 9), 6e10
 """Passes over each coarser grid and the finest; fewer, at least one, where all of a grid would meet more voxels."""
 COARSER = 4.0  # times the denoising on a coarser grid
@@ -118,9 +118,13 @@ class Course:
 def levels_of(data: Data, coarse: bool) -> list[Data]:
     """Return the data at each resolution, the coarsest first; at their own alone unless `coarse`."""
     levels = [data]
-    while coarse and min(levels[0].geometry.n_voxel) >= 2 * SMALLEST:
+    while coarse and not _is_coarsest(levels[0].geometry.n_voxel):
         levels.insert(0, coarser(levels[0]))
     return levels
+
+
+def _is_coarsest(n_voxel: tuple[int, int, int]) -> bool:
+    return min(n_voxel[1:]) < 2 * SMALLEST or n_voxel[0] < 2 * FLATTEST
 
 
 def passes_over(levels: list[Data], given: tuple[int, int] | None) -> list[int]:

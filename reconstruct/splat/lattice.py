@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
@@ -89,15 +90,16 @@ class Lattice:
         The gain is ordered as `rfft2` does it. The result is flat, at `index` for each splat, and holds until the next
         call.
         """
-        (n_y, n_x, n_z), size = self._size, self.padded
+        (n_y, n_x, n_z), (wide_y, wide_x), workers = self._size, self.padded, numba.get_num_threads()
         self._volume.fill(0)
         step_cpu.put_tissue(values, u, below, self.index, self._volume.reshape(-1))
         for first in range(0, n_z, SLICES):  # few at a time, whose memory is used again
             slices = self._volume[:, :, first : first + SLICES]
-            spectrum = np.asarray(fft.rfft2(slices, s=size, axes=(0, 1), workers=-1))
+            along_x = fft.rfft(slices, wide_x, axis=1, workers=workers)  # the rows that are there, none of the padding
+            spectrum = np.asarray(fft.fft(along_x, wide_y, axis=0, workers=workers, overwrite_x=True))
             spectrum *= gain[..., None]
-            filtered = np.asarray(fft.irfft2(spectrum, s=size, axes=(0, 1), workers=-1, overwrite_x=True))
-            slices[...] = filtered[:n_y, :n_x]
+            rows = np.asarray(fft.ifft(spectrum, axis=0, workers=workers, overwrite_x=True))[:n_y]
+            slices[...] = np.asarray(fft.irfft(rows, wide_x, axis=1, workers=workers))[:, :n_x]
         return self._volume.reshape(-1)
 
     def _filled(self, values: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -32,17 +32,17 @@ def l1_ssim(p: Image, target: Image, data_range: float, share: float = SSIM_SHAR
 
 
 def total_variation(volume: Image) -> tuple[float, Image]:
-    """Return Σ |differences of neighbours| along z, y and x over the number of voxels, and its gradient."""
-    value, gradient = 0.0, np.zeros_like(volume)
+    """Return the mean |difference of neighbours| along z, y and x, and its gradient; a single voxel has none."""
+    value, count, gradient = 0.0, 0, np.zeros_like(volume)
     for axis in range(3):
         difference = np.diff(volume, axis=axis)
-        value += float(np.abs(difference).sum())
+        value, count = value + float(np.abs(difference).sum()), count + difference.size
         sign = np.sign(difference)
         ahead = tuple(slice(1, None) if k == axis else slice(None) for k in range(3))
         behind = tuple(slice(None, -1) if k == axis else slice(None) for k in range(3))
         gradient[ahead] += sign
         gradient[behind] -= sign
-    return value / volume.size, gradient / volume.size
+    return value / max(count, 1), gradient / max(count, 1)
 
 
 def brick(geometry: Geometry, scene: str, step: int, edge: int = BRICK) -> Geometry:

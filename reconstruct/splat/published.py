@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import few_views
-from ctsim.reconstruct.log import NO_SIGNAL, finite_or_not, is_blind
+from ctsim.reconstruct.log import NO_SIGNAL, finite_or_not, is_blind, line_integrals
 from ctsim.reconstruct.primary import primary
 from ctsim.reconstruct.settings import keywords
 from ctsim.reconstruct.splat.adam import Array
@@ -64,7 +64,8 @@ def fit_published(scan: Scan, settings: Settings) -> Volume:
     if is_blind(scan, clamped):
         details = {"clamped_pixels": clamped, "splats": 0, "view_updates": 0}
         return Volume(values=torch.zeros(scan.geometry.n_voxel), status=Status.ERROR, reason=NO_SIGNAL, details=details)
-    splats = seed_splats(objective.p, scan.geometry, settings, response)
+    seen, _ = line_integrals(scan, slice(None))  # clamped readings as dark as they are: as 0 metal would have no seeds
+    splats = seed_splats(seen.numpy(), scan.geometry, settings, response)
     if not len(splats):
         reason = f"no voxel of the FDK volume is above {LEAST_VALUE:g} 1/mm, so there is no splat to fit"
         details = {"clamped_pixels": clamped, "splats": 0, "view_updates": 0, "limitation": reason}
@@ -82,7 +83,9 @@ def fit_published(scan: Scan, settings: Settings) -> Volume:
 
 def _identity(scan: Scan, settings: Settings) -> str:
     """Hash what the state of a run depends on, which its end, its read-out and where it is kept are not."""
-    return identity_of(scan, msgspec.structs.replace(settings, seconds=math.inf, readout=None, checkpoints=""))
+    return identity_of(
+        scan, msgspec.structs.replace(settings, seconds=math.inf, readout=None, checkpoints=""), "published", __name__
+    )
 
 
 class _Run:

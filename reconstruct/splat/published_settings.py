@@ -78,6 +78,12 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
         if self.response == "flat" and self.theta is not None:
             raise InputError(f"theta: expected null with response flat, which has none, got {self.theta}")
         refuse_beam(self.response, self.tube, self.detector)
+        if self.basis == "constant":
+            for name, given in (("theta", self.theta), ("readout", self.readout)):
+                if given is not None:
+                    raise InputError(
+                        f"{name}: expected null with basis constant, whose splats know no energy, got {given!r}"
+                    )
 
     @property
     def channels(self) -> str:

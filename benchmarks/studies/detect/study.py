@@ -11,7 +11,7 @@ from ctsim.benchmarks.scores.observer import LEAST
 from ctsim.benchmarks.studies.detect import DEFAULT, PAIRS, Flags, tables
 from ctsim.benchmarks.studies.detect.records import Pair
 from ctsim.benchmarks.studies.detect.suite import load, named
-from ctsim.benchmarks.versions import code_version
+from ctsim.dataset.versions import code_version
 from ctsim.errors import InputError
 
 MEASURE = "ctsim.benchmarks.studies.detect.measure"  # by name: it loads torch

@@ -33,6 +33,7 @@ from ctsim.benchmarks.studies.methods.volumes import Intermediates, attached, re
 from ctsim.dataset.store import StoredScan
 from ctsim.dataset.truth import ScanWithTruth
 from ctsim.errors import InputError
+from ctsim.reconstruct.watch import resumed
 from ctsim.simulate import REFERENCE_KEV
 from ctsim.types import Scan, Status, Volume
 
@@ -122,17 +123,18 @@ def describe(error: BaseException) -> str:
 def attempt(method: Method, scan: Scan, warm_up_seconds: float) -> Outcome:
     """Run a method in this process and return its outcome; of all exceptions only Ctrl-C is passed on."""
     outcome, usage, view_updates = Outcome(status="error"), None, None if method.program else 0
-    earlier = 0.0
+    earlier: list[
+        float
+    ] = []  # seconds before this part of a fit that went on from a checkpoint, also of one that fails
     try:
         with restored():
-            with measured() as usage:
+            with resumed() as earlier, measured() as usage:
                 volume = method.reconstruct(scan)
             check_volume(volume)
             if method.program:  # without the time for its copy of the scan
                 usage = volume.details[USAGE]
             else:
                 view_updates = int(volume.details.get("view_updates", scan.geometry.n_views))
-                earlier = float(volume.details.get("earlier_seconds", 0.0))  # of a fit that went on from a checkpoint
             outcome.status, outcome.reason = str(volume.status), volume.reason
             outcome.values = array_of(volume.values)
             outcome.intermediates = attached(volume.details, scan.geometry)
@@ -144,9 +146,10 @@ def attempt(method: Method, scan: Scan, warm_up_seconds: float) -> Outcome:
     except BaseException as error:  # a method's failure is a result
         log.debug("method %s failed", method.name, exc_info=error)
         outcome = _failure(error)
+        usage = getattr(error, USAGE, None) or usage
     assert usage is not None
     outcome.cost = Cost(
-        wall=usage.wall + earlier,
+        wall=usage.wall + sum(earlier),
         cpu=None if earlier else usage.cpu,
         peak_bytes=usage.peak_bytes,
         view_updates=view_updates,

@@ -74,8 +74,17 @@ def repetition(stored: StoredScan) -> tuple[str, int]:
 
 
 def jobs(scans: Sequence[StoredScan], chosen: Sequence[Method], *, anchor: bool) -> list[Job]:
-    """List every run: all methods on all scans; with `anchor` each first on the metal-free twin, if there is one."""
-    found = []
+    """List every run: all methods on all scans; with `anchor` each first on the metal-free twin, if there is one.
+
+    Raises InputError for two scans that would be one row: NAME, whose own seed is 1, and NAME-s1.
+    """
+    found, folders = [], dict[tuple[str, int], Path]()
+    for stored in scans:
+        if (first := folders.setdefault(repetition(stored), stored.folder)) != stored.folder:
+            raise InputError(
+                f"{first} and {stored.folder} are the same scene and seed, so a table cannot hold both; "
+                "choose one with --scene, or move one to another data folder"
+            )
     for i, stored in enumerate(scans):
         variants = (TWIN, METAL) if anchor and stored.metal_free is not None else (METAL,)
         found += jobs_on(stored, variants, [(method, (i, k)) for k, method in enumerate(chosen)])

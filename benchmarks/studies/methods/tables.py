@@ -44,6 +44,9 @@ ALL = (MAIN_TABLE, *COLUMNS)
 Key = tuple[str, str, str, str, str, str]
 """Scene, variant, method, inputs, protocol and metric; a run without any number has protocol and metric ""."""
 
+Place = tuple[str, tuple[str, str], str]
+"""Scene, row and metric; a row is its inputs and its method."""
+
 Number = tuple[float | None, float | None, int, str, str, bool]
 """Mean, std (ddof 1, of two seeds and more) and n over the seeds that have the metric; status; which of the method's
 volumes was scored; whether no seed has it because the volumes are the reference itself."""
@@ -160,10 +163,10 @@ def tables(records: Sequence[RunRecord], protocols: Collection[str] = ALL) -> li
 
 def _tables(shown: Sequence[RunRecord], found: Numbers, protocols: Collection[str] = ALL) -> list[Table]:
     own = [r for r in shown if r.run.variant == METAL]
-    chosen: dict[str, dict[tuple[str, str, str], Number]] = {}
-    for (scene, variant, method, _, protocol, metric), number in found.items():
+    chosen: dict[str, dict[Place, Number]] = {}
+    for (scene, variant, method, inputs, protocol, metric), number in found.items():
         if variant == METAL:
-            chosen.setdefault(protocol, {})[scene, method, metric] = number
+            chosen.setdefault(protocol, {})[scene, (inputs, method), metric] = number
     made = _main(shown, chosen, own) if MAIN_TABLE in protocols else []
     for protocol in (p for p in protocols if p in chosen):
         columns, rows = _grid(chosen[protocol], protocol, own)
@@ -183,16 +186,14 @@ def _tables(shown: Sequence[RunRecord], found: Numbers, protocols: Collection[st
     return made
 
 
-def _main(
-    shown: Sequence[RunRecord], chosen: dict[str, dict[tuple[str, str, str], Number]], own: Sequence[RunRecord]
-) -> list[Table]:
+def _main(shown: Sequence[RunRecord], chosen: dict[str, dict[Place, Number]], own: Sequence[RunRecord]) -> list[Table]:
     """Return the main tables: one for each scene, and their mean, of what matters most from several protocols."""
     there = {(protocol, metric) for protocol, group in chosen.items() for _, _, metric in group}
     metrics = {f"{p}/{m}": how for (p, m), how in main_columns(shown).items() if (p, m) in there}
     picked = {
-        (scene, method, f"{protocol}/{metric}"): number
+        (scene, row, f"{protocol}/{metric}"): number
         for protocol, group in chosen.items()
-        for (scene, method, metric), number in group.items()
+        for (scene, row, metric), number in group.items()
         if f"{protocol}/{metric}" in metrics
     }
     if not metrics:
@@ -217,15 +218,15 @@ def _main(
 
 
 def _grid(
-    chosen: dict[tuple[str, str, str], Number], protocol: str, own: Sequence[RunRecord]
+    chosen: dict[Place, Number], protocol: str, own: Sequence[RunRecord]
 ) -> tuple[list[Column], list[list[Cell]]]:
-    """Return the columns and rows of a protocol's table; `chosen` are its numbers by scene, method and metric."""
+    """Return the columns and rows of a protocol's table; `chosen` are its numbers by scene, row and metric."""
     there = {metric for _, _, metric in chosen}
     return _grid_of(chosen, {m: how for m, how in COLUMNS[protocol].items() if m in there}, own, protocol)
 
 
 def _grid_of(
-    chosen: dict[tuple[str, str, str], Number],
+    chosen: dict[Place, Number],
     metrics: dict[str, Metric],
     own: Sequence[RunRecord],
     protocol: str = MAIN_TABLE,
@@ -233,15 +234,15 @@ def _grid_of(
     """Return columns and rows of a table with all scenes side by side, then their mean."""
     scenes = list(dict.fromkeys(r.run.scene for r in own))
     groups = [*scenes, *["mean"] * (len(scenes) > 1), *["harm rate"] * (protocol == "anchored")]
-    failed = {(r.run.scene, r.label): r.status for r in own if r.status != OK}
+    failed = {(r.run.scene, (r.inputs, r.label)): r.status for r in own if r.status != OK}
     rows = []
-    for inputs, method in dict.fromkeys((r.inputs, r.label) for r in own):
+    for row in dict.fromkeys((r.inputs, r.label) for r in own):
         cells = []
         for scene in scenes:
             for metric, how in metrics.items():
-                cell = _cell(chosen.get((scene, method, metric)), metric, how)
-                if (scene, method) in failed:
-                    status = failed[scene, method]
+                cell = _cell(chosen.get((scene, row, metric)), metric, how)
+                if (scene, row) in failed:
+                    status = failed[scene, row]
                     cell = Cell(status if cell.number is None or protocol == "cost" else f"{cell.text} ({status})")
                 cells.append(cell)
         more: list[Cell] = []
@@ -250,7 +251,7 @@ def _grid_of(
         if protocol == "anchored":
             shares = (harm([c.number for c in cells[k :: len(metrics)]]) for k in range(len(metrics)))
             more += [Cell(text, share) for share, text in shares]
-        rows.append([Cell(inputs), Cell(daggered(method)), *cells, *more])
+        rows.append([Cell(row[0]), Cell(daggered(row[1])), *cells, *more])
     rows.sort(key=lambda row: row[0].text)
     heads = [Column(how.title, group, True, how.better) for group in groups for how in metrics.values()]
     return [*STUBS, *heads], rows

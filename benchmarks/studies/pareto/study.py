@@ -23,9 +23,9 @@ from ctsim.benchmarks.studies.methods import run
 from ctsim.benchmarks.studies.pareto import Flags, results, suite
 from ctsim.benchmarks.studies.pareto.finding import Part, Timed, TimedRun, points
 from ctsim.benchmarks.studies.pareto.suite import Choice, Effort
-from ctsim.benchmarks.versions import code_version
 from ctsim.dataset.folder import is_complete
 from ctsim.dataset.manifest import read_manifest
+from ctsim.dataset.versions import code_version
 from ctsim.errors import InputError
 from ctsim.human import human_choice
 from ctsim.phantoms.dataset import make_scene

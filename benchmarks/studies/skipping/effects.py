@@ -28,7 +28,8 @@ def scatter(setup: Bench) -> Iterator[Pair]:
     choice: dict[str, Any] = {"limit": None, "stated": "a choice"}
     yield setup.pair("scatter at level 0, which leaves it out", plain, scattering, note=note, **choice)
     scene = setup.scene()
-    coarse = msgspec.structs.replace(scene.simulation, scatter_error=COARSE)
+    error = max(COARSE, scene.simulation.scatter_error)
+    coarse = msgspec.structs.replace(scene.simulation, scatter_error=error)
     scene = msgspec.structs.replace(scene, simulation=coarse)
     for grid, what in ((None, ""), (10.0, " and an anti-scatter grid")):
         followed = setup.planned(scene, scatter=Scatter(level=3, grid_ratio=grid))
@@ -38,7 +39,7 @@ def scatter(setup: Bench) -> Iterator[Pair]:
             skipping=setup.first_views(plain),
             whole=setup.first_views(followed),
             difference=partial(image_difference, names=P_IMAGES),
-            note=f"to {COARSE:.0%}; the time goes with the inverse square of simulation.scatter_error",
+            note=f"to {error:.0%}; the time goes with the inverse square of simulation.scatter_error",
             **choice,
         )
 

@@ -18,7 +18,7 @@ from ctsim.benchmarks.engine.table import Table, simple
 from ctsim.benchmarks.methods import CONTROLS, TABLE, Method, find
 from ctsim.benchmarks.studies.stress import Flags, suite
 from ctsim.benchmarks.studies.stress.suite import Scene, load
-from ctsim.benchmarks.versions import code_version
+from ctsim.dataset.versions import code_version
 from ctsim.errors import InputError
 from ctsim.human import human_choice
 

@@ -82,7 +82,33 @@ def open_naf(path: Path, stated: Stated) -> ScanFile:
     ]
     if any(stack.shape[1:] != shape for _, stack in stacks):
         raise InputError(f"{path} has views of several shapes")
-    return _scan(path, found, views[0], views[1] if len(views) > 1 else [], (int(shape[0]), int(shape[1])))
+    n_detector = (int(shape[0]), int(shape[1]))
+    return _scan(path, _rows_first(path, found, n_detector), views[0], views[1] if len(views) > 1 else [], n_detector)
+
+
+def _rows_first(path: Path, scanner: dict[str, Any], shape: tuple[int, int]) -> dict[str, Any]:
+    """Return a pickle's settings with those of the detector in TIGRE's order (v, u), v upwards.
+
+    NAF's rays take them as (u, v), v downwards, its generator as TIGRE does. The number of pixels tells which it is.
+    Raises InputError where that is the same both ways and the pixel or the offset is not.
+    """
+    keys = [key for key in ("dDetector", "sDetector", "offDetector") if key in scanner]
+    counts = _numbers(path, scanner, "nDetector", 2, whole=True) if "nDetector" in scanner else shape
+    turned = {key: _numbers(path, scanner, key, 2)[::-1] for key in keys}
+    if "offDetector" in turned:
+        turned["offDetector"] = (-turned["offDetector"][0], turned["offDetector"][1])
+    if counts == shape and shape[0] != shape[1]:
+        return scanner
+    if counts == shape[::-1] and shape[0] != shape[1]:
+        return scanner | turned
+    if counts != shape:
+        raise InputError(f"{path} has the nDetector {counts} and views of {shape} pixels")
+    if unlike := [key for key in keys if not np.array_equal(turned[key], _numbers(path, scanner, key, 2))]:
+        raise InputError(
+            f"{path} has the {unlike[0]} {quoted(str(scanner[unlike[0]]))} on a square detector, where (u, v) and "
+            "(v, u) cannot be told apart; expected equal numbers, and no offset"
+        )
+    return scanner
 
 
 def _stack(path: Path, part: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[Any]]:

@@ -35,9 +35,11 @@ def open_field(read: Callable[[int], NDArray[Any]], n_views: int, dark: float, l
     """
     strips, brightest = [], 0.0
     for view in few_views(n_views, SAMPLED):
-        pair = [_strips(read(k)) - dark for k in (int(view), min(int(view) + 1, n_views - 1))]
+        view = int(view)
+        beside = view + 1 if view + 1 < n_views else max(view - 1, 0)
+        pair = [_strips(read(k)) - dark for k in (view, beside)]
         strips.append((pair, [float(np.median(side)) for side in pair[0]]))
-        brightest = max(brightest, float(np.percentile(read(int(view)), BRIGHT)) - dark)
+        brightest = max(brightest, float(np.percentile(read(view), BRIGHT)) - dark)
     levels = np.array([found for _, found in strips])
     bar = OPEN * max(float(levels.max()), brightest) if level is None else OPEN * level
     is_open = levels >= bar
@@ -50,6 +52,7 @@ def open_field(read: Callable[[int], NDArray[Any]], n_views: int, dark: float, l
         _MAD * float(np.median(np.abs(pair[1][side] - pair[0][side]))) / math.sqrt(2)
         for (pair, _), sides in zip(strips, is_open, strict=True)
         for side in np.flatnonzero(sides)
+        if n_views > 1
     ]
     spread = float(np.median(noise)) if noise else 0.0
     return OpenField(level=level, photons=(level / spread) ** 2 if spread > 0 and level > 0 else None, note=note)

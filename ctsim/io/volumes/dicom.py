@@ -83,6 +83,8 @@ def open_volume(path: Path) -> VolumeFile:
     slope, intercept = shared["RescaleSlope"], shared["RescaleIntercept"]
     if slope and slope[0] <= 0:
         raise InputError(f"{first.path} has RescaleSlope = {slope[0]:g}, expected a positive number")
+    if intercept and not slope:
+        raise InputError(f"{first.path} has RescaleIntercept = {intercept[0]:g} and no RescaleSlope, expected both")
     axes = _axes(path, slices, along)
 
     def read() -> NDArray[Any]:

@@ -169,6 +169,16 @@ def _weighted(values, bounds, table):
         table[SECOND, k] = values[bounds[0] + k, 1] * table[PEAKS, k]
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _filled(values, first, last):
+    """Return the part of a run between its outermost splats that are not 0: a body's air costs nothing."""
+    while first < last and values[first, 0] == 0 and values[first, 1] == 0:
+        first += 1
+    while last > first and values[last - 1, 0] == 0 and values[last - 1, 1] == 0:
+        last -= 1
+    return first, last
+
+
 @compiled_once(RUNS_TYPE, "float32[:,::1]", "float64", "float64[::1]", "float32[:,::1]")
 def _forward_view(runs, values, scale, camera, image):
     xy, starts, z, tallest = runs
@@ -176,7 +186,9 @@ def _forward_view(runs, values, scale, camera, image):
     place, least, zero = np.empty(PLACE), _least(camera), spread(np.float32(0))
     table, gains = np.empty((5, tallest + WIDTH), np.float32), np.empty((1, n_u + WIDTH), np.float32)
     for run in range(xy.shape[0]):
-        bounds = (starts[run], starts[run + 1])
+        bounds = _filled(values, starts[run], starts[run + 1])
+        if bounds[0] == bounds[1]:
+            continue
         left, right, low, high, reach = _window(xy[run], scale, camera, z, bounds, (n_v, n_u), place)
         if left >= right:
             continue
