@@ -21,6 +21,7 @@ from test_record import places
 
 from ctsim.benchmarks import cli
 from ctsim.benchmarks.engine import host, study
+from ctsim.benchmarks.engine.process import Lost
 from ctsim.benchmarks.studies.methods import run as methods_run
 from ctsim.benchmarks.studies.pareto import finding as pareto_finding
 from ctsim.benchmarks.studies.pareto import measure as pareto_measure
@@ -555,10 +556,25 @@ def test_a_cluster_finds_the_same_also_within_a_limit(tiny, tmp_path, capsys):
 def test_a_task_whose_worker_dies_each_time_is_a_row(tiny, tmp_path, capsys):
     assert tiny(tmp_path, "dies good", "--workers", "2") == 1
     assert sorted(found(tmp_path)) == [
-        ("dies", "error", "its process died 3 times, the last time with signal SIGKILL"),
+        ("dies", "out_of_memory", "its process died 3 times, the last time with signal SIGKILL"),
         ("good", "ok", ""),
     ]
     assert log(tmp_path).count("dies") == 3
+
+
+def test_of_a_group_whose_worker_dies_each_task_is_tried_by_itself(tmp_path):
+    class Deadly:
+        workers = 2
+
+        def answers(self, function, jobs):
+            for n, group in enumerate(jobs):
+                yield n, Lost("it died") if any(task.case == "dies" for task in group) else function(group)
+
+    given = tiny_study.Flags(results=tmp_path, repeats=1)
+    groups = [tuple(tiny_study.Task(study="tiny", case=case) for case in cases) for cases in (("good", "dies"), ("x",))]
+    found = list(study._round(TINY(), groups, given, Deadly()))
+    ends = {r.task.case: (r.found[0].status, r.found[0].reason) for r in found}
+    assert len(found) == 3 and ends == {"good": ("ok", ""), "x": ("ok", ""), "dies": ("error", "it died")}
 
 
 @pytest.mark.slow

@@ -238,8 +238,22 @@ def test_dead_pixels_are_left_out_by_weight_0(monkeypatch):
     everywhere(monkeypatch, "weighted", lambda g, p, valid, *s: weighed(g, p, np.ones_like(valid), *s))
     everywhere(monkeypatch, "weights_and_bounds", lambda scan, p, valid, *s: told(scan, p, np.ones_like(valid), *s))
     everywhere(monkeypatch, "doubt_edges", lambda *given: None)  # it takes a dead pixel for an edge: 0.13
-    # 0.11 and 0.40: what is carved away scores as an empty volume does
-    assert masked < 0.2 < 2 * masked < error(given)
+    filled = error(given)
+    monkeypatch.setattr(log.Filling, "of", lambda dead: None)
+    # 0.11, 0.13 and 0.40: what is carved away scores as an empty volume does
+    assert masked < filled < 0.2 < 2 * masked < error(given)
+
+
+@pytest.mark.slow
+def test_dead_pixels_are_interpolated_for_methods_without_weights(monkeypatch):
+    given, bare = scan_of(noise=Noise(dead_fraction=0.02)), scan_of(noise=Noise())
+    found = {name: [given.error(find(name).reconstruct(given.scan).values.numpy())] for name in ("fdk", "sirt")}
+    whole = {name: bare.error(find(name).reconstruct(bare.scan).values.numpy()) for name in found}
+    monkeypatch.setattr(log.Filling, "of", lambda dead: None)
+    for name, errors in found.items():
+        errors.append(given.error(find(name).reconstruct(given.scan).values.numpy()))
+        lost = errors[1] - whole[name]  # the grid of 12 voxels makes most of either error
+        assert lost > 0.05 * whole[name] and abs(errors[0] - whole[name]) < 0.2 * lost, (name, errors, whole)
 
 
 @pytest.mark.slow

@@ -252,9 +252,10 @@ def _follow_parent(pipe: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """The answer to a job whose process died each time."""
+    """The answer to a job whose process died each time; `status` is that of a record."""
 
     reason: str
+    status: str = "error"
 
 
 class Jobs(Protocol):
@@ -324,6 +325,7 @@ class Pool:
                     if deaths[number] < TRIES:
                         waiting.appendleft(number)
                         continue
-                    how = how_it_ended(end.exit_code or 0)
-                    answer = Lost(f"its process died {TRIES} times, the last time with {how}")
+                    how, killed = how_it_ended(end.exit_code or 0), end.exit_code == -signal.SIGKILL
+                    status = "out_of_memory" if killed else "error"  # as the system does when memory is short
+                    answer = Lost(f"its process died {TRIES} times, the last time with {how}", status)
                 yield number, answer

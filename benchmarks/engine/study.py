@@ -309,16 +309,27 @@ def _records(study: Study[R, G], groups: Sequence[tuple[Task, ...]], given: G, j
         return
     for of_round in _rounds(groups):
         left = (tuple(task for task in group if task.identity not in failed) for group in of_round)
-        parts = [part for part in left if part]
-        for answer in jobs.answers(functools.partial(_measure_group, study, given), parts):
-            if answer is None:
-                continue
-            number, found = answer
-            if isinstance(found, Lost):
-                lost = study.kind(ok=False, status="error", reason=found.reason)
-                found = [record_of(study, task, [lost]) for task in parts[number]]
-            failed |= {record.task.identity for record in found if not record.finished}
+        for record in _round(study, [part for part in left if part], given, jobs):
+            failed |= set() if record.finished else {record.task.identity}
+            yield record
+
+
+def _round(study: Study[R, G], parts: Sequence[tuple[Task, ...]], given: G, jobs: Jobs) -> Iterator[R]:
+    """Measure groups that do not wait for each other; of one whose process dies, each task is tried by itself."""
+    again: list[tuple[Task, ...]] = []
+    for answer in jobs.answers(functools.partial(_measure_group, study, given), parts):
+        if answer is None:
+            continue
+        number, found = answer
+        if not isinstance(found, Lost):
             yield from found
+        elif len(parts[number]) > 1:
+            again += [(task,) for task in parts[number]]
+        else:
+            lost = study.kind(ok=False, status=found.status, reason=found.reason)
+            yield from (record_of(study, task, [lost]) for task in parts[number])
+    if again:
+        yield from _round(study, again, given, jobs)
 
 
 def _rounds(groups: Sequence[tuple[Task, ...]]) -> list[list[tuple[Task, ...]]]:

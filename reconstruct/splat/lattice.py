@@ -90,16 +90,17 @@ class Lattice:
         The gain is ordered as `rfft2` does it. The result is flat, at `index` for each splat, and holds until the next
         call.
         """
-        (n_y, n_x, n_z), (wide_y, wide_x), workers = self._size, self.padded, numba.get_num_threads()
+        (n_y, _, n_z), (wide_y, wide_x), workers = self._size, self.padded, numba.get_num_threads()
         self._volume.fill(0)
         step_cpu.put_tissue(values, u, below, self.index, self._volume.reshape(-1))
         for first in range(0, n_z, SLICES):  # few at a time, whose memory is used again
             slices = self._volume[:, :, first : first + SLICES]
             along_x = fft.rfft(slices, wide_x, axis=1, workers=workers)  # the rows that are there, none of the padding
             spectrum = np.asarray(fft.fft(along_x, wide_y, axis=0, workers=workers, overwrite_x=True))
-            spectrum *= gain[..., None]
+            step_cpu.damp(spectrum, gain)
             rows = np.asarray(fft.ifft(spectrum, axis=0, workers=workers, overwrite_x=True))[:n_y]
-            slices[...] = np.asarray(fft.irfft(rows, wide_x, axis=1, workers=workers))[:, :n_x]
+            filtered = np.asarray(fft.irfft(rows, wide_x, axis=1, workers=workers))
+            step_cpu.put_slices(filtered, first, self._volume)
         return self._volume.reshape(-1)
 
     def _filled(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
