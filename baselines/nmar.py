@@ -103,9 +103,9 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     if settings.prior in FITTED:
         choice = fitted_prior(trace, metal, scan, settings.prior)
     else:
-        choice = choose_prior(trace, metal, first.values, settings, settings.prior, settings.interpolation)
-    if choice is None:
-        return uncorrected(first, metal, NO_BODY)
+        choice = choose_prior(trace, metal, first.values, settings, settings.prior, settings.interpolation) or NO_BODY
+    if isinstance(choice, str):
+        return uncorrected(first, metal, choice)
     rule = Normalise(kind=settings.normalisation, floor=settings.floor)
     bridge = functools.partial(rule.fill, largest=choice.largest, how=settings.interpolation)
     values, filled = normalised(trace, first.values, choice.columns, bridge, settings)

@@ -88,17 +88,18 @@ def choose_prior(
     return Choice(name=name, columns=columns, misfit=misfit, largest=largest, water=water)
 
 
-def fitted_prior(trace: Trace, metal: Metal, scan: Scan, name: str) -> Choice | None:
-    """Return a fitted volume with water in place of the metal and of what lies next to it; None where all is air.
+def fitted_prior(trace: Trace, metal: Metal, scan: Scan, name: str) -> Choice | str:
+    """Return a fitted volume with water in place of the metal and of what lies next to it, or why there is none.
 
     No tissue classes are made of it. Lee et al., Med. Phys. 52, 2025, doi:10.1002/mp.17859, take a neural field so.
     """
     volume = FITTED[name](scan)
+    if volume.status is not Status.OK:
+        return f"the prior, {name}, ended as {volume.status}: {volume.reason}"
     values, inside = volume.values.numpy().copy(), dilate(metal.mask, SKIN, corners=True)
     values[inside] = 0
-    water = water_value(values) if volume.status is Status.OK else 0.0
-    if water <= 0:
-        return None
+    if (water := water_value(values)) <= 0:
+        return NO_BODY
     values[inside] = water
     columns = np.ascontiguousarray(np.maximum(values, 0).transpose(1, 2, 0))
     misfit, largest = _misfit(trace, columns)

@@ -251,8 +251,12 @@ def test_a_fitted_prior_has_water_for_metal_and_comes_closer_to_the_twin(iron, m
     given, water = details["intermediates"]["prior"], details["water_per_mm"]
     skin = dilate(scan.metal.numpy() > 0, 1, corners=True)
     assert (given[skin] == np.float32(water)).all() and np.array_equal(given[~skin], twin.values.numpy().clip(0)[~skin])
-    monkeypatch.setitem(prior.FITTED, "splat", lambda _: dataclasses.replace(fitted, status=Status.ERROR))
-    assert torch.equal(nmar.reconstruct(scan, prior="splat").values, fdk(scan).values)
+    for status in (Status.ERROR, Status.DIVERGED):
+        ended = dataclasses.replace(fitted, status=status, reason="it ran away")
+        monkeypatch.setitem(prior.FITTED, "splat", lambda _, ended=ended: ended)
+        volume = nmar.reconstruct(scan, prior="splat")
+        assert torch.equal(volume.values, fdk(scan).values)
+        assert f"the prior, splat, ended as {status}: it ran away" in volume.details["uncorrected_reason"]
 
 
 @pytest.mark.parametrize(
