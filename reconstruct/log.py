@@ -70,8 +70,9 @@ class LineIntegrals:
         else:
             dark, floor = np.float32(self.scan.dark), np.float32(self.floor)
             take_log(np.asarray(stack, np.float32), dark, floor, self._log_open, self._dead, p, clamped)
-        for image in p if self._filling is not None else ():
-            self._filling.fill(image)
+        if (filling := self._filling) is not None:
+            for image in p:
+                filling.fill(image)
         return p.reshape(counts.shape), clamped.reshape(counts.shape)
 
 

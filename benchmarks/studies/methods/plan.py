@@ -78,16 +78,17 @@ def jobs(scans: Sequence[StoredScan], chosen: Sequence[Method], *, anchor: bool)
 
     Raises InputError for two scans that would be one row: NAME, whose own seed is 1, and NAME-s1.
     """
-    found, folders = [], dict[tuple[str, int], Path]()
-    for stored in scans:
-        if (first := folders.setdefault(repetition(stored), stored.folder)) != stored.folder:
-            raise InputError(
-                f"{first} and {stored.folder} are the same scene and seed, so a table cannot hold both; "
-                "choose one with --scene, or move one to another data folder"
-            )
+    found: list[Job] = []
     for i, stored in enumerate(scans):
         variants = (TWIN, METAL) if anchor and stored.metal_free is not None else (METAL,)
         found += jobs_on(stored, variants, [(method, (i, k)) for k, method in enumerate(chosen)])
+    first: dict[tuple[str, int], StoredScan] = {}
+    for job in found:
+        if (other := first.setdefault((job.scene, job.seed), job.stored)) is not job.stored:
+            raise InputError(
+                f"{other.folder} and {job.stored.folder} are the same scene and seed, so a table cannot hold both; "
+                "choose one with --scene, or move one to another data folder"
+            )
     return found
 
 
