@@ -54,7 +54,7 @@ def signal_scan() -> Scan:
 def test_photons_are_told_by_two_different_views(n_views):
     images = np.random.default_rng(1).poisson(1e4, (n_views, 64, 80)).astype(np.float32)
     found = open_field(lambda view: images[view], n_views, 0.0)
-    # two strips of 64 x 2 pixels and more: the median deviation of their differences is right to a tenth
+    # strips of 64 x 2 pixels and more tell a deviation to a tenth, and photons, by its square, to a quarter
     assert found.photons == pytest.approx(1e4, rel=0.25) and not found.note
     images[:-1] /= 3  # a body that covers the sides in all views but the last
     found = open_field(lambda view: images[view], n_views, 0.0)
