@@ -3,10 +3,9 @@
 Line integrals of a wrong response are those of no object: views contradict each other wherever dense and thin paths
 cross, and no fit explains them all. What a coarse fit leaves unexplained is averaged over neighbouring rays, whose
 noise and missed edges cancel, while the error of the response does not: it changes slowly. Rays through metal are left
-out, since what its shape leaves is larger. The misfit falls steeply up to the right filtration, and then hardly
-changes: beams that are nearly monochromatic all look alike. Scatter and blur, which the response does not know, move
-the least misfit beyond it. So the value is the one nearest to the usual filtration that explains the scan nearly as
-well as the best.
+out, since what its shape leaves is larger; they are the same rays for all filtrations. The misfit falls steeply up to
+the right filtration, and then changes less: beams that are nearly monochromatic all look alike. So the value is the
+one nearest to the usual filtration that explains the scan about as well as the best.
 
 Consistency of the data is what other calibrations of a beam without a phantom use, too (Würfl et al., Epipolar
 consistency beam hardening, Med. Phys. 44, 2017).
@@ -18,14 +17,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.interpolate import CubicSpline
 
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import FILTER
 
 USUAL = 0.5  # mm of aluminium, from which the search starts
 TRIED = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 14.0, 20.0)
-AS_GOOD = 1.05  # times the least misfit: better is not told from it, as materials and spectra are not those assumed
+AS_GOOD, PLAUSIBLE = 1.005, 1.05
+"""Times the least misfit: up to the first, the usual filtration is preferred; up to the second, a filtration is not
+excluded, as materials, scatter and spectra are not those assumed."""
 WIDTH = 1 / 16  # σ of the averages, in widths of the panel
 MET, DARK = 0.15, 3.0
 """P of rays that count: below they graze the object, above scatter and lacking photons make more than the beam does."""
@@ -37,7 +40,7 @@ FEWEST = 1000  # averages, below which there is no misfit
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Filtration:
-    """The filtration (mm of aluminium), the least and the greatest that explain the scan as well, and all misfits.
+    """The filtration (mm of aluminium), the least and the greatest that explain the scan nearly as well, all misfits.
 
     `misfits` are the root mean squares of P by the filtration tried, empty where the scan shows too little.
     """
@@ -68,51 +71,52 @@ class Filtration:
 
 def found(fit_of: Callable[[float], Fit | None]) -> Filtration:
     """Search the filtration that a scan shows; `fit_of` returns the coarse fit at a filtration, None for nothing."""
-    start = TRIED.index(USUAL)
-    misfits: dict[float, float] = {}
+    usual, start = fit_of(USUAL), TRIED.index(USUAL)
+    if usual is None or not math.isfinite(least := misfit(usual, rays := rays_of(usual))):
+        return Filtration(value=USUAL, low=FILTER[0], high=FILTER[2], misfits={})
+    misfits = {USUAL: least}
 
     def misfit_at(k: int) -> float:
         if (value := TRIED[k]) not in misfits:
             fit = fit_of(value)
-            found_there = math.inf if fit is None else misfit(fit)
-            misfits[value] = found_there if math.isfinite(found_there) else math.inf
+            misfits[value] = math.inf if fit is None else misfit(fit, rays)
         return misfits[value]
 
-    if not math.isfinite(misfit_at(start)):
-        return Filtration(value=USUAL, low=FILTER[0], high=FILTER[2], misfits={})
     for way in (1, -1):
         k = start
         # one more than where it stops falling, since a step of the search is not all that it varies by
-        while 0 <= k + way < len(TRIED) and misfit_at(k) <= AS_GOOD * min(misfits.values()):
+        while 0 <= k + way < len(TRIED) and misfit_at(k) <= PLAUSIBLE * min(misfits.values()):
             k += way
             misfit_at(k)
     return _chosen({t: value for t, value in sorted(misfits.items()) if math.isfinite(value)})
 
 
 def _chosen(misfits: dict[float, float]) -> Filtration:
-    """Choose among the misfits, between which they are taken as straight lines over the logarithm."""
-    tried, values = np.log(list(misfits)), np.array(list(misfits.values()))
-    limit = AS_GOOD * values.min()
-    fine = np.linspace(tried[0], tried[-1], 2001)
-    good = fine[np.interp(fine, tried, values) <= limit]
-    nearest = good[np.argmin(np.abs(good - math.log(USUAL)))]
-    value = USUAL if misfits[USUAL] <= limit else float(np.exp(nearest))
-    return Filtration(
-        value=round(value, 3), low=round(math.exp(good[0]), 3), high=round(math.exp(good[-1]), 3), misfits=misfits
-    )
+    """Choose on a spline through the misfits, both axes logarithmic."""
+    tried, values, usual = np.log(list(misfits)), np.log(list(misfits.values())), math.log(USUAL)
+    fine = np.sort([*np.linspace(tried[0], tried[-1], 2001), usual])
+    curve = CubicSpline(tried, values)(fine) if len(tried) > 1 else np.full_like(fine, values[0])
+    good, plausible = (fine[curve - curve.min() <= math.log(limit)] for limit in (AS_GOOD, PLAUSIBLE))
+    chosen = (good[np.argmin(np.abs(good - usual))], plausible[0], plausible[-1])
+    value, low, high = (round(math.exp(t), 3) for t in chosen)
+    return Filtration(value=value, low=low, high=high, misfits=misfits)
 
 
-def misfit(fit: Fit) -> float:
-    """Return the root mean square of locally averaged p − P, over rays that meet the object and no metal."""
+def rays_of(fit: Fit) -> NDArray[np.bool_]:
+    """Return which readings [view, v, u] tell the beam: those of rays that meet the object and no metal."""
     views = np.arange(fit.data.geometry.n_views)
-    p = fit.fitted(views)
-    metal = fit.shadow(views, METAL * fit.curve.water)
-    counts = (fit.data.weights > 0) & (p > MET) & (p < DARK) & (metal < FAINT)
+    p, metal = fit.fitted(views), fit.shadow(views, METAL * fit.curve.water)
+    return (fit.data.weights > 0) & (p > MET) & (p < DARK) & (metal < FAINT)
+
+
+def misfit(fit: Fit, rays: NDArray[np.bool_]) -> float:
+    """Return the root mean square of locally averaged p − P over `rays` [view, v, u], infinite for too few."""
+    left = fit.data.p - fit.fitted(np.arange(fit.data.geometry.n_views))
     sigma = (0, *[WIDTH * fit.data.geometry.n_detector[1]] * 2)
-    share = ndimage.gaussian_filter(counts.astype(np.float32), sigma)
-    total = ndimage.gaussian_filter(np.where(counts, fit.data.p - p, np.float32(0)), sigma)
-    counts &= share > LEAST
+    share = ndimage.gaussian_filter(rays.astype(np.float32), sigma)
+    total = ndimage.gaussian_filter(np.where(rays, left, np.float32(0)), sigma)
+    counts = rays & (share > LEAST)
     if counts.sum() < FEWEST:
         return math.inf
-    means = total[counts] / share[counts]
-    return float(np.sqrt(np.mean(np.square(means, dtype=np.float64))))
+    value = float(np.sqrt(np.mean(np.square(total[counts] / share[counts], dtype=np.float64))))
+    return value if math.isfinite(value) else math.inf
