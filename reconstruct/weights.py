@@ -2,8 +2,11 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 Image = NDArray[np.float32]
+
+DARK = 3.0  # P from which on a reading lies in metal's shadow
 
 
 def photon_weights(p: Image, valid: NDArray[np.bool_]) -> Image:
@@ -20,14 +23,19 @@ def doubt_edges(p: Image, weights: Image, edges: float, scatter: float = 0.0) ->
     b is the greater of the absolute second differences of `p` along u and v. A pixel averages intensities, and where in
     it an edge lies no grid tells: what a model misses grows with b, as if 1/w, the variance of a reading in units of an
     open ray's, were larger. Bright rays along a wire's shadow, with all their photons, would otherwise outweigh the
-    dark ones that hold the wire. `edges` is the b at which an open ray keeps half of its weight; it is chosen, not
-    derived. Arrays are [view, v, u]. Pixels of weight 0 and those beyond the rim bend nothing. Bounds, w < 0, keep
-    their weights; their p lacks `scatter`, S/I0, which that of readings has.
+    dark ones that hold the wire. An edge that the grid misplaces reaches over the next pixel: where one of the 3 × 3
+    readings around a pixel exceeds `DARK`, b is the greatest of the nine. `edges` is the b at which an open ray keeps
+    half of its weight; it is chosen, not derived. Arrays are [view, v, u]. Pixels of weight 0 and those beyond the rim
+    bend nothing and are not dark. Bounds, w < 0, keep their weights; their p lacks `scatter`, S/I0, which that of
+    readings has.
     """
     for reading, weight in zip(p, weights, strict=True):
         if scatter:
             reading = np.where(weight < 0, -np.log(np.exp(-reading) + np.float32(scatter)), reading)
         bend = np.maximum(_bend(reading, weight != 0, 0), _bend(reading, weight != 0, 1)) / np.float32(edges)
+        dark = (reading > DARK) & (weight != 0)
+        if dark.any():
+            bend = np.where(ndimage.maximum_filter(dark, 3), ndimage.maximum_filter(bend, 3), bend)
         weight /= 1 + np.maximum(weight, 0) * bend * bend
 
 

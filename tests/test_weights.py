@@ -5,7 +5,7 @@ import pytest
 
 from ctsim import new_scene, reconstruct_scan, score_volume, simulate_scene
 from ctsim.reconstruct.splat import fast
-from ctsim.reconstruct.weights import doubt_edges, photon_weights
+from ctsim.reconstruct.weights import DARK, doubt_edges, photon_weights
 
 EDGES = fast.Settings().edges
 
@@ -13,14 +13,17 @@ EDGES = fast.Settings().edges
 def doubted(p, weights, edges, scatter):
     """Compute the weights pixel by pixel in float64, as the docstring defines them."""
     p = np.where(weights < 0, -np.log(np.exp(-p.astype(np.float64)) + scatter), p)
-    out = weights.astype(np.float64)
+    bends, out = np.zeros(p.shape), weights.astype(np.float64)
     n_v, n_u = p.shape[1:]
-    for view, v, u in zip(*np.nonzero(weights > 0), strict=True):
-        bends = []
+    for view, v, u in zip(*np.nonzero(weights), strict=True):
         for near in ([(v - 1, u), (v + 1, u)], [(v, u - 1), (v, u + 1)]):
             inside = [(view, i, j) for i, j in near if 0 <= i < n_v and 0 <= j < n_u and weights[view, i, j] != 0]
-            bends.append(abs(sum(p[at] - p[view, v, u] for at in inside)))
-        out[view, v, u] = 1 / (1 / out[view, v, u] + (max(bends) / edges) ** 2)
+            bends[view, v, u] = max(bends[view, v, u], abs(sum(p[at] - p[view, v, u] for at in inside)))
+    for view, v, u in zip(*np.nonzero(weights > 0), strict=True):
+        around = (view, slice(max(v - 1, 0), v + 2), slice(max(u - 1, 0), u + 2))
+        dark = np.any((p[around] > DARK) & (weights[around] != 0))
+        b = bends[around].max() if dark else bends[view, v, u]
+        out[view, v, u] = 1 / (1 / out[view, v, u] + (b / edges) ** 2)
     return out
 
 
@@ -28,7 +31,7 @@ def doubted(p, weights, edges, scatter):
 @pytest.mark.parametrize("shape", [(3, 9, 11), (2, 1, 7), (2, 7, 1), (1, 1, 1)])
 def test_edges_count_less_and_what_says_nothing_makes_none(shape, edges, scatter):
     draws = np.random.default_rng(3)
-    p = draws.uniform(0, 7, shape).astype(np.float32)
+    p = draws.uniform(0, 4, shape).astype(np.float32)  # some neighbourhoods are dark and some are not
     weights = photon_weights(p, np.ones(p.shape, np.bool_))
     kind = draws.random(p.shape)
     weights[kind < 0.2], p[kind < 0.1] = 0, np.nan
@@ -39,7 +42,7 @@ def test_edges_count_less_and_what_says_nothing_makes_none(shape, edges, scatter
 
 
 def test_a_ramp_keeps_its_weights_and_an_edge_does_not():
-    p = np.broadcast_to(np.linspace(0, 4, 9, dtype=np.float32), (1, 5, 9)).copy()
+    p = np.broadcast_to(np.linspace(0, 2.4, 9, dtype=np.float32), (1, 5, 9)).copy()
     weights = photon_weights(p, np.ones(p.shape, np.bool_))
     before = weights.copy()
     doubt_edges(p, weights, EDGES)
