@@ -6,7 +6,7 @@ from scipy import ndimage
 
 Image = NDArray[np.float32]
 
-DARK = 3.0  # P from which on a reading lies in metal's shadow
+DARK = 3.0  # P above which a reading is dark: little but metal makes it so
 
 
 def photon_weights(p: Image, valid: NDArray[np.bool_]) -> Image:

@@ -33,7 +33,7 @@ from ctsim.reconstruct.splat.response import FILTER, Response, basis_functions, 
 from ctsim.reconstruct.splat.volume import voxelise
 from ctsim.reconstruct.starved import Below, weights_and_bounds
 from ctsim.reconstruct.watch import Stopwatch
-from ctsim.reconstruct.weights import doubt_edges
+from ctsim.reconstruct.weights import DARK, doubt_edges
 from ctsim.types import Scan, Status, Volume
 
 OPEN = 5.0  # standard deviations of an open pixel below which a ray met nothing
@@ -47,10 +47,10 @@ ENOUGH, TRIAL = 32, (2, 4)  # voxels along an axis on which the filtration is fo
 AT_THE_END, FEW, FEWEST, MANY = 0.9, 1e-4, 10, 0.01
 """Share of the curve's last attenuation, which no metal has; the share of the splats, or how many, that may have it;
 and the share with which a fit has diverged."""
-DARK, UNEXPLAINED, DARK_SHARE = 3.0, 0.45, 1e-4
-"""P above which a reading is dark; the root mean square that a fit misses dark readings by before it is said to, and
-their least share. Wire, gold, tungsten and a jaw that came out wrong had 0.5 to 3, right metal 0.1 to 0.4; but so had
-the hip whose core is hollow, which no reading shows."""
+UNEXPLAINED, DARK_SHARE = 0.45, 1e-4
+"""The root mean square that a fit misses dark readings by before it is said to, and their least share. Wire, gold,
+tungsten and a jaw that came out wrong had 0.5 to 3, right metal 0.1 to 0.4; but so had the hip whose core is hollow,
+which no reading shows."""
 Image = NDArray[np.float32]
 
 
