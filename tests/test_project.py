@@ -245,9 +245,11 @@ def response(materials=MATERIALS):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("tolerance", "view"), [(math.inf, 1), (0.2, 0)])
-def test_intensities_equal_the_reference(tolerance, view):
-    tracer, g, r = Tracer.of(blobs(solids=INSERTS)), geometry(n_detector=(5, 7), n_views=2, pixel=7.5), response()
+@pytest.mark.parametrize(("tolerance", "view", "dense"), [(math.inf, 1, False), (0.2, 0, False), (math.inf, 0, True)])
+def test_intensities_equal_the_reference(tolerance, view, dense):
+    density = np.random.default_rng(1).uniform(0.5, 1.5, (5, 7, 11)).astype(np.float32) if dense else None
+    tracer, g = Tracer.of(blobs(solids=INSERTS, density=density)), geometry(n_detector=(5, 7), n_views=2, pixel=7.5)
+    r = response()
     shape = g.n_detector
     everywhere = np.tile(np.array([0, shape[1]]), (shape[0], 1))
     extra = np.random.default_rng(0).uniform(0, 1, shape).astype(np.float32)

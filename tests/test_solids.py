@@ -186,6 +186,28 @@ def test_special_rays_agree_with_the_reference(name):
                 assert agree(row, origin, direction), (base, tilt, scale)
 
 
+@pytest.mark.parametrize("name", KINDS)
+def test_rays_that_are_done_together_meet_to_the_bit_what_each_meets_alone(name):
+    rng, n = np.random.default_rng(8), 45
+    prim = primitive(name, centre=(3.0, -20.0, 11.0), axis=(0.3, -0.5, 0.7), spin=0.4)
+    row = prim.row(1)
+    origin = prim.centre + rng.normal(size=3) * 4 * prim.radius
+    aims = prim.centre + rng.uniform(-1.2, 1.2, (n, 3)) * prim.radius
+    aims[:3] = origin + row[2:11].reshape(3, 3)  # along its own axes
+    middle = prim.centre + row[2:5] * (prim.params[0] if prim.kind == TORUS else 0.0)
+    aims[3:9] = middle + rng.normal(size=(6, 3)) * 0.003
+    directions = aims - origin
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    local, spans = np.zeros((10, n)), np.full((2, 2, n), np.nan)
+    local[:3] = directions.T
+    solids_cpu.intersect_rays.compiled(row, n, origin, local, spans)
+    pairs = 2 if prim.kind == TORUS else 1
+    for i, direction in enumerate(directions):
+        together = [spans[k, :, i] for k in range(pairs) if spans[k, 1, i] > spans[k, 0, i]]
+        np.testing.assert_array_equal(np.reshape(together, (-1, 2)), intervals(solids_cpu, row, origin, direction))
+    assert 4 < sum(spans[0, 1] > spans[0, 0]) < n
+
+
 @settings(max_examples=150, deadline=None)
 @given(
     name=st.sampled_from(sorted(KINDS)),

@@ -162,6 +162,7 @@ def variants(setup: Bench) -> Iterator[Pair]:
     for what, many in {
         f"rays of {doses} doses": scans(("Fe",), (90.0,), doses),
         f"rays of 2 metals, each at 2 voltages and {doses // 4} doses": scans(("Fe", "Ti"), (90.0, 120.0), doses // 4),
+        f"rays of {doses} voltages": scans(("Fe",), tuple(np.linspace(80.0, 140.0, doses).tolist()), 1),
     }.items():
         yield Pair(
             scene=scene.name,

@@ -157,15 +157,20 @@ def add_pieces(pieces, n, t_from, t_to, lengths):
 
 
 @njit(inline="always", error_model="numpy")
-def aim(pose, u, v, ray):
-    """Fill `ray` with the source, the unit direction to detector position (u, v), and the distance."""
+def towards(pose, u, v):
+    """Return the unit direction from the source to detector position (u, v), and the distance (mm)."""
     dx = pose[3] + u * pose[6] + v * pose[9] - pose[0]
     dy = pose[4] + u * pose[7] + v * pose[10] - pose[1]
     dz = pose[5] + u * pose[8] + v * pose[11] - pose[2]
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    return dx / length, dy / length, dz / length, length
+
+
+@njit(inline="always", error_model="numpy")
+def aim(pose, u, v, ray):
+    """Fill `ray` with the source, the unit direction to detector position (u, v), and the distance."""
     ray[0], ray[1], ray[2] = pose[0], pose[1], pose[2]
-    ray[3], ray[4], ray[5] = dx / length, dy / length, dz / length
-    ray[6] = length
+    ray[3], ray[4], ray[5], ray[6] = towards(pose, u, v)
 
 
 @njit(cache=True, error_model="numpy")

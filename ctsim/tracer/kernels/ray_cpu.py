@@ -4,6 +4,7 @@ What runs once a ray is inlined: a call would count references of its arrays ato
 Variants of a scan differ in metal and spectrum: its rays are the same, its attenuation is not.
 """
 
+import numpy as np
 from numba import njit
 
 from ctsim.tracer.kernels.bricks_cpu import add_pieces
@@ -11,6 +12,7 @@ from ctsim.tracer.kernels.exp_cpu import exp_minus
 from ctsim.tracer.kernels.solids_cpu import intersect
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
+WIDTH = 16  # float32 numbers in the widest vector of today's processors
 
 
 @njit(inline="always", error_model="numpy")
@@ -78,5 +80,38 @@ def signal(lengths, n, rule, j, tau, s1, s2):
                 tau[i] += mu_mk * lengths[m, i]
         for i in range(n):
             e = exp_minus(tau[i])
+            s1[i] += w1[j, k] * e
+            s2[i] += w2[j, k] * e
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def signal_near(lengths, n, order, few, rule, j, same, tau, s1, s2):
+    """Sum as `signal` does, for n rays that differ in the materials order[:few] alone; order[few:] are the others.
+
+    Up to WIDTH − 1 rays more are read and summed, since rays that do not fill a vector are done one by one.
+    """
+    mu, w1, w2, nodes = rule
+    whole = -(-n // WIDTH) * WIDTH
+    for i in range(whole):
+        s1[i] = 0
+        s2[i] = 0
+    for k in range(nodes[j]):
+        same[k] = 0
+    for c in range(few, order.size):
+        for k in range(nodes[j]):
+            same[k] += mu[j, order[c], k] * lengths[order[c], 0]
+    # the last two materials are added where their sum is used
+    a, b = order[max(few - 1, 0)], order[max(few - 2, 0)]
+    for k in range(nodes[j]):
+        for i in range(whole):
+            tau[i] = same[k]
+        for c in range(few - 2):
+            m = order[c]
+            mu_mk = mu[j, m, k]
+            for i in range(whole):
+                tau[i] += mu_mk * lengths[m, i]
+        mu_a, mu_b = mu[j, a, k] * np.float32(few > 0), mu[j, b, k] * np.float32(few > 1)
+        for i in range(whole):
+            e = exp_minus(tau[i] + mu_a * lengths[a, i] + mu_b * lengths[b, i])
             s1[i] += w1[j, k] * e
             s2[i] += w2[j, k] * e

@@ -18,6 +18,7 @@ from ctsim.kernels.once import compiled_once
 from ctsim.tracer.kernels.bricks_cpu import aim, walk
 from ctsim.tracer.kernels.ray_cpu import collect, paint, signal, thickness
 from ctsim.tracer.kernels.rows_cpu import columns_near, fill_open, seen_in_row, trim
+from ctsim.tracer.kernels.solids_cpu import intersect_rays
 from ctsim.tracer.kernels.subrays_cpu import (
     ACTIVE,
     BACKGROUND,
@@ -34,7 +35,7 @@ from ctsim.tracer.kernels.subrays_cpu import (
 )
 
 STRIP = 8  # rows done one after the other: they compute 9 rows of pixel corners instead of 16
-ADDRESSES = "UniTuple(int64, 4)"  # of _measure_strip, _corners, _centres and measure_edges
+ADDRESSES = "UniTuple(int64, 5)"  # of _measure_strip, _corners, _centres, measure_edges and intersect_rays
 
 
 @compiled_once(PRIMS, SHADOW, ACTIVE, NEAR, POSE, "float64", "float64[:,::1]", "float64[:,::1]", "float64[::1]")
@@ -145,7 +146,7 @@ def _measure_row(at, volume, solids, pose, v, span, background, rules, edge, ski
                 change = bounds[1, j, u] - bounds[0, j, u]
                 centre[j, u] = change if change > limit else 0.0
         found = (prims, fat, shadow, active, near)
-        measure_edges(at[3], volume, found, pose, v, columns, row, rules, edge, centre, bounds, m1, m2)
+        measure_edges(at[3], at[4], volume, found, pose, v, columns, row, rules, edge, centre, bounds, m1, m2)
 
 
 @compiled_once(
@@ -202,7 +203,8 @@ def transmit_view(volume, solids, pose, order, spans, background, rule, edge, sk
 
 @functools.cache
 def _addresses():
-    return _measure_strip.address(), _corners.address(), _centres.address(), measure_edges.address()
+    called = _measure_strip, _corners, _centres, measure_edges, intersect_rays
+    return tuple(function.address() for function in called)
 
 
 @njit(cache=True, error_model="numpy")

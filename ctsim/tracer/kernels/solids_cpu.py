@@ -1,9 +1,10 @@
-"""Exact ray intervals through one primitive, scalar numba code for the ray tracer's inner loop.
+"""Exact ray intervals through one primitive, of one ray or of many, for the ray tracer's inner loop.
 
 A ray is first moved to its closest approach to the bounding sphere's centre, so every later number is
 of the primitive's own size and nothing cancels over the source distance. The result is that of a ray
 moved by no more than a few 1e-13 mm (source up to 1500 mm away). The centre of the bounding sphere is
-the local origin (`ctsim.solids.Primitive.row`), which is why the row's offset is not read.
+the local origin (`ctsim.solids.Primitive.row`), which is why the row's offset is not read. Primitives of one interval
+choose between numbers, not between branches, so that LLVM does several rays at once.
 """
 
 import math
@@ -11,8 +12,10 @@ import math
 import numpy as np
 from numba import njit
 
-from ctsim.solids import BOX, CAPSULE, ELLIPSOID, FRUSTUM
+from ctsim.kernels.once import compiled_once
+from ctsim.solids import BOX, CAPSULE, ELLIPSOID, FRUSTUM, TORUS
 
+ROW = "float64[::1]"
 # Direction components below this are parallel to a face or axis: over 1e3 mm the ray moves by less than 1e-27 mm.
 _PARALLEL = 1e-30
 
@@ -33,6 +36,65 @@ def intersect(prim, ox, oy, oz, dx, dy, dz, out):
     if px * px + py * py + pz * pz > prim[21] * prim[21] * (1 + 1e-12):
         return 0
     return _intersect_near(prim, px, py, pz, dx, dy, dz, shift, out)
+
+
+@compiled_once(ROW, "int64", ROW, "float64[:,::1]", "float64[:,:,::1]")
+def intersect_rays(prim, n, source, local, spans):
+    """Intersect n rays from one point with a primitive, to the last bit as `intersect` does.
+
+    `source` [≥ 3] is the point (mm) and `local` [10, ≥ n] scratch whose first three rows are unit directions. `spans`
+    [pair, 2, ≥ n] gets where each ray enters and leaves (mm along it), of a torus two pairs; a ray misses a pair where
+    it does not leave it after it enters.
+    """
+    kind, a, b, c = int(prim[0]), prim[14], prim[15], prim[16]
+    if kind == TORUS:
+        _intersect_torus(prim, n, source, local, spans)
+        return
+    enter, leave = spans[0, 0], spans[0, 1]
+    xx, xy, xz, yx, yy, yz = prim[2], prim[3], prim[4], prim[5], prim[6], prim[7]
+    zx, zy, zz = prim[8], prim[9], prim[10]
+    ox, oy, oz = source[0] - prim[18], source[1] - prim[19], source[2] - prim[20]
+    for i in range(n):
+        dx, dy, dz = local[0, i], local[1, i], local[2, i]
+        shift = -(ox * dx + oy * dy + oz * dz)
+        px, py, pz = ox + shift * dx, oy + shift * dy, oz + shift * dz
+        local[3, i] = xx * px + xy * py + xz * pz
+        local[4, i] = yx * px + yy * py + yz * pz
+        local[5, i] = zx * px + zy * py + zz * pz
+        local[6, i] = xx * dx + xy * dy + xz * dz
+        local[7, i] = yx * dx + yy * dy + yz * dz
+        local[8, i] = zx * dx + zy * dy + zz * dz
+        local[9, i] = shift
+    if kind == ELLIPSOID:
+        for i in range(n):
+            x, y, z, ex, ey, ez = local[3, i], local[4, i], local[5, i], local[6, i], local[7, i], local[8, i]
+            t0, t1 = _ellipsoid(x / a, y / b, z / c, ex / a, ey / b, ez / c)
+            enter[i], leave[i] = t0 + local[9, i], t1 + local[9, i]
+    elif kind == FRUSTUM:
+        for i in range(n):
+            x, y, z, ex, ey, ez = local[3, i], local[4, i], local[5, i], local[6, i], local[7, i], local[8, i]
+            t0, t1 = _frustum(x, y, z, ex, ey, ez, a, b, c)
+            enter[i], leave[i] = t0 + local[9, i], t1 + local[9, i]
+    elif kind == CAPSULE:
+        for i in range(n):
+            x, y, z, ex, ey, ez = local[3, i], local[4, i], local[5, i], local[6, i], local[7, i], local[8, i]
+            t0, t1 = _capsule(x, y, z, ex, ey, ez, a, b)
+            enter[i], leave[i] = t0 + local[9, i], t1 + local[9, i]
+    else:
+        for i in range(n):
+            x, y, z, ex, ey, ez = local[3, i], local[4, i], local[5, i], local[6, i], local[7, i], local[8, i]
+            t0, t1 = _box(x, y, z, ex, ey, ez, a, b, c)
+            enter[i], leave[i] = t0 + local[9, i], t1 + local[9, i]
+
+
+@njit(cache=True, error_model="numpy")
+def _intersect_torus(prim, n, source, local, spans):
+    pair = np.empty(4)
+    for i in range(n):
+        x, y, z = local[0, i], local[1, i], local[2, i]
+        pairs = intersect(prim, source[0], source[1], source[2], x, y, z, pair)
+        for k in range(2):
+            spans[k, 0, i], spans[k, 1, i] = (pair[2 * k], pair[2 * k + 1]) if k < pairs else (np.inf, -np.inf)
 
 
 @njit(cache=True, error_model="numpy")
@@ -77,10 +139,7 @@ def _intersect_near(prim, px, py, pz, dx, dy, dz, shift, out):
     elif kind == CAPSULE:
         t0, t1 = _capsule(x, y, z, ex, ey, ez, a, b)
     elif kind == BOX:
-        x0, x1 = _slab(x, ex, a)
-        y0, y1 = _slab(y, ey, b)
-        z0, z1 = _slab(z, ez, c)
-        t0, t1 = max(x0, y0, z0), min(x1, y1, z1)
+        t0, t1 = _box(x, y, z, ex, ey, ez, a, b, c)
     else:
         n = _torus(x, y, z, ex, ey, ez, a, b, out)
         for i in range(2 * n):
@@ -93,7 +152,7 @@ def _intersect_near(prim, px, py, pz, dx, dy, dz, shift, out):
     return 1
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _slab(p, e, half):
     """Interval in which |p + t·e| ≤ half; (inf, -inf) if empty."""
     if abs(e) < _PARALLEL:
@@ -105,7 +164,16 @@ def _slab(p, e, half):
     return min(t0, t1), max(t0, t1)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
+def _box(x, y, z, ex, ey, ez, a, b, c):
+    """Interval in |x| ≤ a, |y| ≤ b, |z| ≤ c."""
+    x0, x1 = _slab(x, ex, a)
+    y0, y1 = _slab(y, ey, b)
+    z0, z1 = _slab(z, ez, c)
+    return max(x0, max(y0, z0)), min(x1, min(y1, z1))
+
+
+@njit(cache=True, error_model="numpy", inline="always")
 def _ellipsoid(x, y, z, ex, ey, ez):
     """Interval in the unit sphere (coordinates already divided by the semi-axes)."""
     norm = 1 / (ex * ex + ey * ey + ez * ez)
@@ -118,7 +186,7 @@ def _ellipsoid(x, y, z, ex, ey, ez):
     return s - half, s + half
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _frustum(x, y, z, ex, ey, ez, h, r0, r1):
     """Interval in |z| ≤ h, x² + y² ≤ g(z)², g linear from r0 to r1.
 
@@ -126,8 +194,6 @@ def _frustum(x, y, z, ex, ey, ez, h, r0, r1):
     B² − AC equals |g·e − g'·p|² − (p × e)² in the xy plane, which does not cancel.
     """
     t0, t1 = _slab(z, ez, h)
-    if not t0 < t1:
-        return t0, t1
     slope = (r1 - r0) / (2 * h)
     g, dg = 0.5 * (r0 + r1) + slope * z, slope * ez
     wx, wy, cross = g * ex - dg * x, g * ey - dg * y, x * ey - y * ex
@@ -135,68 +201,46 @@ def _frustum(x, y, z, ex, ey, ez, h, r0, r1):
     qb = x * ex + y * ey - g * dg
     qc = x * x + y * y - g * g
     disc = wx * wx + wy * wy - cross * cross
-    if disc <= 0 and qa > 0:
-        return np.inf, -np.inf
     q = math.sqrt(max(disc, 0.0))
     q = -qb - q if qb > 0 else q - qb
-    if abs(q) < _PARALLEL:  # along a cylinder's axis, or a tangent on a cone
-        if qc > 0:
-            return np.inf, -np.inf
-        return t0, t1
     ta, tb = q / qa, qc / q
-    ta, tb = min(ta, tb), max(ta, tb)
-    if qa > 0:
-        return max(t0, ta), min(t1, tb)
+    low, high = min(ta, tb), max(ta, tb)
     if qa == 0:  # one root only: ta or tb is infinite
-        root = qc / q
-        if qb > 0:
-            return t0, min(t1, root)
-        return max(t0, root), t1
-    if dg > 0:  # steeper than the cone: inside beyond the root on the nappe that widens along the ray
-        return max(t0, tb), t1
-    return t0, min(t1, ta)
+        low, high = (-np.inf, tb) if qb > 0 else (tb, np.inf)
+    if qa < 0:  # steeper than the cone: inside beyond the root on the nappe that widens along the ray
+        low, high = (high, np.inf) if dg > 0 else (-np.inf, low)
+    if abs(q) < _PARALLEL:  # along a cylinder's axis, or a tangent on a cone
+        low, high = (-np.inf, np.inf) if qc <= 0 else (np.inf, -np.inf)
+    if disc <= 0 and qa > 0:
+        low, high = np.inf, -np.inf
+    return max(t0, low), min(t1, high)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _capsule(x, y, z, ex, ey, ez, h, r):
     """Interval in the points nearer than r to the segment |z| ≤ h on the axis."""
     a = ex * ex + ey * ey
+    cross = x * ey - y * ex
+    disc = r * r * a - cross * cross
+    b, half, inverse = x * ex + y * ey, math.sqrt(max(disc, 0.0)), 1 / a
+    t0, t1, empty = (-b - half) * inverse, (half - b) * inverse, disc <= 0
     if a < _PARALLEL:
-        if x * x + y * y >= r * r:
-            return np.inf, -np.inf
-        t0, t1 = -np.inf, np.inf
-    else:
-        cross = x * ey - y * ex
-        disc = r * r * a - cross * cross
-        if disc <= 0:
-            return np.inf, -np.inf
-        b, half = x * ex + y * ey, math.sqrt(disc)
-        inverse = 1 / a
-        t0, t1 = (-b - half) * inverse, (half - b) * inverse
-    # Where the infinite cylinder is entered or left beyond an end, that end's ball decides.
+        t0, t1, empty = -np.inf, np.inf, x * x + y * y >= r * r
+    # Where the infinite cylinder is entered or left beyond an end, that end's ball decides; one that is missed has no
+    # length, and the ray has not come between the ends.
     z0, z1 = z + t0 * ez, z + t1 * ez
-    if abs(z0) > h:
-        s, half = _ball(x, y, z - math.copysign(h, z0), ex, ey, ez, r)
-        if half <= 0:
-            return np.inf, -np.inf
-        t0 = s - half
-    if abs(z1) > h:
-        s, half = _ball(x, y, z - math.copysign(h, z1), ex, ey, ez, r)
-        if half <= 0:
-            return np.inf, -np.inf
-        t1 = s + half
-    return t0, t1
+    s0, half0 = _ball(x, y, z - math.copysign(h, z0), ex, ey, ez, r)
+    s1, half1 = _ball(x, y, z - math.copysign(h, z1), ex, ey, ez, r)
+    t0, t1 = s0 - half0 if abs(z0) > h else t0, s1 + half1 if abs(z1) > h else t1
+    return (np.inf, -np.inf) if empty else (t0, t1)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _ball(x, y, z, ex, ey, ez, r):
     """Middle and half length of the interval in a ball of radius r about the origin; half is 0 on a miss."""
     s = -(x * ex + y * ey + z * ez)
     x, y, z = x + s * ex, y + s * ey, z + s * ez
-    rest = r * r - (x * x + y * y + z * z)
-    if rest <= 0:
-        return s, 0.0
-    return s, math.sqrt(rest)
+    return s, math.sqrt(max(r * r - (x * x + y * y + z * z), 0.0))
 
 
 @njit(cache=True, error_model="numpy")
