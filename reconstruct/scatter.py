@@ -26,6 +26,8 @@ LOW, HIGH = 2.0, 5.0  # standard deviations that an open block may be below the 
 CUT, SIGNIFICANT = 0.055, 5.0
 """The mean of a Gaussian above −LOW, and standard deviations of the mean, beyond which open blocks show an excess."""
 FEWEST = 100  # open blocks, below which nothing is told
+VARIED = 0.3  # of the source between far and near open blocks, below which gain and constant are not told apart
+LARGEST = 0.1  # gain that is taken for the object's without a sign of it
 FAINTEST = 1e-4  # primary over open field below which the source is not told from none
 DARKEST = 0.01  # share of the blocks that may, in the mean around them, hold less than the scatter found
 
@@ -85,12 +87,30 @@ def scatter_of(p: Image, valid: NDArray[np.bool_], geometry: Geometry, i0: float
     for _ in range(ROUNDS):
         primary: Image = np.clip(means - gain * source - constant, FAINTEST, 1).astype(np.float32)
         source = _blurred(-np.log(primary) * primary, sigma)
-        both = np.stack([source[is_open], np.ones(excess.size)], 1, dtype=np.float64)
-        gain, constant = optimize.nnls(both, excess)[0].tolist()
+        gain, constant = _fitted(source[is_open], excess)
     held = _held(means, gain * source + constant)
     if gain == 0:
         return Scatter(floor=held * constant)
     return Scatter(floor=held * constant, gain=held * gain, source=source, step=step)
+
+
+def _fitted(source: NDArray[np.float32], excess: NDArray[np.float64]) -> tuple[float, float]:
+    """Return gain and constant, neither below 0, with which open blocks' excess is gain·source + constant.
+
+    Where the source hardly varies over them, an object that nearly fills the panel leaves few open blocks, all near its
+    shadow. Gain and constant are the same there, and scatter that is the object's has no constant. Blocks with more
+    source are nearer to the object and may be in its shadow's rim, so the quarter with the least counts.
+    """
+    quarters = np.quantile(source, (0.25, 0.75))
+    far, near = source <= quarters[0], source >= quarters[1]
+    least, most = (float(source[some].mean(dtype=np.float64)) for some in (far, near))
+    if most - least < VARIED * (most + least) / 2:
+        level = max(float(excess[far].mean()), 0.0)
+        gain = min(level / least, LARGEST) if least > 0 else 0.0
+        return gain, level - gain * least
+    both = np.stack([source, np.ones(excess.size)], 1, dtype=np.float64)
+    gain, constant = optimize.nnls(both, excess)[0].tolist()
+    return gain, constant
 
 
 def _noise(means: Image, photons: float) -> float:
