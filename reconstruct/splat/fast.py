@@ -47,9 +47,9 @@ ENOUGH, TRIAL = 32, (2, 4)  # voxels along an axis on which the filtration is fo
 AT_THE_END, FEW, FEWEST, MANY = 0.9, 1e-4, 10, 0.01
 """Share of the curve's last attenuation, which no metal has; the share of the splats, or how many, that may have it;
 and the share with which a fit has diverged."""
-UNEXPLAINED, DARK_SHARE = 0.45, 1e-4
+UNEXPLAINED, DARK_SHARE = 0.35, 1e-4
 """The root mean square that a fit misses dark readings by before it is said to, and their least share. Wire, gold,
-tungsten and a jaw that came out wrong had 0.5 to 3, right metal 0.1 to 0.4; but so had the hip whose core is hollow,
+tungsten and a jaw that came out wrong had 0.43 to 3, right metal 0.1 to 0.26; but so had the hip whose core is hollow,
 which no reading shows."""
 Image = NDArray[np.float32]
 
