@@ -267,7 +267,7 @@ def measure_edges(rays_at, volume, solids, pose, v, columns, background, rules, 
     kept = 1 if variants == 1 else KEPT
     whole = -(-size // WIDTH) * WIDTH
     lengths, seen, counts = np.zeros((kept, n_m, whole), np.float32), np.empty((kept, variants, 2)), np.empty(kept)
-    orders, few = np.zeros((kept, n_m - 1), np.int64), np.zeros(kept, np.int64)
+    orders, few = np.zeros((kept, max(n_m - 1, 1)), np.int64), np.zeros(kept, np.int64)  # air, where nothing else is
     tau, s1, s2 = np.empty(whole, np.float32), np.empty(whole, np.float32), np.empty(whole, np.float32)
     same, sums = np.empty(rules[1].shape[1], np.float32), np.empty(5)
     grid, ray, pair, n = volume[4], np.empty(7), np.empty(4), 2 * active.size + 1
