@@ -4,7 +4,7 @@ A ray is first moved to its closest approach to the bounding sphere's centre, so
 of the primitive's own size and nothing cancels over the source distance. The result is that of a ray
 moved by no more than a few 1e-13 mm (source up to 1500 mm away). The centre of the bounding sphere is
 the local origin (`ctsim.solids.Primitive.row`), which is why the row's offset is not read. Primitives of one interval
-choose between numbers, not between branches, so that LLVM does several rays at once.
+are written without loops and calls, so that LLVM turns their branches into choices and does several rays at once.
 """
 
 import math

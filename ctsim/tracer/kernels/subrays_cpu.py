@@ -256,7 +256,8 @@ def _cast(volume, solids, pose, at, count, background, edge_mu, work, lengths, o
 def measure_edges(rays_at, volume, solids, pose, v, columns, background, rules, edge, changes, bounds, m1, m2):
     """Measure again, by several rays each, the pixels of row v that the edge of a solid crosses.
 
-    A pixel whose mean is uncertain by more than the tolerance is measured again by more rays.
+    A pixel whose mean is uncertain by more than the tolerance is measured again by more rays. `rays_at` is the address
+    of `intersect_rays`.
     """
     prims, fat, shadow, active, near = solids
     edge_mu, _, _, most, tolerance = edge
