@@ -65,18 +65,26 @@ def test_arrays_changed_by_hand_are_not_gone_on_from(tmp_path):
     (path,) = tmp_path.iterdir()
     with np.load(io.BytesIO(path.read_bytes())) as file:
         arrays = dict(file)
-    arrays["u"][:] = np.nan
+    arrays["u0"][:] = np.nan
     np.savez(path, **arrays)
     with pytest.raises(InputError, match="delete it"):
         reconstruct(sphere(), Settings(checkpoints=str(tmp_path), passes=(1, 1)))
 
 
-@pytest.mark.parametrize("name", ["level", "seconds", "support", "u", "dual", "curvature", "numbers", "reals"])
+@pytest.mark.parametrize("name", ["level", "seconds", "support", "u0", "dual0", "curvature0", "numbers", "reals"])
 @pytest.mark.parametrize("how", ["empty", "missing", "one"])
 def test_a_state_that_is_none_of_a_fit_is_refused(tmp_path, name, how):
     reconstruct(sphere(), Settings(checkpoints=str(tmp_path), passes=(1, 1), seconds=0.0))
     value = {"empty": np.zeros(0, np.uint8), "one": np.ones((1, 1), np.uint8)}.get(how)
     rewritten(tmp_path, lambda s: {k: v for k, v in (s | {name: value}).items() if v is not None})
+    with pytest.raises(InputError, match="delete it"):
+        reconstruct(sphere(), Settings(checkpoints=str(tmp_path), passes=(1, 1)))
+
+
+@pytest.mark.parametrize("how", [None, np.ones((1, 1), np.uint8)])
+def test_a_state_of_other_fine_voxels_is_refused(tmp_path, how):
+    reconstruct(sphere(), Settings(checkpoints=str(tmp_path), passes=(1, 1), seconds=0.0))
+    rewritten(tmp_path, lambda s: {k: v for k, v in (s | {"fine": how}).items() if v is not None})
     with pytest.raises(InputError, match="delete it"):
         reconstruct(sphere(), Settings(checkpoints=str(tmp_path), passes=(1, 1)))
 

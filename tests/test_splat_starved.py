@@ -21,6 +21,7 @@ from ctsim.reconstruct.splat import fast
 from ctsim.reconstruct.splat.curve import MaterialCurve
 from ctsim.reconstruct.splat.fast import reconstruct
 from ctsim.reconstruct.splat.level import Data, coarser
+from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import make_response
 from ctsim.reconstruct.starved import WEIGHT, Below, weights_and_bounds
 from ctsim.types import Scan, Status
@@ -182,7 +183,8 @@ def test_splats_at_the_end_of_the_curve_are_said_and_many_are_divergence(runaway
     curve = MaterialCurve.of(make_response("tube", e_max=90.0, basis="klein-nishina"), 30.0)
     u = np.full(100_000, curve.water, np.float32)
     u[:runaway] = curve.knots[-1]
-    fit = SimpleNamespace(u=u, curve=curve)
+    part = SimpleNamespace(u=u, curve=curve, finer=1)
+    fit = Fit(data=None, parts=[part], response=None, tv=0.0)
     found, reason = fast._verdict(fit, u)
     assert found is status and ("18 times the attenuation of iron" in reason) == (status is Status.DIVERGED)
     assert said in fast._unexplained(fit, 0.3) and bool(said) == bool(fast._unexplained(fit, 0.3))

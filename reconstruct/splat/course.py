@@ -13,6 +13,7 @@ from ctsim.reconstruct.splat.curve import MaterialCurve
 from ctsim.reconstruct.splat.lattice import Lattice
 from ctsim.reconstruct.splat.level import Data, carve, coarser, refined
 from ctsim.reconstruct.splat.ordered import Fit
+from ctsim.reconstruct.splat.part import Part
 from ctsim.reconstruct.splat.response import Response
 
 EMPTY, AGAIN = 0.05, 0.3
@@ -28,9 +29,9 @@ class Course:
     """The levels of a fit, coarsest first, and the passes over each.
 
     `met` is how far p of a ray that met something lies above that of open ones; `tv` is the denoising of the finest
-    level; `exact` is how splats are projected. `again` is whether a voxel that a coarser fit emptied begins again
-    where no view shows it to be empty: streaks of thick metal bite pieces off the object. The few passes of a trial do
-    not empty the air again, so trials go without.
+    level; `exact` is how splats are projected. A voxel that a coarser fit emptied begins again where no view shows it
+    to be empty: streaks of thick metal bite pieces off the object. The few passes of a `trial` do not empty the air
+    again, so it goes without; it needs no fine metal, either.
     """
 
     levels: list[Data]
@@ -40,7 +41,7 @@ class Course:
     met: float
     tv: float
     exact: bool
-    again: bool = True
+    trial: bool = False
 
     def go(self, proceed: Callable[[Fit, bool, float], bool], fit: Fit | None = None) -> Fit | None:
         """Fit level by level while `proceed(fit, whole, share of the work)`, from a `fit` on that has begun.
@@ -57,7 +58,7 @@ class Course:
 
     def state(self, fit: Fit) -> dict[str, NDArray[Any]]:
         """Return all that the next step depends on, as arrays that it changes."""
-        support = np.packbits(fit.lattice.support)
+        support = np.packbits(fit.support)
         return {**fit.state(), "support": support, "level": np.array(self._level(fit))}
 
     def restored(self, state: Mapping[str, NDArray[Any]]) -> Fit:
@@ -79,7 +80,7 @@ class Course:
         else:
             start = refined(before.volume(), level.geometry)
             support = start > EMPTY * water
-            if self.again:
+            if not self.trial:
                 lost = carve(level, self.met) & ~support
                 start[lost] = AGAIN * water
                 support |= lost
@@ -88,15 +89,16 @@ class Course:
         return self._fit(k, support, start)
 
     def _fit(self, k: int, support: NDArray[np.bool_], start: NDArray[np.float32]) -> Fit:
-        lattice = Lattice(geometry=self.levels[k].geometry, support=support)
+        level, finest = self.levels[k], k + 1 == len(self.levels)
+        lattice = Lattice(geometry=level.geometry, support=support)
+        u = lattice.gather(start)
+        part = Part(geometry=level.geometry, lattice=lattice, curve=self.curve, u=u, exact=self.exact)
         return Fit(
-            data=self.levels[k],
-            lattice=lattice,
+            data=level,
+            parts=[part],
             response=self.response,
-            curve=self.curve,
-            u=lattice.gather(start),
-            tv=self.tv * (1 if self.levels[k] is self.levels[-1] else COARSER),
-            exact=self.exact,
+            tv=self.tv * (1 if finest else COARSER),
+            metal_from=(self.passes[k] // 2 or None) if finest and not self.trial else None,
             view_updates=int(self._updates[:k].sum()),
         )
 

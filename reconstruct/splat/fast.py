@@ -30,7 +30,6 @@ from ctsim.reconstruct.splat.filtration import USUAL, Filtration, found
 from ctsim.reconstruct.splat.level import Data
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import FILTER, Response, basis_functions, evaluate, make_response, tangent
-from ctsim.reconstruct.splat.volume import voxelise
 from ctsim.reconstruct.starved import Below, weights_and_bounds
 from ctsim.reconstruct.watch import Stopwatch
 from ctsim.reconstruct.weights import DARK, doubt_edges
@@ -125,7 +124,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         **scatter.details(),
         "clamped_pixels": int(clamped.sum()),
         "grid": list(finest.n_voxel),
-        "splats": 0 if fit is None else len(fit.lattice),
+        "splats": 0 if fit is None else fit.n_splats,
     }
     if fit is None:
         nothing, empty = np.zeros((2, *scan.geometry.n_voxel), np.float32), torch.zeros(scan.geometry.n_voxel)
@@ -170,10 +169,10 @@ def find_filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtr
         return None
     levels = levels if len(levels) > 1 else levels_of(levels[-1], coarse=True)
     few = levels[: 1 + next((k for k, level in enumerate(levels) if min(level.geometry.n_voxel[1:]) >= ENOUGH), 0)]
-    trial = msgspec.structs.replace(settings, passes=TRIAL)
+    brief = msgspec.structs.replace(settings, passes=TRIAL)
 
     def fit_of(value: float) -> Fit | None:
-        course = _course(few, settings.make_response(scan.e_max, value), trial, again=False)
+        course = _course(few, settings.make_response(scan.e_max, value), brief, trial=True)
         return course.go(lambda fit, whole, share: True)
 
     return found(fit_of)
@@ -218,18 +217,18 @@ def _verdict(fit: Fit, values: Image) -> tuple[Status, str]:
     status, reason = finite_or_not(values)
     if status is not Status.OK:
         return status, reason
-    runaway = _runaway(fit)
-    if runaway <= max(MANY * len(fit.u), FEWEST):
+    runaway, of = _runaway(fit)
+    if runaway <= max(MANY * of, FEWEST):
         return Status.OK, ""
     return Status.DIVERGED, (
-        f"{runaway} of {len(fit.u)} splats went to {AT_THE_END * STRONGEST:g} times the attenuation of iron: "
+        f"{runaway:.0f} of {of:.0f} splats went to {AT_THE_END * STRONGEST:g} times the attenuation of iron: "
         "readings are darker than any metal makes them; are the scan's dark and open field right?"
     )
 
 
-def _runaway(fit: Fit) -> int:
-    """Return how many splats stand where no metal does."""
-    return int((fit.u >= AT_THE_END * fit.curve.knots[-1]).sum())
+def _runaway(fit: Fit) -> tuple[float, float]:
+    """Return how many splats stand where no metal does, and of how many."""
+    return fit.many_above(AT_THE_END * float(fit.curve.knots[-1]))
 
 
 def _dark_misfit(fit: Fit) -> float | None:
@@ -249,7 +248,8 @@ def _unexplained(fit: Fit, missed: float | None) -> str:
             f"readings of P > {DARK:g} are missed by {missed:.2g} (root mean square): metal is thinner than the grid "
             "or denser than its readings show, so its values, and tissue next to it, may be wrong"
         )
-    if _runaway(fit) > max(FEW * len(fit.u), FEWEST):
+    runaway, of = _runaway(fit)
+    if runaway > max(FEW * of, FEWEST):
         return f"metal reaches {AT_THE_END * STRONGEST:g} times iron, where the assumed materials end"
     return ""
 
@@ -282,7 +282,7 @@ def _read(fit: Fit, settings: Settings, geometry: Geometry) -> tuple[Image, Imag
         weights, how = tangent(fit.response, fit.curve.of_water, length), f"hardened by {length:.1f} mm of water"
     else:
         weights, how = _at(settings.readout, fit.response), f"at {settings.readout:g} keV"
-    rho = voxelise(fit.lattice.splats(fit.curve.densities_of(fit.u)), geometry)
+    rho = fit.densities(geometry)
     return _summed(weights, rho), rho, how
 
 
@@ -307,7 +307,7 @@ def _summed(weights: tuple[float, float], rho: Image) -> Image:
     return np.float32(weights[0]) * rho[0] + np.float32(weights[1]) * rho[1]
 
 
-def _course(levels: list[Data], response: Response, settings: Settings, again: bool = True) -> Course:
+def _course(levels: list[Data], response: Response, settings: Settings, trial: bool = False) -> Course:
     data = levels[-1]
     met = least_met(data)
     return Course(
@@ -318,7 +318,7 @@ def _course(levels: list[Data], response: Response, settings: Settings, again: b
         met=met,
         tv=settings.tv,
         exact=settings.exact,
-        again=again,
+        trial=trial,
     )
 
 
@@ -355,10 +355,10 @@ def rough_length(data: Data, response: Response, met: float) -> float:
 def typical_length(fit: Fit) -> float:
     """Return the median water-equivalent path (mm) through what is no metal, of the rays that meet it."""
     geometry, water = fit.data.geometry, fit.curve.water
-    shares = np.where(fit.u < DENSEST * water, fit.u / water, 0).astype(np.float32)
-    # the projector takes two channels: the second is not looked at
-    both = np.stack([shares, shares], 1) / np.float32(fit.lattice.unit)
-    views = few_views(geometry.n_views, VIEWS)
-    paths = fit.projector.pictures(fit.projector.forward(both, views))[:, 0]
+
+    def of_water(u: Image) -> Image:
+        return np.where(u < DENSEST * water, u / water, 0).astype(np.float32)
+
+    paths = fit.integrals(of_water, few_views(geometry.n_views, VIEWS))
     met = paths[paths > SHORTEST * max(geometry.d_voxel)]
     return float(np.median(met)) if met.size else 0.0

@@ -105,7 +105,8 @@ def _chosen(misfits: dict[float, float]) -> Filtration:
 def rays_of(fit: Fit) -> NDArray[np.bool_]:
     """Return which readings [view, v, u] tell the beam: those of rays that meet the object and no metal."""
     views = np.arange(fit.data.geometry.n_views)
-    p, metal = fit.fitted(views), fit.shadow(views, METAL * fit.curve.water)
+    p, least = fit.fitted(views), np.float32(METAL * fit.curve.water)
+    metal = fit.integrals(lambda u: np.where(u > least, u, np.float32(0)), views)
     return (fit.data.weights > 0) & (p > MET) & (p < DARK) & (metal < FAINT)
 
 

@@ -78,6 +78,12 @@ class Lattice:
         """Take the values of a volume [z, y, x] at the splats: [splat]."""
         return volume.transpose(1, 2, 0)[self._box].reshape(-1)[self.index]
 
+    def scattered(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Put values [splat] into a volume of the grid, zero elsewhere: [z, y, x]."""
+        volume = np.zeros(self.support.shape, np.float32)
+        volume.transpose(1, 2, 0)[self._box] = self._filled(values)
+        return volume
+
     def denoise(self, values: NDArray[np.float32], tau: float, iterations: int) -> NDArray[np.float32]:
         """Return argmin ½‖x − values‖² + tau·TV(x), x not negative."""
         return self._denoiser.run(self._filled(values), tau, iterations).reshape(-1)[self.index]

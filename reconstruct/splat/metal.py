@@ -1,0 +1,96 @@
+"""Metal on splats half as far apart, seen by sub-pixels.
+
+A pixel on the edge of metal averages intensities: half of it open and half behind metal read P = ln 2, however thick
+the metal is. The mean of the line integrals, which one ray a pixel gives, is far more, so that a fit makes the metal
+fainter or smears it. Where there is metal, P is therefore −ln of the mean of exp(−P) over four sub-pixels, and the
+splats near its surface are half as far apart, so that sub-pixels differ.
+"""
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ctsim.geometry import Geometry
+from ctsim.reconstruct.splat.curve import METAL
+from ctsim.reconstruct.splat.lattice import Lattice
+from ctsim.reconstruct.splat.level import refined
+from ctsim.reconstruct.splat.part import Part
+from ctsim.reconstruct.splat.response import Response, evaluate
+
+FINER = 2  # splats along an axis, and sub-pixels, for one
+AROUND, WITHIN = 2, 3  # voxels outside and inside a metal's surface that are fine: its inside is as smooth as tissue
+
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+def surface(part: Part) -> Mask:
+    """Return the voxels of the lattice's support near the surface of metal: [z, y, x]."""
+    support = part.lattice.support
+    metal = part.lattice.scattered(part.u) > METAL * part.curve.water
+    if not metal.any():
+        return np.zeros_like(support)
+    inside = ndimage.binary_erosion(metal, iterations=WITHIN)
+    return support & ndimage.binary_dilation(metal, iterations=AROUND) & ~inside
+
+
+def split(part: Part, fine: Mask) -> list[Part]:
+    """Return `part` without the voxels `fine` [z, y, x], which must not be none, and those on finer splats."""
+    values = part.lattice.scattered(part.u)
+    rest = Lattice(geometry=part.geometry, support=part.lattice.support & ~fine)
+    box = ndimage.find_objects(fine.astype(np.uint8))[0]
+    geometry = _finer(part.geometry, box)
+    lattice = Lattice(geometry=geometry, support=fine[box].repeat(FINER, 0).repeat(FINER, 1).repeat(FINER, 2))
+    start = lattice.gather(refined(values[box], geometry))
+    return [
+        Part(geometry=part.geometry, lattice=rest, curve=part.curve, u=rest.gather(values), exact=part.exact),
+        Part(geometry=geometry, lattice=lattice, curve=part.curve, u=start, finer=FINER, exact=part.exact),
+    ]
+
+
+def average(response: Response, rest: Sequence[Image], fine: Part, paths: Image, found: Sequence[Image]) -> Image:
+    """Correct `found`, P and its derivatives of [view, v, u] for one ray a pixel, in place where there is fine metal.
+
+    `rest`, two of [view, v, u], and `paths`, as the fine part has them, are La and Lb, which add up. The derivatives by
+    the sub-pixels' own are returned as `paths` is; those by `rest` are their sums.
+    """
+    la, lb = (fine.blocks(paths[:, channel]).transpose(0, 1, 3, 2, 4) for channel in (0, 1))
+    met = la.any((3, 4))
+    n = FINER * FINER
+    p, by_a, by_b = evaluate(
+        response,
+        *(own[met].reshape(-1, n) + other[met][:, None] for own, other in zip((la, lb), rest, strict=True)),
+    )
+    least = p.min(1, keepdims=True)
+    shares = np.exp(least - p)
+    total = shares.sum(1, keepdims=True)
+    shares /= total
+    by_a *= shares
+    by_b *= shares
+    for image, values in zip(found, (least[:, 0] - np.log(total[:, 0] / n), by_a.sum(1), by_b.sum(1)), strict=True):
+        image[met] = values
+    slopes = np.zeros_like(paths)
+    for channel, values in enumerate((by_a, by_b)):
+        fine.blocks(slopes[:, channel]).transpose(0, 1, 3, 2, 4)[met] = values.reshape(-1, FINER, FINER)
+    return slopes
+
+
+def _finer(geometry: Geometry, box: tuple[slice, ...]) -> Geometry:
+    """Return the geometry of a box of voxels with finer voxels and pixels."""
+    poses = geometry.pose_array()
+    poses[:, 6:12] /= FINER
+    sides = [s.stop - s.start for s in box]
+    shift = [0.5 * (s.start + s.stop - n) * d for s, n, d in zip(box, geometry.n_voxel, geometry.d_voxel, strict=True)]
+    return msgspec.structs.replace(
+        geometry,
+        n_voxel=tuple(FINER * n for n in sides),
+        d_voxel=tuple(d / FINER for d in geometry.d_voxel),
+        off_origin=tuple(o + s for o, s in zip(geometry.off_origin, shift, strict=True)),
+        n_detector=tuple(FINER * n for n in geometry.n_detector),
+        d_detector=tuple(d / FINER for d in geometry.d_detector),
+        angles_deg=None,
+        poses=tuple(tuple(row) for row in poses.tolist()),
+    )

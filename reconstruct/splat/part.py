@@ -1,0 +1,132 @@
+"""The splats of one lattice: their unknowns, their pictures, and how they step."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctsim.geometry import Geometry
+from ctsim.reconstruct.splat.columns import LatticeProjector
+from ctsim.reconstruct.splat.curve import METAL, MaterialCurve
+from ctsim.reconstruct.splat.kernels import step_cpu
+from ctsim.reconstruct.splat.lattice import Lattice
+from ctsim.reconstruct.splat.volume import voxelise
+
+STEEPEST = 0.8
+"""Greatest gain of the ramp, as a share of the views in a subset."""
+LONGEST = 3.0  # times the median root of a step: hardly seen splats, their steps spread by F, make a fit diverge
+SAMPLE = 1 << 18  # roots of which the median is taken
+FAINT = 0.5  # times water: splats below are preconditioned as if they held this
+LONGER = 1.8
+"""Steps of fine splats, in those of the majoriser, whose curvature is too high: 1.9 is better on wire, 3 diverges."""
+
+Image = NDArray[np.float32]
+
+
+@dataclass(slots=True, kw_only=True)
+class Part:
+    """Splats with unknowns `u`, float32 [splat] in 1/mm of the hardened beam, on one lattice.
+
+    `geometry` has `finer` × `finer` sub-pixels in each pixel of the scan's. Splats are projected by EWA unless `exact`.
+    Images are as `LatticeProjector` has them: [view, channel, …].
+    """
+
+    geometry: Geometry
+    lattice: Lattice
+    curve: MaterialCurve
+    u: Image
+    finer: int = 1
+    exact: bool = False
+    projector: LatticeProjector = field(init=False)
+    curvature: Image = field(init=False)  # by both densities, summed over the views that it was measured in
+    _pair: Image = field(init=False)  # densities, then sums by them: memory that is used again costs less than new
+    _gradient: Image = field(init=False)
+    _roots: Image = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.projector = LatticeProjector(self.geometry, self.lattice, exact=self.exact)
+        n = len(self.lattice)
+        self.curvature, self._pair = np.zeros((n, 2), np.float32), np.empty((n, 2), np.float32)
+        self._gradient, self._roots = np.empty(n, np.float32), np.empty(n, np.float32)
+
+    def state(self) -> dict[str, Image]:
+        """Return all that the next step depends on, as arrays that it changes."""
+        return {"u": self.u, "curvature": self.curvature, "dual": self.lattice.dual}
+
+    def paths(self, views: NDArray[np.int64]) -> Image:
+        """Return the line integrals of both densities (La, Lb)."""
+        return self.projector.forward(self.curve.densities_of(self.u, self.lattice.unit, self._pair), views)
+
+    def integrals(self, values: Image, views: NDArray[np.int64]) -> Image:
+        """Return the line integrals (mm) of `values` [splat], a mean over each pixel of the scan: [view, v, u]."""
+        # the projector takes two channels: the second is not looked at
+        np.stack([values, values], 1, out=self._pair)
+        self._pair /= np.float32(self.lattice.unit)
+        return self.blocks(self.projector.forward(self._pair, views)[:, 0]).mean((2, 4))
+
+    def blocks(self, image: Image) -> Image:
+        """View images of one channel as sub-pixels within pixels, [view, v, sub-pixel, u, sub-pixel]."""
+        pictures = self.projector.pictures(image)
+        n_view, n_v, n_u = pictures.shape
+        return pictures.reshape(n_view, n_v // self.finer, self.finer, n_u // self.finer, self.finer)
+
+    def along(self, slopes: Image, paths: Image) -> Image:
+        """Sum slopes times paths over channels and the sub-pixels of a pixel: [view, v, u]."""
+        a, b = (self.blocks(slopes[:, k]) * self.blocks(paths[:, k]) for k in (0, 1))
+        return (a + b).sum((2, 4))
+
+    def back(self, slopes: Image, pixels: Image, views: NDArray[np.int64]) -> Image:
+        """Sum slopes times what `pixels` [view, v, u] hold over the pixels: [splat, channel], until the next call."""
+        images = np.zeros_like(slopes)  # in the scratch columns, too
+        for k in (0, 1):
+            np.multiply(self.blocks(slopes[:, k]), pixels[:, :, None, :, None], out=self.blocks(images[:, k]))
+        return self.projector.adjoint(images, views, self._pair)
+
+    def measure(self, slopes: Image, along: Image, views: NDArray[np.int64]) -> None:
+        """Add the curvature of some views."""
+        self.curvature += self.back(slopes, along, views)
+
+    def move(self, slopes: Image, lacking: Image, views: NDArray[np.int64], length: float, share: float) -> None:
+        """Step by `length` of a step towards what pixels lack; `share` makes the curvature that of these views."""
+        gradient = self.curve.transpose(self.u, self.back(slopes, lacking, views), length, self._gradient)
+        curvature = self.curve.transpose(self.u, self.curvature, share, self._roots)
+        self._move(gradient, curvature, len(views))
+
+    def _move(self, gradient: Image, curvature: Image, n_views: int) -> None:
+        """Step; gradient and curvature are overwritten.
+
+        Metal, and all fine splats, step each by itself: metal's steps are so large that spread they swamp the tissue.
+        """
+        water, last = self.curve.water, np.float32(self.curve.knots[-1])
+        faint, metal = np.float32(FAINT * water), np.float32(METAL * water)
+        if self.finer > 1:
+            gradient *= np.float32(LONGER)
+            step_cpu.precondition(self.u, faint, np.float32(0), np.float32(np.inf), gradient, curvature)
+            step_cpu.move(self.u, np.float32(0), last, curvature, gradient, self.lattice.index, gradient)
+            return
+        few = slice(None, None, max(len(self.u) // SAMPLE, 1))
+        u, seen = self.u[few], np.maximum(curvature[few], np.float32(step_cpu.LEAST))
+        roots = np.sqrt(np.maximum(u, faint) / seen)[u < metal]
+        longest = np.float32(LONGEST * np.median(roots)) if roots.size else np.float32(np.inf)
+        step_cpu.precondition(self.u, faint, metal, longest, gradient, curvature)
+        spread = self.lattice.filter_slices(self.u, metal, gradient, self._ramp(n_views))
+        step_cpu.move(self.u, metal, last, curvature, gradient, self.lattice.index, spread)
+
+    def denoise(self, threshold: float, iterations: int) -> None:
+        """Take away total variation."""
+        self.u = self.lattice.denoise(self.u, threshold, iterations)
+
+    def densities(self, geometry: Geometry) -> Image:
+        """Return ρa and ρb, means over the voxels of a grid: [2, z, y, x]."""
+        return voxelise(self.lattice.splats(self.curve.densities_of(self.u)), geometry)
+
+    def volume(self, geometry: Geometry) -> Image:
+        """Return u, a mean over the voxels of a grid: [z, y, x] in 1/mm."""
+        return voxelise(self.lattice.splats(self.u[:, None]), geometry)[0]
+
+    def _ramp(self, n_views: int) -> Image:
+        _, n_y, n_x = self.lattice.support.shape
+        p_y, p_x = self.lattice.padded
+        cycles = np.hypot((np.fft.fftfreq(p_y) * n_y)[:, None], np.fft.rfftfreq(p_x) * n_x)
+        return np.clip(cycles * math.pi / n_views, 1, max(STEEPEST * n_views, 1)).astype(np.float32)
