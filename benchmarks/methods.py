@@ -7,6 +7,7 @@ that they are annotated with; one called `device` is always "cpu". Its module ma
 within one class of inputs. `--method "cmd:./mine {scan} {out}"` runs a program (`ctsim.benchmarks.program`).
 """
 
+import dataclasses
 import difflib
 import importlib
 import inspect
@@ -35,7 +36,7 @@ RUNS_PROGRAM = "ctsim.benchmarks.program"
 COUNTS_ONLY, METAL_MASK, SPECTRUM = "counts only", "metal mask", "spectrum"
 MASK_AND_SPECTRUM = "metal mask and spectrum"
 ASSUMED = "assumed spectrum"
-"""Told no spectrum, but built on the tube, filter and scintillator that the simulator has by default."""
+"""Told no spectrum: a tungsten tube and 0.2 mm of GOS are assumed, and the filter is found in the scan."""
 MASK_AND_ASSUMED = "metal mask and assumed spectrum"
 TRAINED, TRAINED_MASK = "training", "training, metal mask"
 """Counts and weights that were trained on other scans (the suite `train`), and the same with a metal mask."""
@@ -110,7 +111,8 @@ def daggered(label: str) -> str:
 class Method:
     """A method and its parameters as plain JSON values: all in `params`, those not at their default in `overrides`.
 
-    Where checkpoints are kept stands in `overrides` alone.
+    Where checkpoints are kept stands in `overrides` alone. What the scan told the method stands in `told` and `params`,
+    not in its label; a `limitation` is added to the details of its volumes (`ctsim.benchmarks.known_beam`).
     """
 
     name: str
@@ -119,6 +121,8 @@ class Method:
     params: dict[str, Any]
     overrides: dict[str, Any] = field(default_factory=dict)
     code: str = ""
+    told: dict[str, Any] = field(default_factory=dict)
+    limitation: str = ""
 
     @property
     def label(self) -> str:
@@ -152,10 +156,14 @@ class Method:
     def reconstruct(self, scan: "Scan") -> "Volume":
         """Run the method."""
         function = resolve(self.target)
-        given = convert(parameters(self.name, function), self.overrides, f"{self.name}.")
+        given = convert(parameters(self.name, function), self.told | self.overrides, f"{self.name}.")
         if "device" in inspect.signature(function).parameters:
             given["device"] = "cpu"
-        return function(scan, **given)
+        volume = function(scan, **given)
+        if not self.limitation:
+            return volume
+        said = [text for text in (volume.details.get("limitation"), self.limitation) if text]
+        return dataclasses.replace(volume, details={**volume.details, "limitation": "; ".join(said)})
 
     def skip(self, scan: "Scan") -> str | None:
         """Return why the method's module would skip `scan`; None to run."""

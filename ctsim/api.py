@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ctsim.benchmarks.known_beam import with_beam
 from ctsim.benchmarks.methods import Method, find
 from ctsim.benchmarks.scores.judge import Judge, Twin
 from ctsim.benchmarks.scores.projection import held_out, with_floor
@@ -54,7 +55,9 @@ def new_scene(**keys: Any) -> Scene:
 def reconstruct_scan(scan: ScanWithTruth | Scan, method: str = "fdk", **parameters: Any) -> Volume:
     """Reconstruct a scan by a method's name or "module:function", with its parameters.
 
-    A method with mask "oracle" gets the true metal mask, which a `Scan` without truth must hold in `metal`. Give
+    A method with mask "oracle" gets the true metal mask, which a `Scan` without truth must hold in `metal`. A method
+    that is told the spectrum gets the tube and the detector of the scan's scene, unless it is given one of them; of a
+    `Scan` they are not known, so that the simulator's are assumed and the volume has a limitation. Give
     `scan.metal_free` to reconstruct the twin.
 
     Raises
@@ -62,7 +65,7 @@ def reconstruct_scan(scan: ScanWithTruth | Scan, method: str = "fdk", **paramete
     InputError
         For an unknown method, parameter or value, where the method skips this scan, and where it returns no volume.
     """
-    found = find(method, parameters)
+    found = with_beam(find(method, parameters), scan if isinstance(scan, ScanWithTruth) else None)
     given = _readings(found, scan)
     if (reason := found.skip(given)) is not None:
         raise InputError(f"{found.label} skips this scan: {reason}")

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from ctsim.beam.spectrum import spectrum
 from ctsim.dataset.manifest import About
 from ctsim.dataset.memory import MemoryWriter, SimulatedScan
+from ctsim.dataset.truth import ScanWithTruth
 from ctsim.dataset.writer import SceneWriter, Stack
 from ctsim.detector.response import response
 from ctsim.errors import InputError
 from ctsim.notes import metal_share
-from ctsim.phantoms.scene import Scene, build, individual, scene_id, scene_to_toml, stream_id
+from ctsim.phantoms.scene import Scene, build, individual, parse_suite, scene_id, scene_to_toml, stream_id
 from ctsim.phantoms.variants import build_all
 from ctsim.phantoms.vary import Drawn
 from ctsim.plan import Plan, disk_estimate, make_plan
@@ -215,6 +216,19 @@ def _write_truth(writer: Writer, plan: Plan, phantom: Phantom, scanner: Scanner,
     writer.write_text("scan.json", _json(info))
     writer.write_text("plan.json", _json(plan.to_dict()))
     writer.write_text("spectrum.csv", spectrum_csv(scanner))
+
+
+def scene_of(scan: ScanWithTruth) -> Scene | str:
+    """Return the scene that a scan was simulated from, or why it is not known."""
+    try:
+        if (text := scan.text("scene.toml")) is None:
+            return "the scan comes without scene.toml"
+        (scene,) = parse_suite(text, f"{scan.place}: scene.toml")
+    except ValueError as error:  # InputError, or a file of several scenes
+        return " ".join(str(error).split())
+    if scene.resolve().geometry != scan.geometry:
+        return "scene.toml describes another geometry than the scan's"
+    return scene
 
 
 def plan_hash(plan: Plan) -> str:

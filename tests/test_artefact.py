@@ -148,14 +148,16 @@ def test_streaks_of_several_pairs_are_taken_together():
     assert scored(difference, centres=centres)["streak"] == pytest.approx(expected, rel=1e-9)
 
 
-def test_near_is_within_five_mm_of_a_metal_voxel():
+@pytest.mark.parametrize("scale, reach", [(0.5, 5.0), (1.0, 9.0)])  # voxels of up to 0.75 and 1.5 mm
+def test_near_is_within_five_mm_or_six_voxels_of_a_metal_voxel(scale, reach):
     truth, layout = scene(((15, 18, 12), (20, 9, 36)))
-    metal = KDTree(np.argwhere(truth.metal) * D)
-    distance = metal.query(np.argwhere(truth.tissue) * D)[0]
-    found = layout.near[truth.tissue]
-    # exactly 5 mm counts as near; distances here are multiples that float64 has to 1e-15
-    np.testing.assert_array_equal(found, distance <= 5 + 1e-9)
-    assert ((distance > 5 - 1e-9) & (distance < 5 + 1e-9)).any()
+    size = tuple(scale * d for d in D)
+    metal = KDTree(np.argwhere(truth.metal) * size)
+    distance = metal.query(np.argwhere(truth.tissue) * size)[0]
+    found = near_metal(dataclasses.replace(truth, d_voxel=size))[truth.tissue]
+    # exactly this distance counts as near; distances here are multiples that float64 has to 1e-15
+    np.testing.assert_array_equal(found, distance <= reach + 1e-9)
+    assert ((distance > reach - 1e-9) & (distance < reach + 1e-9)).any()
     assert not (layout.near & layout.far).any()
     np.testing.assert_array_equal(layout.near | layout.far, truth.tissue)
 
@@ -165,7 +167,7 @@ def test_near_at_the_volumes_edge():
     metal[:2, :3, -2:] = True
     truth = truth_of(np.ones(SHAPE, np.uint8), metal)
     distance = KDTree(np.argwhere(metal) * D).query(np.argwhere(truth.tissue) * D)[0]
-    np.testing.assert_array_equal(near_metal(truth)[truth.tissue], distance <= 5 + 1e-9)
+    np.testing.assert_array_equal(near_metal(truth)[truth.tissue], distance <= 6 * 1.5 + 1e-9)
 
 
 def test_rois_are_homogeneous_and_declared():
@@ -291,8 +293,8 @@ def test_a_layout_of_stored_files_declares_itself(smallest):
     from ctsim.benchmarks.scores.protocol import truth_of as stored_truth
 
     note = artefact.layout_of(stored, stored_truth(stored)).note
-    # voxels of 5 and 6 mm: the dilated metal reaches beyond 5 mm, and nothing is left for a ROI
-    for words in ("no ROI in water", "of 1 pairs", "no tissue within 5 mm", "water 0.0"):
+    # voxels of 5 and 6 mm: nothing is left for a ROI
+    for words in ("no ROI in water", "of 1 pairs", "water 0.0"):
         assert words in note
 
 

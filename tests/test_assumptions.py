@@ -54,3 +54,19 @@ def test_a_scene_shares_the_grid_that_its_name_says(scene):
     assert coincide(splats, geometry, labels) == (favour in ("splat-grid", "ideal"))
     assert coincide(geometry.n_voxel, geometry, labels) == (favour == "volume-grid")
     assert np.all(np.greater(splats, geometry.n_voxel))
+
+
+@pytest.mark.parametrize(
+    ("suite", "of_splats", "of_volume"),
+    [(name, True, False) for name in ("core", "core-scatter", "lookalike", "systems")]
+    + [(name, False, False) for name in ("quick", "ablation", "neural", "beams", "scatter", "headline")]
+    + [("paper", False, True)],
+)
+def test_a_suite_shares_the_grid_that_its_description_says(suite, of_splats, of_volume):
+    for scene in load(suite):
+        geometry, phantom = scene.resolve().geometry, scene.phantom
+        size = tuple(phantom.size / n for n in phantom.n_voxel)
+        shift = tuple(s * d for s, d in zip(phantom.grid_shift, size, strict=True))
+        labels = LabelGrid(n_voxel=phantom.n_voxel, d_voxel=size, off_origin=shift)
+        assert coincide(finer(geometry, Settings().fineness).n_voxel, geometry, labels) == of_splats
+        assert coincide(geometry.n_voxel, geometry, labels) == of_volume

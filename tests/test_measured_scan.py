@@ -113,7 +113,8 @@ def test_scores_see_what_they_are_for(data):
     assert scored(streaked)["air_streak"] > 2 * base["air_streak"]
     noisy = values + rng.normal(0, 0.2 * judge.water, values.shape).astype(np.float32)
     assert scored(noisy)["air_entropy"] > base["air_entropy"] + 0.5
-    near = np.where(judge.near, noisy, values)
+    # without noise the body varies by 0.23 of water near the metal and by 0.30 beyond; noise of 0.4 makes it 0.46
+    near = np.where(judge.near, 2 * noisy - values, values)
     assert scored(near)["artefact_index"] > base["artefact_index"]
     assert scored(np.zeros_like(values))["held/outside"] > 3 * base["held/outside"]
     assert scored(np.zeros_like(values))["air_entropy"] == 0

@@ -241,6 +241,21 @@ def test_one_piece_has_nothing_between_and_no_metal_has_a_reason(scan):
     )
 
 
+@pytest.mark.parametrize("size", [1.4, 2.0])
+def test_soft_tissue_is_near_metal_on_coarse_voxels(size):
+    labels = bodies(RODS[:1])
+    truth = dataclasses.replace(truth_of(labels), d_voxel=(size,) * 3)
+    soft = soft_layout(labels, truth, NAMES, WATER)
+    found = structure_layout(soft, truth, 2.5)
+    # the rod is 3 voxels wide: along x the first voxel that counts is 4 from its surface voxel, the last is 6
+    assert found.near[24, 28, :20].nonzero()[0].tolist() == [13, 14, 15]
+    painted = np.where(np.arange(SHAPE[2]) < 20, 1000.0, 0.0)
+    values = structure_score(volume((labels, truth, soft), painted), found).values
+    assert 0.2 < values["false_bone_near"] < 0.8
+    noisy = 40 * np.random.default_rng(2).standard_normal(SHAPE)
+    assert scored((labels, truth, soft), noisy)["noise_near"] == pytest.approx(40, rel=0.1)
+
+
 @pytest.mark.parametrize(
     "changes", [{}, {"off_detector": (3.0, 0.0)}, {"off_detector": (0.0, 4.0)}, {"arc_deg": 200.0}]
 )

@@ -22,16 +22,18 @@ from ctsim.dataset.truth import ScanWithTruth
 from ctsim.errors import InputError
 from ctsim.materials import attenuation
 
-NEAR = 5.0
-"""Tissue up to this distance from the metal (mm, between voxel centres) is near."""
+NEAR, NEAR_VOXELS = 5.0, 6
+"""Tissue up to this distance from the metal (mm, or voxels if that is more, between centres) is near."""
+# 2 voxels next to the metal are left out, and `structure` leaves out the outermost one of the soft tissue: what is left
+# begins 4 voxels away along an axis and 4·√2 = 5.7 along the diagonal of a face. 6 voxels hold both on any grid.
 
 ROI_MARGIN = 2
 MIN_VOXELS = 64
 MAX_PIECES = 32
 BINS = 3
 REGION = (
-    "homogeneous ROIs, lines between metal pieces, and the tissue within 5 mm of the metal and beyond, "
-    "all outside the metal dilated by 2 voxels"
+    "homogeneous ROIs, lines between metal pieces, and the tissue within 5 mm or 6 voxels (the greater) of the metal "
+    "and beyond, all outside the metal dilated by 2 voxels"
 )
 REFERENCE = "the metal-free scan reconstructed by the same method"
 _EVERY_WAY = np.ones((3, 3, 3), bool)
@@ -101,7 +103,7 @@ def layout_of(stored: ScanWithTruth, truth: Truth) -> Layout:
     parts = [_roi_text(roi) for roi in rois]
     parts += [f"no ROI in {', '.join(small)}: fewer than {MIN_VOXELS} voxels"] if small else []
     parts += [f"lines for {len(lines)} of {n_pairs} pairs of metal pieces{cut}"]
-    parts += [] if near.any() else [f"no tissue within {NEAR:g} mm of the metal"]
+    parts += [] if near.any() else [f"no tissue within {near_mm(truth.d_voxel):g} mm of the metal"]
     parts += [f"water {water:.5g} 1/mm"] if water else ["no HU: the scan comes without spectrum.csv"]
     return Layout(
         water=water,
@@ -202,13 +204,23 @@ def distance_to_metal(truth: Truth) -> NDArray[np.float64]:
     return np.asarray(ndimage.distance_transform_edt(~truth.metal, sampling=truth.d_voxel))
 
 
+def near_mm(d_voxel: tuple[float, float, float]) -> float:
+    """Return the distance from the metal (mm, between voxel centres) up to which tissue is near, on a grid."""
+    return max(NEAR, NEAR_VOXELS * max(d_voxel))
+
+
+def is_near(distance: NDArray[np.float64], d_voxel: tuple[float, float, float]) -> Mask:
+    """Return where a distance from the metal (mm) counts as near."""
+    return distance <= near_mm(d_voxel) * (1 + 1e-9)  # a sum of voxel sizes may be rounded up or down
+
+
 def near_metal(truth: Truth) -> Mask:
-    """Return the tissue whose voxel centres are within 5 mm of the centre of a metal voxel."""
+    """Return the tissue that is near the metal."""
     near = np.zeros_like(truth.metal)
     if truth.metal.any():
-        box = box_around(truth.metal, [math.ceil(NEAR / d) + 1 for d in truth.d_voxel])
+        box = box_around(truth.metal, [math.ceil(near_mm(truth.d_voxel) / d) + 1 for d in truth.d_voxel])
         distance = np.asarray(ndimage.distance_transform_edt(~truth.metal[box], sampling=truth.d_voxel))
-        near[box] = distance <= NEAR * (1 + 1e-9)  # a sum of voxel sizes may be rounded up or down
+        near[box] = is_near(distance, truth.d_voxel)
     return near & truth.tissue
 
 

@@ -20,7 +20,8 @@ from ctsim.dataset.truth import ScanWithTruth
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
-from ctsim.phantoms.scene import build, parse_suite, stream_id
+from ctsim.phantoms.dataset import scene_of
+from ctsim.phantoms.scene import build, stream_id
 from ctsim.plan import make_plan
 from ctsim.reconstruct.projector import forward_columns
 from ctsim.simulate import REFERENCE_KEV, simulate_views
@@ -75,14 +76,9 @@ def held_out(stored: ScanWithTruth) -> HeldOut | str:
     views = half_way(stored.geometry)
     if isinstance(views, str):
         return views
-    try:
-        if (text := stored.text("scene.toml")) is None:
-            return "the scan comes without scene.toml, from which held-out views are simulated"
-        (scene,) = parse_suite(text, f"{stored.place}: scene.toml")
-    except ValueError as error:  # InputError, or a file of several scenes
-        return f"held-out views cannot be simulated: {' '.join(str(error).split())}"
-    if scene.resolve().geometry != stored.geometry:
-        return "scene.toml describes another geometry than the scan's: held-out views are not its own"
+    scene = scene_of(stored)
+    if isinstance(scene, str):
+        return f"held-out views cannot be simulated: {scene}"
     try:
         return _simulated(scene, views, stored)
     except InputError as error:  # such as a CT volume's file that is not here

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ctsim.benchmarks.scores import metrics
-from ctsim.benchmarks.scores.artefact import MIN_VOXELS, distance_to_metal
+from ctsim.benchmarks.scores.artefact import MIN_VOXELS, distance_to_metal, is_near
 from ctsim.benchmarks.scores.metrics import Mask, dilate
 from ctsim.benchmarks.scores.protocol import Truth
 from ctsim.benchmarks.scores.score import COLUMNS, Score
@@ -74,7 +74,7 @@ class SoftLayout:
     `region` holds all voxels of soft classes, `classes` each class's own; `even` those whose 26 neighbours are of the
     same class, and `wide` those whose neighbours within 2 voxels are. `pair` names two classes to tell apart. `fine`
     holds fine structures and what is up to 2 voxels from them, away from bone and air. The `reference` is in HU.
-    `near` is up to 5 mm from the metal. `edges` are cubes with structure, "near" metal and "far".
+    `near` is what `is_near` calls so. `edges` are cubes with structure, "near" metal and "far".
     """
 
     water: float
@@ -120,7 +120,7 @@ def soft_layout(
         classes=classes,
         even=even,
         wide=wide,
-        near=distance <= 5.0 * (1 + 1e-9),
+        near=is_near(distance, truth.d_voxel),
         pair=pair,
         fine=_fine(reference, truth, classes),
         edges=_edges(reference, truth, distance),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from skimage.morphology import convex_hull_image
 
-from ctsim.benchmarks.scores.artefact import MAX_PIECES, pieces_of
+from ctsim.benchmarks.scores.artefact import MAX_PIECES, near_mm, pieces_of
 from ctsim.benchmarks.scores.metrics import Mask, erode
 from ctsim.benchmarks.scores.protocol import Truth
 from ctsim.benchmarks.scores.score import COLUMNS, Score
@@ -23,8 +23,8 @@ from ctsim.benchmarks.scores.soft import SoftLayout
 BONE_HU = 1000.0
 """What attenuates twice as much as water reads as bone, whatever cortical bone has under a soft spectrum."""
 REGION = (
-    "soft tissue without its outermost voxel, within 5 mm of the metal or between two pieces of it, outside the metal "
-    "dilated by 2 voxels"
+    "soft tissue without its outermost voxel, within 5 mm or 6 voxels (the greater) of the metal or between two pieces "
+    "of it, outside the metal dilated by 2 voxels"
 )
 NO_METAL = "the scan holds no metal"
 NONE_LEFT = "no soft tissue lies near the metal or between its pieces"
@@ -32,9 +32,13 @@ NONE_LEFT = "no soft tissue lies near the metal or between its pieces"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StructureLayout:
-    """Where false structure is looked for: masks [z, y, x], and per voxel the HU from which it reads as bone or air."""
+    """Where false structure is looked for: masks [z, y, x], and the HU of bone and of air.
+
+    `near` goes up to `reach` (mm) from the metal.
+    """
 
     near: Mask
+    reach: float
     between: Mask
     soft: SoftLayout
     bone: float
@@ -49,7 +53,11 @@ def structure_layout(soft: SoftLayout | str, truth: Truth, bone: float | None) -
         return NO_METAL
     inside = erode(soft.region) & soft.region
     found = StructureLayout(
-        near=inside & soft.near, between=inside & between_metal(truth), soft=soft, bone=(bone - 1) * 1000
+        near=inside & soft.near,
+        reach=near_mm(truth.d_voxel),
+        between=inside & between_metal(truth),
+        soft=soft,
+        bone=(bone - 1) * 1000,
     )
     return found if (found.near | found.between).any() else NONE_LEFT
 
@@ -95,6 +103,6 @@ def structure_score(values: NDArray[Any], layout: StructureLayout | str) -> Scor
         data_range=None,
         n_voxels=int(region.sum()),
         values=found,
-        note=f"{int(layout.near.sum())} voxels near metal, {int(layout.between.sum())} between pieces; "
-        f"cortical bone {layout.bone:.0f} HU",
+        note=f"{int(layout.near.sum())} voxels within {layout.reach:.3g} mm of metal, "
+        f"{int(layout.between.sum())} between pieces; cortical bone {layout.bone:.0f} HU",
     )

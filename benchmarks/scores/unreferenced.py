@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ctsim.baselines.metal import auto_mask, water_value
-from ctsim.benchmarks.scores.artefact import NEAR, effective_attenuation
+from ctsim.benchmarks.scores.artefact import effective_attenuation, is_near
 from ctsim.benchmarks.scores.judge import Twin
 from ctsim.benchmarks.scores.metrics import Mask, dilate
 from ctsim.benchmarks.scores.protocol import METAL_MARGIN, field_of_view
@@ -34,8 +34,8 @@ BIN, MOST_BINS = 20.0, 2000  # HU of a bin of the histogram of air; what is beyo
 MIN_VOXELS = 64
 TRACE_MARGIN = 2  # pixels
 REGION = (
-    "air at least 3 voxels outside the body, the body within 5 mm of the metal and beyond, and rays of views held out; "
-    "body and metal are those of FDK without correction"
+    "air at least 3 voxels outside the body, the body within 5 mm or 6 voxels (the greater) of the metal and beyond, "
+    "and rays of views held out; body and metal are those of FDK without correction"
 )
 REFERENCE = "none; 0 in air, and measured views that no method saw"
 
@@ -74,7 +74,7 @@ class Unreferenced:
         near = np.zeros_like(inside)
         if metal.any():
             distance = np.asarray(ndimage.distance_transform_edt(~metal, sampling=stored.geometry.d_voxel))
-            near = inside & (distance <= NEAR)
+            near = inside & (is_near(distance, stored.geometry.d_voxel))
         water = effective_attenuation(stored) or scale
         found = views if isinstance(views, HeldViews | str) else held_views(stored, metal)
         notes = [

@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 import torch
 
+from ctsim.benchmarks.known_beam import with_beam
 from ctsim.benchmarks.methods import Method, find
 from ctsim.benchmarks.scores.metrics import mse3d, psnr
 from ctsim.benchmarks.scores.protocol import tissue_range, truth_of
@@ -42,7 +43,7 @@ def _course(stored: StoredScan, scene: str, method: Method) -> Course:
         return psnr(mse3d(values.numpy(), truth.references["effective"], truth.tissue), span) or -math.inf
 
     with watch(lambda _updates, _seconds, values: seen.append(score(values))):
-        end = score(method.reconstruct(scan_for(method, stored, METAL)).values)
+        end = score(with_beam(method, stored).reconstruct(scan_for(method, stored, METAL)).values)
     best = max([*seen, end])
     sys.stderr.write(f"{scene}: {method.name}: {best:.2f} dB at best, {end:.2f} at the end\n")
     return Course(scene=scene, method=method.name, code=method.code, best=best, end=end)

@@ -19,6 +19,7 @@ from skimage.metrics import structural_similarity
 from ctsim.benchmarks import methods
 from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.table import Table, simple
+from ctsim.benchmarks.known_beam import with_beam
 from ctsim.benchmarks.scores import metrics
 from ctsim.benchmarks.scores.metrics import ssim_along_axes
 from ctsim.benchmarks.scores.protocol import TISSUE, Truth, tissue_range, truth_of
@@ -293,7 +294,7 @@ def _made(name: str | None, stored: StoredScan) -> Inspected:
     """Reconstruct the scan."""
     if name is None:
         raise InputError("expected a results folder or --method NAME")
-    method = methods.find(name)
+    method = with_beam(methods.find(name), stored)
     scan = scan_for(method, stored, METAL)
     if reason := method.skip(scan):
         raise InputError(f"method {name!r} does not apply to {stored.name!r}: {reason}")

@@ -27,7 +27,7 @@ def main_caption(shown: Sequence[RunRecord]) -> str:
     if measured(shown):
         return (
             "Measured scans have no truth, so nothing here says how right a volume is. Streaks in air: RMS of the air "
-            "around the body, smoothed. Artefact index: how much more the body varies within 5 mm of the metal than "
+            "around the body, smoothed. Artefact index: how much more the body varies near the metal than "
             "beyond. Held out: line integrals against measured views that no method saw; they hold noise, scatter and "
             "beam hardening, which a good volume does not. A method that erases detail may win any of these. "
             f"Skipped, since they need a truth: {', '.join(NEED_TRUTH)}. Controls have no rank."

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ctsim.benchmarks import methods
 from ctsim.benchmarks.engine.record import done
+from ctsim.benchmarks.known_beam import with_beam
 from ctsim.benchmarks.methods import Method
 from ctsim.benchmarks.scores.score import lacks_twin
 from ctsim.benchmarks.studies.methods.records import METAL, TWIN, Run, RunRecord, RunTask, rank, task_of
@@ -113,10 +114,13 @@ def jobs_on(
 
 
 def fitted(method: Method, stored: StoredScan) -> Method:
-    """Return the method as it runs on a scan: where no true mask is stored it finds the metal itself."""
-    if stored.has_truth or method.mask != "oracle":
-        return method
-    return methods.find(method.name, {**method.overrides, "mask": "auto"})
+    """Return the method as it runs on a scan: where no true mask is stored it finds the metal itself.
+
+    A method that is told the spectrum gets the scan's tube and detector.
+    """
+    if not stored.has_truth and method.mask == "oracle":
+        method = methods.find(method.name, {**method.overrides, "mask": "auto"})
+    return with_beam(method, stored)
 
 
 def job_of(task: RunTask) -> Job:

@@ -36,6 +36,7 @@ FEW = 20  # scenes that a warning names
 class Flags(study.Options):
     """Run reconstruction methods over a dataset, score them, and write tables and pictures.
 
+    A method that needs the spectrum is told the tube and the detector of the scan's scene, unless --set states one.
     A run that RESULTS already holds is not repeated, unless it failed or the data, the method's parameters or its code
     have changed. A method with a parameter `seconds`, such as splat, gets the time limit and returns what it has by
     then, at most 120 s late; other methods are stopped at the limit, start included, with the status timeout.

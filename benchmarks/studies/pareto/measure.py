@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ctsim import settings
 from ctsim.benchmarks.engine import host
 from ctsim.benchmarks.engine.record import Task
+from ctsim.benchmarks.known_beam import with_beam
 from ctsim.benchmarks.methods import find
 from ctsim.benchmarks.oracles import measured_pixel, poly_scene, relative, scanner_of, voxelised
 from ctsim.benchmarks.scores import metrics
@@ -176,12 +177,13 @@ class MethodBench:
 
     def warm_up(self, effort: Effort) -> float:
         """Run the method on a few views and slices, so that no timed run compiles; return the seconds."""
-        method = find(effort.method, effort.changes)
+        method = with_beam(find(effort.method, effort.changes), self.stored)
         return warm_up(method, scan_for(method, self.stored, "metal"))
 
     def run(self, effort: Effort) -> TimedRun:
         """Time one run, with a mark at each stop, the default and the end, or one if the method cannot be watched."""
-        method, usual = find(effort.method, effort.changes), find(effort.method).params.get("iterations")
+        method = with_beam(find(effort.method, effort.changes), self.stored)
+        usual = find(effort.method).params.get("iterations")
         marks = Marks(score=self.values, stops={*effort.stops, usual, method.params.get("iterations")})
         with watch(marks) if effort.watched else contextlib.nullcontext():
             outcome = skip(method, self.stored, "metal") or run_here(self.stored, "metal", method, 0.0)
