@@ -31,7 +31,8 @@ class Course:
     `met` is how far p of a ray that met something lies above that of open ones; `tv` is the denoising of the finest
     level; `exact` is how splats are projected. A voxel that a coarser fit emptied begins again where no view shows it
     to be empty: streaks of thick metal bite pieces off the object. The few passes of a `trial` do not empty the air
-    again, so it goes without; it needs no fine metal, either.
+    again, so it goes without. `fine_metal` gives the surface of metal finer splats in the second half of the passes
+    over the finest grid.
     """
 
     levels: list[Data]
@@ -41,6 +42,7 @@ class Course:
     met: float
     tv: float
     exact: bool
+    fine_metal: bool = True
     trial: bool = False
 
     def go(self, proceed: Callable[[Fit, bool, float], bool], fit: Fit | None = None) -> Fit | None:
@@ -98,7 +100,7 @@ class Course:
             parts=[part],
             response=self.response,
             tv=self.tv * (1 if finest else COARSER),
-            metal_from=(self.passes[k] // 2 or None) if finest and not self.trial else None,
+            metal_from=(self.passes[k] // 2 or None) if finest and self.fine_metal else None,
             view_updates=int(self._updates[:k].sum()),
         )
 

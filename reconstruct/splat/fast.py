@@ -62,11 +62,13 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     `passes` null makes them 3 and 9, or fewer, at least one, where the passes over a level times its views times its
     voxels would be more than 6e10, minutes of two cores. `tv` is stronger in the first passes and on coarser levels.
-    The finest grid is at most as fine as the detector's pixels at the isocentre. `response` "tube" is a tube behind
-    `filtration`, seen by a scintillator; null has it found, on grids of at least 32 voxels along x and y. `readout`
-    "hardened" is by the object's own water; `Volume.at_energy` gives the volume at any energy. `scatter` "found" is
-    what the pixels tell that no shadow reaches (`scatter_of`), with its course over the panel; a number is the same
-    everywhere, and 0 is for scans whose open pixels are brighter than their open field for another reason.
+    The finest grid is at most as fine as the detector's pixels at the isocentre. With `fine_metal` the splats within
+    two voxels of the surface of metal are half as far apart in the second half of the passes over that grid.
+    `response` "tube" is a tube behind `filtration`, seen by a scintillator; null has it found, on grids of at least 32
+    voxels along x and y. `readout` "hardened" is by the object's own water; `Volume.at_energy` gives the volume at any
+    energy. `scatter` "found" is what the pixels tell that no shadow reaches (`scatter_of`), with its course over the
+    panel; a number is the same everywhere, and 0 is for scans whose open pixels are brighter than their open field for
+    another reason.
     """
 
     passes: Annotated[tuple[Passes, Passes] | None, about("over the views: on each coarser level, on the finest")] = (
@@ -77,6 +79,7 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
         float, about("second difference of P between pixels that halves an open ray's weight", ge=1e-3, le=1e6)
     ] = 0.5
     fineness: Annotated[float, about("how much finer the finest grid is than the volume's", ge=1, le=16)] = 1.5
+    fine_metal: Annotated[bool, about("finer splats at the surface of metal, seen by sub-pixels")] = True
     exact: Annotated[bool, about("project splats by their exact line integrals, not by EWA")] = False
     response: Annotated[Literal["tube", "known"], about("beam: assumed, or known from tube and detector")] = "tube"
     filtration: Annotated[Filter | None, about("filtration behind the assumed tube; null: found", "mm Al")] = None
@@ -318,6 +321,7 @@ def _course(levels: list[Data], response: Response, settings: Settings, trial: b
         met=met,
         tv=settings.tv,
         exact=settings.exact,
+        fine_metal=settings.fine_metal and not trial,
         trial=trial,
     )
 

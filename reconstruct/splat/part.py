@@ -19,7 +19,7 @@ LONGEST = 3.0  # times the median root of a step: hardly seen splats, their step
 SAMPLE = 1 << 18  # roots of which the median is taken
 FAINT = 0.5  # times water: splats below are preconditioned as if they held this
 LONGER = 1.8
-"""Steps of fine splats, in those of the majoriser, whose curvature is too high: 1.9 is better on wire, 3 diverges."""
+"""Steps of fine splats, in those of the majoriser, which are short: 1 lost 1.2 dB on a copper wire, 3 another 2.5."""
 
 Image = NDArray[np.float32]
 
