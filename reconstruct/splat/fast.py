@@ -105,7 +105,8 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
 def reconstruct(scan: Scan, settings: Settings) -> Volume:
     """Reconstruct `scan`, attenuation in 1/mm; keywords are those of `Settings`.
 
-    Details hold the volumes "rho_a" and "rho_b" under "densities", and under "grid" the voxels of the finest lattice.
+    Details hold the volumes "rho_a" and "rho_b" under "densities", and under "grid" how many voxels the finest
+    lattice has over the volume, be it that of metal alone.
     """
     stopwatch = Stopwatch(limit=settings.seconds)
     scatter = scatter_in(scan, settings.scatter)  # first: it takes line integrals of its own, which are then gone
@@ -126,7 +127,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         **({} if filtration is None else {"filtration": filtration.described()}),
         **scatter.details(),
         "clamped_pixels": int(clamped.sum()),
-        "grid": list(finest.n_voxel),
+        "grid": [n * (1 if fit is None else fit.finer) for n in finest.n_voxel],
         "splats": 0 if fit is None else fit.n_splats,
     }
     if fit is None:

@@ -78,6 +78,11 @@ class Fit:
         return first if self.fine is None else first | self.fine
 
     @property
+    def finer(self) -> int:
+        """How many of the finest splats lie along a voxel of the scan's grid."""
+        return max(part.finer for part in self.parts)
+
+    @property
     def n_splats(self) -> int:
         """How many splats there are."""
         return sum(len(part.lattice) for part in self.parts)
