@@ -231,6 +231,7 @@ def _scan(path: Path, stated: Stated, found: _Found) -> ScanFile:
     pedestal = np.zeros(found.shape) if found.dark is None else found.dark
     return ScanFile(
         path=path,
+        files=(path,),
         geometry=Geometry(
             dso=dso,
             dsd=dsd,
