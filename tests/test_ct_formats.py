@@ -295,7 +295,7 @@ def test_metal_of_the_ct_is_refused_or_replaced_never_kept(tmp_path):
     clean = hu.copy()
     hu[5:7, 8:10, 14:16], hu[6, 9, 6] = 9000, 3000  # an implant in bone, and a voxel at the limit
     np.save(tmp_path / "ct.npy", hu)
-    given = {"spacing": (1.0, 1.0, 1.0)}
+    given = {"spacing": (1.0, 1.0, 1.0), "rescale": (1.0, 0.0)}  # there is no air
     refused(tmp_path / "ct.npy", r"holds metal, 8 voxels above metal_hu = 3000 HU \(up to 9000\)", **given)
     np.save(tmp_path / "clean.npy", clean)
     expected = body(tmp_path / "clean.npy", **given)
@@ -320,3 +320,31 @@ def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch):
 def test_directions_are_a_rotation():
     assert np.allclose(oblique() @ oblique().T, np.eye(3))
     assert np.linalg.det(oblique()[::-1]) == pytest.approx(1)
+
+
+NO_HU = {
+    "grey values of 8 bits": lambda hu: (hu // 16 + 100).clip(0, 255),
+    "HU + 1024": lambda hu: hu + 1024,
+    "attenuation in 1/mm": lambda hu: (0.02 * (1 + hu / 1000)).astype(np.float32),
+    "0 to 1": lambda hu: ((hu + 1000) / 2500).astype(np.float32),
+    "-1 to 1": lambda hu: ((hu + 1000) / 1250 - 1).astype(np.float32),
+}
+
+
+@pytest.mark.parametrize("kind", [".nii.gz", ".mha", ".nrrd", ".npy"])
+@pytest.mark.parametrize("change", NO_HU.values(), ids=NO_HU)
+def test_values_that_are_no_hu_need_a_rescale(tmp_path, kind, change):
+    array, steps = stored(change(corner()))
+    path = tmp_path / "ct.npy"
+    if kind == ".npy":
+        np.save(path, array)
+    else:
+        path = write(tmp_path, kind, array, steps)
+    refused(path, r"rescale: .* a CT in HU has air .* or rescale = \[1, 0\]", spacing=SPACING)
+    assert body(path, spacing=SPACING, rescale=(1.0, 0.0), n_inserts=0).labels.shape  # of a CT without air, say
+
+
+def test_a_rescale_of_the_file_that_leads_to_no_hu_is_refused(tmp_path):
+    folder = write_slices(tmp_path / "slices", *stored(corner()), RescaleIntercept="0")
+    refused(folder, r"holds \d+ to \d+, but a CT in HU .* rescale = \[1, 0\]")
+    assert body(folder, rescale=(1.0, 0.0), n_inserts=0, metal_hu=4000.0).labels.shape
