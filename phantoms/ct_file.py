@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from ctsim.errors import InputError
 from ctsim.geometry import Triple
+from ctsim.io.payload import quoted
 from ctsim.io.volumes.volumefile import VolumeFile
 from ctsim.phantoms.ct_headers import digest_at, range_at, volume_at
 
@@ -72,6 +73,11 @@ def _check_hu(path: str, file: VolumeFile) -> None:
             "expected a slope and an intercept"
         )
     slope, intercept = file.rescale or NO_CHANGE
+    if file.unit:
+        raise InputError(
+            f"rescale: {path} states that its values are {quoted(file.unit)}; expected HU, or "
+            f"rescale = [{slope:g}, {intercept:g}] if these are HU"
+        )
     try:
         lowest, highest = (value * slope + intercept for value in range_at(file))
     except InputError as error:

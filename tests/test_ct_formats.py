@@ -205,6 +205,11 @@ DOUBTFUL = {
         {"RescaleSlope": None, "RescaleIntercept": None},
         r"rescale: .* grey values \(uint16\) that cannot be HU",
     ),
+    "another unit": ({"RescaleType": "US"}, r"rescale: .* 'US'; expected HU, or rescale = \[1, -1024\]"),
+    "two spacings": (
+        {"SpacingBetweenSlices": "7"},
+        "slices are 7 mm apart by SpacingBetweenSlices, 2 mm by ImagePositionPatient",
+    ),
     "directions": (
         {"ImageOrientationPatient": [1, 0, 0, 0, 2, 0]},
         r"has ImageOrientationPatient of the lengths \[1\.0, 2\.0\]",
@@ -287,6 +292,35 @@ def test_a_nifti_without_or_with_two_orientations_is_refused(tmp_path):
     data[80:84] = np.float32(3).tobytes()  # pixdim of x
     path.write_bytes(data)
     refused(path, r"contradicts itself: its voxels are \[3\.0, 1\.5, 2\.0\] by pixdim, \[0\.8125, 1\.5, 2\.0\]")
+
+
+def test_a_nifti_whose_two_orientations_differ_is_refused(expected, tmp_path):
+    path = write(tmp_path, ".nii", *stored(corner()))
+    image, path = nibabel.Nifti1Image.from_filename(path), tmp_path / "two.nii"
+    turned, tilted = image.affine.copy(), image.affine.copy()
+    turned[:2] *= -1  # as a file in LPS that passes for one in RAS
+    tilted[:3, :3] = nibabel.eulerangles.euler2mat(0.2) @ tilted[:3, :3]  # the nearest axes are the same
+    image.set_qform(tilted, 1)
+    image.to_filename(path)
+    assert np.array_equal(body(path).labels, expected.labels)
+    image.set_qform(turned, 1)
+    image.to_filename(path)
+    refused(path, "by sform than by qform; expected the same, or a sform_code or qform_code of 0")
+    image.set_qform(turned, 0)
+    image.to_filename(path)
+    assert np.array_equal(body(path).labels, expected.labels)
+
+
+@pytest.mark.parametrize(
+    "words", [{"SpacingBetweenSlices": "-2.02"}, {"SpacingBetweenSlices": "0"}, {"RescaleType": "HU"}]
+)
+def test_what_is_stated_twice_and_alike_is_taken(expected, tmp_path, words):
+    assert np.array_equal(body(write_slices(tmp_path / "slices", *stored(corner()), **words)).labels, expected.labels)
+
+
+def test_a_unit_can_be_overruled(expected, tmp_path):
+    folder = write_slices(tmp_path / "slices", *stored(corner()), RescaleType="US")
+    assert np.array_equal(body(folder, rescale=(1.0, -1024.0)).labels, expected.labels)
 
 
 def test_metal_of_the_ct_is_refused_or_replaced_never_kept(tmp_path):
