@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ctsim.dataset.durable import replacing
 from ctsim.errors import InputError
+from ctsim.io.h5file import writing
 
 STACKS = ("p", "twin_p", "trace")
 VOLUMES = ("fdk", "twin", "reference", "metal")
@@ -51,7 +52,7 @@ def write(
     """
     entries = []
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as new, h5py.File(new, "w") as file:
+    with replacing(path) as new, writing(new) as (file, check):
         for entry, arrays, scene in scans:
             group = file.create_group(entry.name)
             group.attrs["scene"] = scene
@@ -61,6 +62,7 @@ def write(
                 )
             shapes = {item: array.shape for item, array in arrays.items()}
             entries.append(msgspec.structs.replace(entry, shapes=shapes))
+            check()  # before the next scan is reconstructed
         file.attrs[_CONTENTS] = msgspec.json.encode(Contents(format=FORMAT, scans=tuple(entries), items=items)).decode()
 
 
