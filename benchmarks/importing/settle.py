@@ -65,10 +65,11 @@ class Settled:
         g = self.geometry
         tube = "spectrum unknown" if self.tube is None else f"{self.tube.kvp:g} kV behind {_sheets(self.tube)}"
         held = f", {len(self.held)} more held out" if len(self.held) else ""
+        axis = f"{self.axis + 0.0:+.2f}"  # no -0.00
         sizes = [f"{d:.4g}" for d in g.d_voxel]
         size = sizes[0] if len({*sizes}) == 1 else " × ".join(sizes)
         return (
-            f"{g.n_views} views of {g.n_detector[0]} × {g.n_detector[1]}{held}; axis {self.axis + 0.0:+.2f} columns from the "
+            f"{g.n_views} views of {g.n_detector[0]} × {g.n_detector[1]}{held}; axis {axis} columns from the "
             f"middle; open field {self.level:.5g}, {self.i0:.3g} photons; {tube}; "
             f"{' × '.join(map(str, g.n_voxel))} voxels of {size} mm (z × y × x)"
         )
