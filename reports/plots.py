@@ -19,7 +19,7 @@ from matplotlib.widgets import Slider
 from numpy.typing import NDArray
 
 from ctsim.dataset.truth import ScanWithTruth
-from ctsim.errors import InputError
+from ctsim.errors import InputError, check_kind
 from ctsim.geometry import Geometry, few_views
 from ctsim.reconstruct.log import line_integrals
 from ctsim.types import Scan
@@ -123,8 +123,9 @@ def plot_geometry(scan: ScanWithTruth | Scan | Geometry) -> Figure:
     """Draw source, detector and volume of the first view: seen from +z, and from the side; all in mm.
 
     The dots are the sources of all views. In the view from the side, "out" is the direction from the axis to the
-    source.
+    source. Raises InputError for what is neither a scan nor a geometry.
     """
+    check_kind("scan", scan, (Geometry, ScanWithTruth, Scan), "a scan or a Geometry")
     geometry = scan if isinstance(scan, Geometry) else scan.geometry
     poses = geometry.pose_array()
     source, centre, du, dv = (poses[0, k : k + 3] for k in (0, 3, 6, 9))
