@@ -17,11 +17,12 @@ def length_of(width: float) -> float:
     return next(step * power for step in STEPS if step * power <= most * (1 + 1e-9))
 
 
-def scale_bar(axes: Axes, shape: tuple[int, ...], d_voxel: float, *, size: float = 6.5) -> None:
+def scale_bar(axes: Axes, shape: tuple[int, ...], d_voxel: float, *, size: float = 6.5, where: str = "") -> None:
     """Draw a bar and its length into the lower left of an image.
 
     `shape` is the image's (rows, columns), row 0 at the bottom, `d_voxel` the size of a column in mm, and `size` that
-    of the text in points. White on a black rim, so that it is seen on any grey.
+    of the text in points. The text ends with `where`, if these mm are not those of the image's plane. White on a black
+    rim, so that it is seen on any grey.
     """
     rows, columns = shape[:2]
     length = length_of(columns * d_voxel)
@@ -29,7 +30,7 @@ def scale_bar(axes: Axes, shape: tuple[int, ...], d_voxel: float, *, size: float
     rim = [withStroke(linewidth=3, foreground="black")]
     axes.plot([left, left + length / d_voxel], [bottom] * 2, color="white", lw=1.6, path_effects=rim, zorder=5)
     axes.annotate(
-        f"{length:g} mm", (left, bottom), xytext=(0, 2.5), textcoords="offset points", color="white", fontsize=size,
-        va="bottom", path_effects=[withStroke(linewidth=1.6, foreground="black")], zorder=5,
+        f"{length:g} mm {where}".rstrip(), (left, bottom), xytext=(0, 2.5), textcoords="offset points", color="white",
+        fontsize=size, va="bottom", path_effects=[withStroke(linewidth=1.6, foreground="black")], zorder=5,
     )  # fmt: skip
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(-0.5, rows - 0.5))

@@ -22,7 +22,7 @@ from ctsim.benchmarks.studies.methods.attempt import SCORED, Outcome, array_of, 
 from ctsim.benchmarks.studies.methods.records import METAL, TWIN
 from ctsim.benchmarks.suites import load, select
 from ctsim.dataset.truth import ScanWithTruth
-from ctsim.errors import InputError
+from ctsim.errors import InputError, check_kind
 from ctsim.human import human_choice
 from ctsim.phantoms.scene import Scene
 from ctsim.phantoms.suites import decode
@@ -36,6 +36,7 @@ def find_scene(suite: str, name: str, *, seed: int | None = None) -> Scene:
     With `seed` it is another individual with another noise, named NAME-sSEED as by `make-dataset --seeds`. Raises
     InputError for an unknown suite or scene.
     """
+    check_kind("suite", suite, str, "the name of a suite or the path of a TOML file, as a text")
     scenes = load(suite)
     names = [scene.name for scene in scenes]
     if name not in names:
@@ -65,6 +66,7 @@ def reconstruct_scan(scan: ScanWithTruth | Scan, method: str = "fdk", **paramete
     InputError
         For an unknown method, parameter or value, where the method skips this scan, and where it returns no volume.
     """
+    check_kind("scan", scan, (Scan, ScanWithTruth), "a scan, such as of open_scan or simulate_scene")
     found = with_beam(find(method, parameters), scan if isinstance(scan, ScanWithTruth) else None)
     given = _readings(found, scan)
     if (reason := found.skip(given)) is not None:
@@ -107,8 +109,11 @@ def score_volume(
     ------
     InputError
         Where a volume is not finite or not on the scan's grid, where its method ended with neither "ok" nor "diverged",
-        where `scan` is a twin, and for an unknown protocol or variant.
+        where `scan` is a twin or was measured, and for an unknown protocol or variant.
     """
+    check_kind("scan", scan, ScanWithTruth, "a scan with its truth, such as of open_scan or simulate_scene")
+    if not scan.has_truth:
+        raise InputError(f"{scan.place}: is a measured scan, which has no truth to score a volume with")
     protocols = {protocols} if isinstance(protocols, str) else set(protocols)
     if unknown := sorted(protocols - set(PROTOCOLS)):
         raise InputError(f"protocols: expected names among {', '.join(PROTOCOLS)}, got {unknown[0]!r}")

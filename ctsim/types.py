@@ -3,7 +3,7 @@
 import enum
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
@@ -139,6 +139,18 @@ class Scan:
         if not bool(((flat > self.dark) & (flat < math.inf)).any()):
             raise InputError(f"flat: no pixel is finite and above the pedestal, dark = {self.dark:g} counts")
 
+    def __reduce__(self) -> "tuple[Callable[..., Scan], tuple[Any, ...]]":
+        """Pickle unsigned readings by the signed numbers of the same bits: torch loads no uint16 and uint32."""
+        import torch
+
+        values: dict[str, Any] = {one.name: getattr(self, one.name) for one in fields(self)}
+        unsigned: dict[str, str] = {}
+        for name, value in values.items():
+            if isinstance(value, torch.Tensor) and value.dtype in (torch.uint16, torch.uint32):
+                unsigned[name] = str(value.dtype).removeprefix("torch.")
+                values[name] = value.view(getattr(torch, unsigned[name].removeprefix("u")))
+        return _unpickled, (type(self), values, unsigned)
+
     @classmethod
     def from_line_integrals(
         cls, p: "torch.Tensor | NDArray[np.floating]", geometry: Geometry, *, e_max: float, i0: float = 1e5
@@ -154,6 +166,12 @@ class Scan:
         counts = i0 * torch.exp(-torch.as_tensor(p, dtype=torch.float64))
         flat = torch.full(geometry.n_detector, i0, dtype=torch.float32)
         return cls(geometry=geometry, counts=counts.float(), flat=flat, i0=i0, e_max=e_max)
+
+
+def _unpickled(kind: type[Scan], values: dict[str, Any], unsigned: dict[str, str]) -> Scan:
+    import torch
+
+    return kind(**values | {name: values[name].view(getattr(torch, dtype)) for name, dtype in unsigned.items()})
 
 
 READINGS = ("uint8", "uint16", "uint32", "int8", "int16", "int32", "int64", "float16", "float32", "float64")

@@ -10,8 +10,9 @@ from scipy import ndimage
 
 from ctsim.errors import InputError
 from ctsim.geometry import Triple
+from ctsim.io.payload import quoted
 from ctsim.io.volumes.volumefile import VolumeFile
-from ctsim.phantoms.ct_headers import digest_at, volume_at
+from ctsim.phantoms.ct_headers import digest_at, range_at, volume_at
 
 ALIKE = 1e-3
 """Largest relative difference of a stated spacing to the file's: it is half a voxel over 500 of them."""
@@ -20,6 +21,8 @@ SAME = 1e-5
 BLOOM = 2.0
 """Distance (mm) to metal within which its blur is replaced, too."""
 NO_CHANGE = (1.0, 0.0)
+AIR = -200.0
+"""HU below which a CT has some voxel, of the air around the body; grey values and attenuations have none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,12 +60,33 @@ def settle(path: str, spacing: Triple | None, rescale: tuple[float, float] | Non
         raise InputError(f"path: {path} has voxels of {found} mm (z, y, x), expected 0.001 to 2000 mm")
     if rescale and file.rescale and not np.allclose(rescale, file.rescale, rtol=SAME, atol=SAME):
         raise InputError(f"rescale: got {rescale}, but {path} says {file.rescale}; expected the same or none")
-    if not rescale and not file.holds_hu:
+    if not rescale:
+        _check_hu(path, file)
+    return Settled(file=file, spacing=found, rescale=file.rescale or rescale or NO_CHANGE)
+
+
+def _check_hu(path: str, file: VolumeFile) -> None:
+    """Refuse values that are no HU, of which nobody says that they are. Raises InputError."""
+    if not file.holds_hu:
         raise InputError(
             f"rescale: {path} holds grey values ({file.dtype.name}) that cannot be HU, for air has -1000; "
             "expected a slope and an intercept"
         )
-    return Settled(file=file, spacing=found, rescale=file.rescale or rescale or NO_CHANGE)
+    slope, intercept = file.rescale or NO_CHANGE
+    if file.unit:
+        raise InputError(
+            f"rescale: {path} states that its values are {quoted(file.unit)}; expected HU, or "
+            f"rescale = [{slope:g}, {intercept:g}] if these are HU"
+        )
+    try:
+        lowest, highest = (value * slope + intercept for value in range_at(file))
+    except InputError as error:
+        raise InputError(f"path: {error}") from None
+    if lowest > AIR:
+        raise InputError(
+            f"rescale: {path} holds {lowest:.4g} to {highest:.4g}, but a CT in HU has air (below {AIR:g}); "
+            f"expected a slope and an intercept, or rescale = [{slope:g}, {intercept:g}] if these are HU"
+        )
 
 
 def digest_of(file: VolumeFile) -> str:

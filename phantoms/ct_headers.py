@@ -1,6 +1,6 @@
-"""Headers and SHA-256 of a CT's files, found once for as long as the files do not change.
+"""Headers, SHA-256 and range of a CT's files, found once for as long as the files do not change.
 
-A scene needs both where it is read and where it is built, and pydicom takes seconds for the headers of a long series.
+A scene needs them where it is read and where it is built, and pydicom takes seconds for the headers of a long series.
 """
 
 import functools
@@ -40,6 +40,12 @@ def digest_at(file: VolumeFile) -> str:
     return _digest(file, stamp) if stamp else file.digest()
 
 
+def range_at(file: VolumeFile) -> tuple[float, float]:
+    """Return the lowest and the highest value of a volume as it is stored; raises as `VolumeFile.values`."""
+    stamp = _stamp(*file.files)
+    return _range(file, stamp) if stamp else _range_of(file)
+
+
 @functools.lru_cache(KEPT)
 def _opened(known: _Known) -> VolumeFile:
     return open_volume(known.opened)
@@ -48,6 +54,16 @@ def _opened(known: _Known) -> VolumeFile:
 @functools.lru_cache(KEPT)
 def _digest(file: VolumeFile, stamp: Stamp) -> str:
     return file.digest()
+
+
+@functools.lru_cache(KEPT)
+def _range(file: VolumeFile, stamp: Stamp) -> tuple[float, float]:
+    return _range_of(file)
+
+
+def _range_of(file: VolumeFile) -> tuple[float, float]:
+    values = file.values()
+    return float(values.min()), float(values.max())
 
 
 def _stamp(*paths: Path) -> Stamp:

@@ -19,7 +19,7 @@ from ctsim.dataset.memory import MemoryWriter, SimulatedScan
 from ctsim.dataset.truth import ScanWithTruth
 from ctsim.dataset.writer import SceneWriter, Stack
 from ctsim.detector.response import response
-from ctsim.errors import InputError
+from ctsim.errors import InputError, check_kind
 from ctsim.notes import metal_share
 from ctsim.phantoms.scene import Scene, build, individual, parse_suite, scene_id, scene_to_toml, stream_id
 from ctsim.phantoms.variants import build_all
@@ -171,6 +171,7 @@ def simulate_scene(scene: Scene) -> SimulatedScan:
 
     Raises InputError where memory is short.
     """
+    check_kind("scene", scene, Scene, "a Scene, such as of find_scene or new_scene")
     with _memory(scene.name):
         job = _Job.of(scene, build(scene, whole=False))
         writer = MemoryWriter(scene.name, scene_id=scene_id(scene), stacks=_stacks(job.plan, job.scanner))

@@ -18,9 +18,10 @@ from matplotlib.patches import Polygon
 from matplotlib.widgets import Slider
 from numpy.typing import NDArray
 
+from ctsim.benchmarks.scalebar import scale_bar
 from ctsim.dataset.truth import ScanWithTruth
-from ctsim.errors import InputError
-from ctsim.geometry import Geometry, few_views
+from ctsim.errors import InputError, check_kind
+from ctsim.geometry import Geometry, Pair, few_views
 from ctsim.reconstruct.log import line_integrals
 from ctsim.types import Scan
 
@@ -37,13 +38,14 @@ def plot_projections(
 
     A still picture shows `views`, by default six from the first to the last, in one window. With `slider` (default:
     where the backend is interactive) it is one view and a slider over all; the first of `views` is where it starts.
+    Views of a scan have a scale bar, in mm at the detector.
 
     Raises
     ------
     InputError
         For an array that is no stack of real numbers, and for a view that does not exist.
     """
-    n, view_of = _stack(scan)
+    n, view_of, pixel = _stack(scan)
     for k in views:
         if not 0 <= k < n:
             raise InputError(f"view must be within 0 to {n - 1}, got {k}")
@@ -51,8 +53,9 @@ def plot_projections(
         slider = is_interactive()
     chosen = views or tuple(int(k) for k in few_views(n, SHOWN))
     if slider:
-        return _with_slider(n, view_of, chosen[0], _window([view_of(int(k)) for k in few_views(n, SHOWN)]))
-    return _still(chosen, [view_of(k) for k in chosen])
+        window = _window([view_of(int(k)) for k in few_views(n, SHOWN)])
+        return _with_slider(n, view_of, chosen[0], window, pixel)
+    return _still(chosen, [view_of(k) for k in chosen], pixel)
 
 
 def is_interactive() -> bool:
@@ -60,17 +63,18 @@ def is_interactive() -> bool:
     return matplotlib.get_backend().lower() in (*backend_registry.list_builtin(BackendFilter.INTERACTIVE), *NOTEBOOK)
 
 
-def _stack(scan: ScanWithTruth | Scan | NDArray[Any]) -> tuple[int, Callable[[int], NDArray[Any]]]:
-    """Return how many views there are, and what gives one of them as an image [v, u]."""
+def _stack(scan: ScanWithTruth | Scan | NDArray[Any]) -> tuple[int, Callable[[int], NDArray[Any]], Pair | None]:
+    """Return how many views there are, what gives one as an image [v, u], and its pixels (v, u) in mm if known."""
     if isinstance(scan, ScanWithTruth):
         scan = scan.scan
     if isinstance(scan, Scan):
         readings = scan
-        return readings.geometry.n_views, lambda k: line_integrals(readings, k)[0].numpy()
+        geometry = readings.geometry
+        return geometry.n_views, lambda k: line_integrals(readings, k)[0].numpy(), geometry.d_detector
     stack = np.asarray(scan)
     if stack.ndim != 3 or 0 in stack.shape or stack.dtype.kind not in "biuf":
         raise InputError(f"expected a scan or real numbers [view, v, u], got {stack.dtype} of shape {stack.shape}")
-    return len(stack), lambda k: stack[k]
+    return len(stack), lambda k: stack[k], None
 
 
 def _window(images: list[NDArray[Any]]) -> tuple[float, float]:
@@ -80,11 +84,19 @@ def _window(images: list[NDArray[Any]]) -> tuple[float, float]:
     return low, high if high > low else low + 1.0
 
 
-def _image(axes: Axes, image: NDArray[Any], window: tuple[float, float]) -> AxesImage:
-    return axes.imshow(image, cmap="gray", vmin=window[0], vmax=window[1], origin="lower", interpolation="nearest")
+def _image(axes: Axes, image: NDArray[Any], window: Pair, pixel: Pair | None) -> AxesImage:
+    d_v, d_u = pixel or (1.0, 1.0)
+    return axes.imshow(
+        image, cmap="gray", vmin=window[0], vmax=window[1], origin="lower", interpolation="nearest", aspect=d_v / d_u
+    )
 
 
-def _still(views: tuple[int, ...], images: list[NDArray[Any]]) -> Figure:
+def _bar(axes: Axes, image: NDArray[Any], pixel: Pair | None) -> None:
+    if pixel is not None:
+        scale_bar(axes, image.shape, pixel[1], where="at the detector")
+
+
+def _still(views: tuple[int, ...], images: list[NDArray[Any]], pixel: Pair | None) -> Figure:
     """Draw views next to each other."""
     columns = min(COLUMNS, len(views))
     rows = -(-len(views) // columns)
@@ -94,18 +106,23 @@ def _still(views: tuple[int, ...], images: list[NDArray[Any]]) -> Figure:
     for axes in grid.flat[len(views) :]:
         axes.axis("off")
     for axes, k, image in zip(grid.flat, views, images, strict=False):
-        shown = _image(axes, image, window)
+        shown = _image(axes, image, window, pixel)
         axes.set_title(f"view {k}", fontsize=9)
         axes.set(xticks=[], yticks=[])
         figure.colorbar(shown, ax=list(grid.flat), fraction=0.03) if k == views[-1] else None
+    _bar(grid[0, 0], images[0], pixel)
     return figure
 
 
-def _with_slider(n: int, view_of: Callable[[int], NDArray[Any]], first: int, window: tuple[float, float]) -> Figure:
+def _with_slider(
+    n: int, view_of: Callable[[int], NDArray[Any]], first: int, window: Pair, pixel: Pair | None
+) -> Figure:
     """Open a window with one view and a slider over all."""
     figure, axes = pyplot.subplots()
     figure.subplots_adjust(bottom=0.18)
-    shown = _image(axes, view_of(first), window)
+    image = view_of(first)
+    shown = _image(axes, image, window, pixel)
+    _bar(axes, image, pixel)
     axes.set(xlabel="u (pixels)", ylabel="v (pixels)")
     figure.colorbar(shown, ax=axes)
     bar = Slider(figure.add_axes((0.15, 0.04, 0.7, 0.04)), "view", 0, max(n - 1, 1), valinit=first, valstep=range(n))
@@ -123,8 +140,9 @@ def plot_geometry(scan: ScanWithTruth | Scan | Geometry) -> Figure:
     """Draw source, detector and volume of the first view: seen from +z, and from the side; all in mm.
 
     The dots are the sources of all views. In the view from the side, "out" is the direction from the axis to the
-    source.
+    source. Raises InputError for what is neither a scan nor a geometry.
     """
+    check_kind("scan", scan, (Geometry, ScanWithTruth, Scan), "a scan or a Geometry")
     geometry = scan if isinstance(scan, Geometry) else scan.geometry
     poses = geometry.pose_array()
     source, centre, du, dv = (poses[0, k : k + 3] for k in (0, 3, 6, 9))

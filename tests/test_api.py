@@ -7,7 +7,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+import scan_files
 import torch
+from closed_scans import GEOMETRY, counts_of, line_integrals
 from conftest import SMALLEST
 from run_records import run_jobs
 
@@ -15,6 +17,8 @@ import ctsim
 from ctsim import api
 from ctsim.api import find_scene, new_scene, reconstruct_scan, score_volume
 from ctsim.benchmarks import methods
+from ctsim.benchmarks.importing import Flags
+from ctsim.benchmarks.importing.work import bring
 from ctsim.benchmarks.scores.score import NOT_ASKED, PROTOCOLS
 from ctsim.benchmarks.studies.methods import plan
 from ctsim.dataset.store import list_scans, open_scan
@@ -134,6 +138,30 @@ def test_volumes_that_cannot_be_scored_are_refused(simulated):
         score_volume(np.zeros(shape), simulated.metal_free)
     with pytest.raises(InputError, match=r"variant: expected 'metal' or 'metal_free', got 'metalfree'"):
         score_volume(np.zeros(shape), simulated, variant="metalfree")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: ctsim.simulate_scene("quick"), "scene: expected a Scene, such as of find_scene or new_scene, got str"),
+        (lambda: ctsim.reconstruct_scan(42), "scan: expected a scan, .* got int"),
+        (lambda: ctsim.score_volume(np.zeros((2, 2, 2)), "data/x"), "scan: expected a scan with its truth, .* got str"),
+        (lambda: ctsim.plot_geometry("x"), "scan: expected a scan or a Geometry, got str"),
+        (lambda: ctsim.plot_projections("x"), "expected a scan or real numbers"),
+        (lambda: ctsim.find_scene(42, "x"), "suite: expected the name of a suite .* got int"),
+    ],
+)
+def test_what_is_no_scan_is_one_sentence(call, said):
+    with pytest.raises(InputError, match=f"^{said}"):
+        call()
+
+
+def test_a_measured_scan_has_no_truth_to_score_with(tmp_path):
+    few = msgspec.structs.replace(GEOMETRY, n_views=6)
+    log = scan_files.skyscan(tmp_path / "scan", counts_of(line_integrals(few)), few)
+    own = open_scan(bring(Flags(scan=log, out=tmp_path / "data")))
+    with pytest.raises(InputError, match="data/rods: is a measured scan, which has no truth"):
+        ctsim.score_volume(np.zeros(own.geometry.n_voxel), own)
 
 
 @pytest.mark.parametrize("status", list(Status))

@@ -205,6 +205,11 @@ DOUBTFUL = {
         {"RescaleSlope": None, "RescaleIntercept": None},
         r"rescale: .* grey values \(uint16\) that cannot be HU",
     ),
+    "another unit": ({"RescaleType": "US"}, r"rescale: .* 'US'; expected HU, or rescale = \[1, -1024\]"),
+    "two spacings": (
+        {"SpacingBetweenSlices": "7"},
+        "slices are 7 mm apart by SpacingBetweenSlices, 2 mm by ImagePositionPatient",
+    ),
     "directions": (
         {"ImageOrientationPatient": [1, 0, 0, 0, 2, 0]},
         r"has ImageOrientationPatient of the lengths \[1\.0, 2\.0\]",
@@ -289,13 +294,42 @@ def test_a_nifti_without_or_with_two_orientations_is_refused(tmp_path):
     refused(path, r"contradicts itself: its voxels are \[3\.0, 1\.5, 2\.0\] by pixdim, \[0\.8125, 1\.5, 2\.0\]")
 
 
+def test_a_nifti_whose_two_orientations_differ_is_refused(expected, tmp_path):
+    path = write(tmp_path, ".nii", *stored(corner()))
+    image, path = nibabel.Nifti1Image.from_filename(path), tmp_path / "two.nii"
+    turned, tilted = image.affine.copy(), image.affine.copy()
+    turned[:2] *= -1  # as a file in LPS that passes for one in RAS
+    tilted[:3, :3] = nibabel.eulerangles.euler2mat(0.2) @ tilted[:3, :3]  # the nearest axes are the same
+    image.set_qform(tilted, 1)
+    image.to_filename(path)
+    assert np.array_equal(body(path).labels, expected.labels)
+    image.set_qform(turned, 1)
+    image.to_filename(path)
+    refused(path, "by sform than by qform; expected the same, or a sform_code or qform_code of 0")
+    image.set_qform(turned, 0)
+    image.to_filename(path)
+    assert np.array_equal(body(path).labels, expected.labels)
+
+
+@pytest.mark.parametrize(
+    "words", [{"SpacingBetweenSlices": "-2.02"}, {"SpacingBetweenSlices": "0"}, {"RescaleType": "HU"}]
+)
+def test_what_is_stated_twice_and_alike_is_taken(expected, tmp_path, words):
+    assert np.array_equal(body(write_slices(tmp_path / "slices", *stored(corner()), **words)).labels, expected.labels)
+
+
+def test_a_unit_can_be_overruled(expected, tmp_path):
+    folder = write_slices(tmp_path / "slices", *stored(corner()), RescaleType="US")
+    assert np.array_equal(body(folder, rescale=(1.0, -1024.0)).labels, expected.labels)
+
+
 def test_metal_of_the_ct_is_refused_or_replaced_never_kept(tmp_path):
     hu = np.full((12, 20, 20), 40, np.int16)
     hu[:, :, 9:] = 900
     clean = hu.copy()
     hu[5:7, 8:10, 14:16], hu[6, 9, 6] = 9000, 3000  # an implant in bone, and a voxel at the limit
     np.save(tmp_path / "ct.npy", hu)
-    given = {"spacing": (1.0, 1.0, 1.0)}
+    given = {"spacing": (1.0, 1.0, 1.0), "rescale": (1.0, 0.0)}  # there is no air
     refused(tmp_path / "ct.npy", r"holds metal, 8 voxels above metal_hu = 3000 HU \(up to 9000\)", **given)
     np.save(tmp_path / "clean.npy", clean)
     expected = body(tmp_path / "clean.npy", **given)
@@ -320,3 +354,31 @@ def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch):
 def test_directions_are_a_rotation():
     assert np.allclose(oblique() @ oblique().T, np.eye(3))
     assert np.linalg.det(oblique()[::-1]) == pytest.approx(1)
+
+
+NO_HU = {
+    "grey values of 8 bits": lambda hu: (hu // 16 + 100).clip(0, 255),
+    "HU + 1024": lambda hu: hu + 1024,
+    "attenuation in 1/mm": lambda hu: (0.02 * (1 + hu / 1000)).astype(np.float32),
+    "0 to 1": lambda hu: ((hu + 1000) / 2500).astype(np.float32),
+    "-1 to 1": lambda hu: ((hu + 1000) / 1250 - 1).astype(np.float32),
+}
+
+
+@pytest.mark.parametrize("kind", [".nii.gz", ".mha", ".nrrd", ".npy"])
+@pytest.mark.parametrize("change", NO_HU.values(), ids=NO_HU)
+def test_values_that_are_no_hu_need_a_rescale(tmp_path, kind, change):
+    array, steps = stored(change(corner()))
+    path = tmp_path / "ct.npy"
+    if kind == ".npy":
+        np.save(path, array)
+    else:
+        path = write(tmp_path, kind, array, steps)
+    refused(path, r"rescale: .* a CT in HU has air .* or rescale = \[1, 0\]", spacing=SPACING)
+    assert body(path, spacing=SPACING, rescale=(1.0, 0.0), n_inserts=0).labels.shape  # of a CT without air, say
+
+
+def test_a_rescale_of_the_file_that_leads_to_no_hu_is_refused(tmp_path):
+    folder = write_slices(tmp_path / "slices", *stored(corner()), RescaleIntercept="0")
+    refused(folder, r"holds \d+ to \d+, but a CT in HU .* rescale = \[1, 0\]")
+    assert body(folder, rescale=(1.0, 0.0), n_inserts=0, metal_hu=4000.0).labels.shape

@@ -33,7 +33,9 @@ def test_an_example_works(kind, text, smallest, tmp_path, monkeypatch):
     (tmp_path / "data").symlink_to(smallest)
     tifffile.imwrite(tmp_path / "head.tif", np.full((50, 150, 150), 1074, np.uint16))
     if '"head"' in text:
-        write_slices(tmp_path / "head", *stored(np.full((50, 150, 150), 50, np.int16), spacing=(2.4, 0.8, 0.8)))
+        head = np.full((50, 150, 150), 50, np.int16)
+        head[:, :2] = -1000  # the air around it
+        write_slices(tmp_path / "head", *stored(head, spacing=(2.4, 0.8, 0.8)))
     monkeypatch.chdir(tmp_path)
     if kind == "python":
         exec(compile(text, "example", "exec"), {"__name__": "example"})

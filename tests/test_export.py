@@ -167,6 +167,10 @@ def test_the_command_writes_references_labels_and_reconstructions(smallest, tmp_
         (("{scan}", "{new}.mha", "--to", "mha", "--volume", "nowhere"), "nowhere is no file and none of labels, metal"),
         (("{scan}", "{new}.mha", "--to", "mha", "--volume", "{scan}/flat.tif"), "expected (10, 12, 12)"),
         (("{scan}", "{new}.mha", "--to", "mha", "--hu", "--kev", "0"), "--kev must be within 1 to 800, got 0"),
+        (
+            ("{scan}", "{new}.nii", "--to", "nifti", "--kev", "60"),
+            "--kev says at which energy water is 0 HU: expected --hu",
+        ),
         (("{new}", "{new}.mha", "--to", "mha"), "no such scene folder"),
     ],
 )

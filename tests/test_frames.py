@@ -180,6 +180,7 @@ def test_a_ct_that_is_read_scanned_and_exported_keeps_its_corner(tmp_path, kind,
     """Bone at the patient's left, in front, near the head, in a file whose axes run to other sides."""
     hu = np.full((12, 16, 20), 40, np.int16)  # z, y, x of LPS, in voxels of 2 mm
     hu[9:11, 1:4, 15:18] = 900
+    hu[:, -1] = -1000  # air, which every CT has
     source = write(tmp_path, kind, *stored(hu, (0, 1, 2), flips, (2.0, 2.0, 2.0), np.eye(3)[::-1]))
     bone, middle = marked(with_itk(source), 900)
     placed = bone - middle

@@ -158,6 +158,26 @@ def test_the_axis_is_found_when_it_is_imported(tmp_path):
     assert abs(-found.off_detector[1] / 1.6 - 3.7) < 0.25
 
 
+def test_an_axis_that_is_assumed_is_said(tmp_path, capsys):
+    """Of less than a turn the axis is not found; a number, or the axis of a turn, is no assumption."""
+    short = msgspec.structs.replace(GEOMETRY, arc_deg=200.0)
+    log = scan_files.skyscan(tmp_path / "scan", COUNTS, short, step=8.333)
+    assumed = "the detector's middle assumed, or --center PIXELS"
+    for center, said in (("", True), ("file", True), ("0", False)):
+        stored = open_scan(bring(Flags(scan=log, out=tmp_path / "data", name=f"one{center}", center=center)))
+        assert (assumed in " ".join(stored.info.notes), assumed in capsys.readouterr().out) == (said, said)
+    turn = scan_files.skyscan(tmp_path / "turn", COUNTS, GEOMETRY)
+    assert assumed not in " ".join(open_scan(bring(Flags(scan=turn, out=tmp_path / "data"))).info.notes)
+
+
+def test_voxels_that_are_no_cubes_are_said(tmp_path, capsys):
+    scanner = msgspec.structs.replace(GEOMETRY, n_views=6)
+    folder = scan_files.r2(tmp_path / "scan", line_integrals(scanner), scanner)
+    bring(Flags(scan=folder, out=tmp_path / "data", center="file"))
+    sizes = " × ".join(f"{d:.4g}" for d in GEOMETRY.d_voxel)
+    assert len({*GEOMETRY.d_voxel}) > 1 and f"voxels of {sizes} mm (z × y × x)" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

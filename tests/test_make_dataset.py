@@ -2,20 +2,24 @@
 
 import hashlib
 import shutil
+import tomllib
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 import tifffile
+import tomli_w
 
 from ctsim.benchmarks.make_dataset import main
 from ctsim.benchmarks.make_dataset import work as command
+from ctsim.benchmarks.make_dataset.work import PLANNED
 from ctsim.benchmarks.suites import STUDY_SUITES, bundled, load, select
 from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
 from ctsim.human import human_bytes, human_time
 from ctsim.phantoms import dataset
+from ctsim.phantoms.dataset import plan_scene
 from ctsim.phantoms.scene import load_suite, parse_suite, scene_id
 
 SUITE = """
@@ -100,6 +104,38 @@ def test_a_dry_run_tells_all_and_writes_nothing(tmp_path, suite, capsys):
     assert "no metal: metal-free twin" in bare and "no metal" not in rods
     assert "(energies)" in rods and "on disk" in rods and "not asked: " in rods
     assert not (tmp_path / "data").exists()
+
+
+def planned(capsys, *words):
+    """Return the titles of a dry run, and its last line."""
+    assert main([*map(str, words), "--dry-run"]) == 0
+    *titles, total = [line for line in capsys.readouterr().out.splitlines() if not line.startswith(" ")]
+    return titles, total
+
+
+def test_a_dry_run_plans_one_of_the_scenes_that_differ_in_their_seed_alone(made, tmp_path, suite, capsys):
+    titles, total = planned(capsys, suite, tmp_path / "data", "--seeds", *range(500))
+    more = "and 499 more that differ in their seed alone"
+    assert titles == [f"rods-s0, {more}", f"bare-s0, {more}"] and total.endswith(" (planned 2 of 1000 scenes)")
+    plans = [plan_scene(scene) for scene in select(load(suite), (), (0,))]
+    assert f", {human_bytes(500 * sum(plan.disk_bytes for plan in plans))} on disk " in total
+    data = Path(shutil.copytree(made, tmp_path / "made"))
+    (tmp_path / "two.toml").write_text(Path(suite).read_text().replace('"bare"', '"other"'))
+    assert planned(capsys, tmp_path / "two.toml", data)[0] == ["rods: already complete", "other"]
+
+
+def test_a_dry_run_of_many_plans_one_of_a_recipe_and_geometry(tmp_path, suite, capsys):
+    def listed(n):
+        doses = [{"name": f"s{k}", "scanner": {"i0": 1e4 + k}} for k in range(n)]
+        given = tomllib.loads(Path(suite).read_text())
+        text = tomli_w.dumps(given | {"scene": [{**given["scene"][k % 2], **one} for k, one in enumerate(doses)]})
+        (tmp_path / "many.toml").write_text(text)
+        return planned(capsys, tmp_path / "many.toml", tmp_path / "data")
+
+    assert listed(PLANNED)[0] == [f"s{k}" for k in range(PLANNED)]
+    titles, total = listed(1000)
+    assert titles == [f"s{k}, and 499 more of its recipe, metal and geometry" for k in (0, 1)]
+    assert total.endswith("(planned 2 of 1000 scenes)")
 
 
 def test_finished_scenes_are_skipped(made, suite, tmp_path, capsys):

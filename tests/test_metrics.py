@@ -303,6 +303,14 @@ def test_a_pure_energy_scale_is_what_alignment_removes():
     assert scores["metal"].values["core_ratio"] == pytest.approx(0.8, rel=1e-5)
 
 
+def test_alignment_turns_no_sign():
+    t = truth()
+    negative = evaluate(-t.references["effective"], t)
+    assert negative["aligned"].values == {**negative["tissue"].values, "gain": None}
+    assert negative["aligned"].alignment == "none: no positive gain fits"
+    assert negative["aligned"].values["psnr3d"] < 10
+
+
 def test_a_method_that_knows_energies_is_held_against_50_kev_by_its_volume_at_50_kev():
     t = truth()
     delivered, true = t.references["effective"], t.references["50kev"]

@@ -82,6 +82,13 @@ def test_a_bad_volume_in_its_place_is_scored(size):
         check(noisy(reference, size, seed), reference)
 
 
+@pytest.mark.parametrize("negative", [lambda v: -v, lambda v: 2 * WATER - v, lambda v: -v[:, ::-1]])
+def test_a_negative_is_refused_by_name(negative):
+    reference = np.maximum(body(), 0.9 * body()[:, ::-1])
+    with pytest.raises(InputError, match=r"^mine looks like the negative of a volume: .* reference -0\.[5-9]\d$"):
+        check(negative(noisy(reference, 0.1)), reference)
+
+
 def test_a_volume_without_content_is_scored():
     reference = body()
     check(np.zeros_like(reference), reference)

@@ -68,6 +68,22 @@ def test_views_of_a_scan_are_line_integrals(tmp_path):
     assert image.get_array().mean() == pytest.approx(np.log(2), rel=1e-6)  # 1000 counts of 2000; float32
 
 
+@pytest.mark.parametrize("slider", [False, True])
+def test_views_of_a_scan_have_a_scale_bar_at_the_detector(tmp_path, slider):
+    scan = Double(folder=tmp_path, name="box").scan
+    try:
+        figure = plot_projections(scan, (3, 1), slider=slider)
+        axes = figure.axes[0]
+        (line,), (text,) = axes.lines, axes.texts
+        length = length_of(GEOMETRY.s_detector[1])
+        assert text.get_text() == f"{length:g} mm at the detector"
+        assert np.ptp(line.get_xdata()) * GEOMETRY.d_detector[1] == pytest.approx(length, rel=1e-12)
+        assert axes.get_aspect() == pytest.approx(GEOMETRY.d_detector[0] / GEOMETRY.d_detector[1])
+        assert not any(axes.lines for axes in plot_projections(STACK, slider=False).axes)  # no one knows its pixels
+    finally:
+        pyplot.close("all")
+
+
 def test_the_slider_turns_the_views():
     try:
         figure = plot_projections(STACK, (2,), slider=True)

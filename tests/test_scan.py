@@ -1,7 +1,10 @@
 """What a scan may be: the impossible is refused where it is said, not turned into a volume."""
 
+import copy
 import dataclasses
 import math
+import multiprocessing
+import pickle
 
 import numpy as np
 import pytest
@@ -66,6 +69,31 @@ def test_readings_of_every_type_that_numpy_has_are_taken(dtype):
 @pytest.mark.parametrize("fill", [math.nan, math.inf, 0.0, -5.0])
 def test_one_pixel_that_sees_is_enough(fill):
     assert Scan(**GOOD | {"flat": part(fill)}).flat[3, 4] == 2000
+
+
+@pytest.mark.parametrize("dtype", [getattr(torch, name) for name in READINGS], ids=str)
+@pytest.mark.parametrize("same", [lambda scan: pickle.loads(pickle.dumps(scan)), copy.deepcopy], ids=["pickle", "copy"])
+def test_a_scan_comes_back_from_a_pickle(dtype, same):
+    counts = torch.arange(math.prod(GEOMETRY.shape)).mul(257).reshape(GEOMETRY.shape).to(dtype)  # bits of all bytes
+    flat = torch.full(GEOMETRY.n_detector, 100).to(dtype)
+    scan = Scan(
+        geometry=GEOMETRY, counts=counts, flat=flat, metal=torch.ones(GEOMETRY.n_voxel, dtype=torch.bool), name="a/b"
+    )
+    found = same(scan)
+    for one in dataclasses.fields(Scan):
+        was, now = getattr(scan, one.name), getattr(found, one.name)
+        assert type(was) is type(now)
+        assert np.array_equal(was, now) and was.dtype == now.dtype if isinstance(was, torch.Tensor) else was == now
+
+
+def total(scan: Scan) -> int:
+    return int(scan.counts.double().sum())
+
+
+def test_a_scan_travels_to_another_process():
+    scan = Scan(**GOOD | {"counts": torch.full(GEOMETRY.shape, 60000, dtype=torch.uint16)})
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert pool.apply(total, (scan,)) == total(scan)
 
 
 def test_counts_are_not_read():

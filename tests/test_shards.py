@@ -1,14 +1,21 @@
 """Shards for training: what is in them is the scan, and the PyTorch dataset gives it to any worker."""
 
 import pickle
+import shutil
 from pathlib import Path
 
 import h5py
+import msgspec
 import numpy as np
 import pytest
+import scan_files
 import torch
+from closed_scans import GEOMETRY, counts_of
+from closed_scans import line_integrals as integrals_of
 from torch.utils.data import DataLoader
 
+from ctsim.benchmarks.importing import Flags
+from ctsim.benchmarks.importing.work import bring
 from ctsim.benchmarks.make_dataset import main as make_dataset
 from ctsim.benchmarks.shards.work import main
 from ctsim.dataset.manifest import read_index
@@ -178,6 +185,32 @@ def test_a_shard_of_other_scans_or_items_is_not_taken_for_one_of_these(folder, t
         main([data, str(out)])
     other.unlink()
     assert main([data, str(out)]) == 0
+
+
+def test_a_damaged_array_is_named(folder, tmp_path):
+    shutil.copytree(folder / "out", tmp_path / "out")
+    path = next(shards.shards_of(tmp_path / "out"))
+    with h5py.File(path) as file:
+        name = shards.contents(path).scans[0].name
+        chunk = file[name]["fdk"].id.get_chunk_info(2)
+    data = bytearray(path.read_bytes())
+    data[chunk.byte_offset + chunk.size // 2] ^= 4
+    path.write_bytes(data)
+    scans = Scans(tmp_path / "out", ("fdk",))
+    at = next(k for k in range(len(scans)) if scans.where(k)[0] == name)
+    with pytest.raises(InputError, match=rf"{path}: fdk of {name} is damaged; delete the file"):
+        scans[at]
+
+
+def test_a_measured_scan_has_what_is_known_of_it(tmp_path):
+    few = msgspec.structs.replace(GEOMETRY, n_views=6)
+    bring(Flags(scan=scan_files.skyscan(tmp_path / "scan", counts_of(integrals_of(few)), few), out=tmp_path / "data"))
+    assert main([str(tmp_path / "data"), str(tmp_path / "out")]) == 0
+    (entry,) = shards.contents(next(shards.shards_of(tmp_path / "out"))).scans
+    assert {*entry.shapes} == {"p", "fdk"}
+    with pytest.raises(InputError, match=r"--items reference: .*data/rods is a measured scan without it"):
+        main([str(tmp_path / "data"), str(tmp_path / "none"), "--items", "p", "reference"])
+    assert not (tmp_path / "none").exists()
 
 
 def test_what_is_not_there_is_one_sentence(folder, tmp_path):

@@ -83,7 +83,11 @@ def test_the_command_adds_a_marked_row(smallest, fdk, tmp_path, capsys, monkeypa
         ({"name": "fdk"}, "is a method of ctsim"),
         ({"name": "a[b]"}, "expected up to 60 letters"),
         ({"seconds": -1.0}, "must be positive"),
-        ({"inputs": " "}, "--inputs is empty"),
+        ({"inputs": " "}, "--inputs ' ': expected a text such as"),
+        ({"inputs": "counts | mask"}, "--inputs 'counts | mask': expected"),
+        ({"inputs": "counts\nonly"}, "up to 60 letters, digits"),
+        ({"cite": "doi:1\n2"}, "--cite 'doi:1\\n2': expected one line"),
+        ({"cite": "a" * 301}, "up to 300 characters"),
         ({"unit": "hu"}, "looks like 1/mm"),
     ],
 )

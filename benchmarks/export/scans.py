@@ -3,19 +3,20 @@
 Lengths are mm. `docs/reference/conventions.md` says how the frames lie in each other.
 """
 
+import io
 import json
 import math
 import pickle
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.lib.format as npy
 from numpy.typing import NDArray
 
-from ctsim.dataset.durable import replacing
+from ctsim.dataset.durable import making, replacing
 from ctsim.dataset.interop import Library, angles_to, astra_vectors, projections_to, volume_to
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -66,11 +67,8 @@ def write_scan(out: Path, to: str, scan: Measured) -> None:
         with replacing(out) as new:
             layout.write(new, scan)
         return
-    partial = out.with_name(f".{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir()
-    layout.write(partial, scan)
-    partial.rename(out)
+    with making(out) as new:
+        layout.write(new, scan)
 
 
 def _json(path: Path, content: dict[str, Any]) -> None:
@@ -78,7 +76,11 @@ def _json(path: Path, content: dict[str, Any]) -> None:
 
 
 def _save(path: Path, values: NDArray[Any]) -> None:
-    np.save(path, np.ascontiguousarray(values))
+    values, head = np.ascontiguousarray(values), io.BytesIO()
+    npy.write_array_header_1_0(head, npy.header_data_from_array_1_0(values))
+    with path.open("wb") as file:  # np.save says of a full disk only how many values were written
+        file.write(head.getvalue())
+        file.write(values.data)
 
 
 def _tigre(folder: Path, scan: Measured) -> None:

@@ -37,6 +37,8 @@ def export(given: Flags) -> None:
     another format.
     """
     _check_out(given.out, given.to)
+    if given.kev is not None and not given.hu and given.to in FORMATS and given.to != "dicom":
+        raise InputError("--kev says at which energy water is 0 HU: expected --hu with it")
     stored = open_scan(given.scan)
     if given.to in LAYOUTS:
         _export_scan(given, stored)

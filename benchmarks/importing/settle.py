@@ -65,10 +65,13 @@ class Settled:
         g = self.geometry
         tube = "spectrum unknown" if self.tube is None else f"{self.tube.kvp:g} kV behind {_sheets(self.tube)}"
         held = f", {len(self.held)} more held out" if len(self.held) else ""
+        axis = f"{self.axis + 0.0:+.2f}"  # no -0.00
+        sizes = [f"{d:.4g}" for d in g.d_voxel]
+        size = sizes[0] if len({*sizes}) == 1 else " × ".join(sizes)
         return (
-            f"{g.n_views} views of {g.n_detector[0]} × {g.n_detector[1]}{held}; axis {self.axis:+.2f} columns from the "
+            f"{g.n_views} views of {g.n_detector[0]} × {g.n_detector[1]}{held}; axis {axis} columns from the "
             f"middle; open field {self.level:.5g}, {self.i0:.3g} photons; {tube}; "
-            f"{' × '.join(map(str, g.n_voxel))} voxels of {g.d_voxel[2]:.4g} mm"
+            f"{' × '.join(map(str, g.n_voxel))} voxels of {size} mm (z × y × x)"
         )
 
 
@@ -82,7 +85,7 @@ def settle(scan: ScanFile, given: Flags) -> Settled:
     first = scan.read(0)
     whole = scan.dtype == "uint16" and first.dtype in (np.uint8, np.uint16)
     flat, level, i0 = _opened(scan, geometry, given, notes)
-    axis = _axis(scan, geometry, flat, i0, given)
+    axis = _axis(scan, geometry, flat, i0, given, notes)
     geometry = msgspec.structs.replace(
         geometry, off_detector=(geometry.off_detector[0], -axis * geometry.d_detector[1])
     )
@@ -163,13 +166,17 @@ def _opened(
     return flat, found.level, photons
 
 
-def _axis(scan: ScanFile, geometry: Geometry, flat: NDArray[np.float32], i0: float, given: Flags) -> float:
+def _axis(
+    scan: ScanFile, geometry: Geometry, flat: NDArray[np.float32], i0: float, given: Flags, notes: list[str]
+) -> float:
     """Return the axis in columns from the detector's middle."""
     stated = -geometry.off_detector[1] / geometry.d_detector[1]
     asked = given.center or ("file" if scan.axis_known or not _is_turn(geometry) else "auto")
     if geometry.poses is not None and asked != "file":
         raise InputError("--center: the scan's views are poses, which say where the axis is")
     if asked == "file":
+        if not scan.axis_known:
+            notes.append("the format does not state the axis: the detector's middle assumed, or --center PIXELS")
         return stated
     if asked == "auto":
         return axis_shift(_middle_rows(scan, geometry, flat, i0))

@@ -14,6 +14,7 @@ from ctsim.beam.spectrum import Tube
 from ctsim.benchmarks.engine.terminal import Bar
 from ctsim.benchmarks.importing import Flags
 from ctsim.benchmarks.importing.settle import Settled, settle
+from ctsim.dataset.manifest import file_sha256
 from ctsim.dataset.writer import SceneWriter, Stack, is_complete
 from ctsim.errors import InputError
 from ctsim.geometry import FARTHEST
@@ -22,6 +23,16 @@ from ctsim.io.scans.scanfile import ScanFile, Stated
 from ctsim.phantoms.dataset import spectrum_csv
 from ctsim.scaninfo import ScanInfo
 from ctsim.types import Scanner
+
+SOURCE = "source.json"
+
+
+class _Source(msgspec.Struct, frozen=True, kw_only=True):
+    """What source.json holds: the name of the scan's header, the flags, and the SHA-256 of each file by its name."""
+
+    scan: str
+    flags: dict[str, Any]
+    files: dict[str, str] = {}
 
 
 def main(argv: list[str]) -> int:
@@ -38,12 +49,15 @@ def bring(given: Flags) -> Path:
     """
     scan = open_scan(given.scan, given.format, _stated(given))
     name = given.name or _name(given.scan)
-    identity = _identity(scan, given)
+    digests = {path.relative_to(scan.path.parent).as_posix(): file_sha256(path) for path in scan.files}
+    identity = _identity(scan, digests, given)
+    if not given.force:
+        _check_unchanged(given.out / name, digests)
     if not given.force and is_complete(given.out, name, identity):
         sys.stdout.write(f"{given.out / name}: already complete\n")
         return given.out / name
     settled = settle(scan, given)
-    folder = _write(scan, settled, given, name, identity)
+    folder = _write(scan, settled, name, identity, given, digests)
     sys.stdout.write(f"{folder}: {settled.text()}\n")
     for note in settled.notes:
         sys.stdout.write(f"  {note}\n")
@@ -64,15 +78,27 @@ def _name(path: Path) -> str:
     return stem.strip("-_.+")[:100] or "scan"
 
 
-def _identity(scan: ScanFile, given: Flags) -> str:
-    """Hash the scan's headers, its place, and the flags that change what is written."""
-    header = scan.path.read_bytes() if scan.path.is_file() and scan.path.stat().st_size < 2**24 else b""
+def _identity(scan: ScanFile, digests: dict[str, str], given: Flags) -> str:
+    """Hash all bytes of the scan, and the flags that change what is written."""
     flags = [given.center, given.n_voxel, given.voxel, given.turn, given.kv, given.filter, given.i0, given.hold]
-    shown = repr((str(scan.path.resolve()), scan.geometry, flags)).encode()
-    return hashlib.sha256(header + shown).hexdigest()[:12]
+    return hashlib.sha256(repr((digests, scan.geometry, flags)).encode()).hexdigest()[:12]
 
 
-def _write(scan: ScanFile, settled: Settled, given: Flags, name: str, identity: str) -> Path:
+def _check_unchanged(folder: Path, digests: dict[str, str]) -> None:
+    """Name the file by which an import that is there differs; what else differs is refused as another scene."""
+    try:
+        known = msgspec.json.decode((folder / SOURCE).read_bytes(), type=_Source).files
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError):
+        return
+    changed = [name for name in sorted({*known, *digests}) if known.get(name) != digests.get(name)]
+    if known and changed:
+        raise InputError(
+            f"{folder}: was imported from other data, for {changed[0]} has changed; "
+            "import it under another --name, or replace it with --force"
+        )
+
+
+def _write(scan: ScanFile, settled: Settled, name: str, identity: str, given: Flags, digests: dict[str, str]) -> Path:
     """Write counts, open field, and what is known of both; held-out views apart."""
     geometry, kept, held = settled.geometry, settled.kept, settled.held
     pixel = geometry.d_detector
@@ -91,7 +117,7 @@ def _write(scan: ScanFile, settled: Settled, given: Flags, name: str, identity: 
         if tube is not None:
             writer.write_text("spectrum.csv", spectrum_csv(Scanner(geometry=geometry, tube=tube)))
         writer.write_text("scan.json", msgspec.json.format(msgspec.json.encode(_info(settled, tube)), indent=1) + b"\n")
-        writer.write_text("source.json", _source(scan, given))
+        writer.write_text(SOURCE, _source(scan, given, digests))
         return writer.finish()
 
 
@@ -108,7 +134,8 @@ def _info(settled: Settled, tube: Tube | None) -> ScanInfo:
     )
 
 
-def _source(scan: ScanFile, given: Flags) -> bytes:
-    """Return what was imported and how, for a reader."""
+def _source(scan: ScanFile, given: Flags, digests: dict[str, str]) -> bytes:
+    """Return what was imported and how."""
     flags = {k: str(v) if isinstance(v, Path) else v for k, v in vars(given).items()}
-    return msgspec.json.format(msgspec.json.encode({"scan": scan.path.name, "flags": flags}), indent=1) + b"\n"
+    found = _Source(scan=scan.path.name, flags=flags, files=digests)
+    return msgspec.json.format(msgspec.json.encode(found), indent=1) + b"\n"

@@ -6,9 +6,11 @@ import shutil
 import sys
 import time
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TypeVar
+
+import msgspec
 
 from ctsim.benchmarks.engine.host import open_jobs
 from ctsim.benchmarks.engine.process import TICK, Jobs, Lost
@@ -35,6 +37,7 @@ from ctsim.phantoms.dataset import disk_bytes, make_scenes, plan_scene
 from ctsim.phantoms.scene import Scene, scene_id
 from ctsim.phantoms.variants import MOST, families
 
+PLANNED = 24  # scenes; a plan takes up to a second
 T = TypeVar("T")
 _SPARE = 64 * 2**20  # bytes left free for the file system's own needs
 
@@ -70,34 +73,50 @@ def _verify(data_dir: Path) -> int:
 def _dry_run(scenes: tuple[Scene, ...], options: Flags) -> int:
     there = {} if options.out is None else _finished(scenes, options.out, options.force)
     seconds, size = 0.0, 0
-    for name, group in _alike(scenes, there).items():
-        if group[0].name in there:
-            sys.stdout.write(f"{_complete(there[group[0].name])}\n")
-            continue
-        plan, n = plan_scene(group[0]), len(group)
-        sys.stdout.write(f"{name}\n{plan.text()}\n")
+    for manifest in there.values():
+        sys.stdout.write(f"{_complete(manifest)}\n")
+    groups = alike([scene for scene in scenes if scene.name not in there])
+    for first, n, of in groups:
+        plan = plan_scene(first)
+        sys.stdout.write(f"{first.name}{f', and {n - 1} more {of}' if n > 1 else ''}\n{plan.text()}\n")
         seconds, size = seconds + n * plan.seconds, size + n * plan.disk_bytes
-    sys.stdout.write(f"total: {human_time(seconds)}, {human_bytes(size)} on disk\n")
+    n_scenes = sum(n for _, n, _ in groups)
+    sample = f" (planned {len(groups)} of {n_scenes} scenes)" if len(groups) < n_scenes else ""
+    sys.stdout.write(f"total: {human_time(seconds)}, {human_bytes(size)} on disk{sample}\n")
     for text in _of_other_code(scenes, there, options.out):
         sys.stdout.write(f"{text}\n")
     return 0
 
 
-def _alike(scenes: tuple[Scene, ...], there: dict[str, Manifest]) -> dict[str, list[Scene]]:
-    """Return what a dry run plans by what it is called: one scene, or those of a table with `count` that are missing.
+def alike(scenes: Sequence[Scene]) -> list[tuple[Scene, int, str]]:
+    """Return what a dry run plans: a scene that stands for others, how many they are with it, and what they share.
 
-    Of a table the first scene stands for all.
+    These are the scenes of a table with `count`, and those that differ in their seed alone. Where that leaves more than
+    `PLANNED`, one scene stands for all of its recipe, metal and geometry.
     """
-    found: dict[str, list[Scene]] = {}
+    groups = _grouped(scenes, lambda s: s.drawn.table if s.drawn else _text(s, "name", "seed"))
+    if len(groups) <= PLANNED:
+        return [(g[0], len(g), "of its table" if g[0].drawn else "that differ in their seed alone") for g in groups]
+    return [(g[0], len(g), "of its recipe, metal and geometry") for g in _grouped(scenes, _kind)]
+
+
+def _grouped(scenes: Sequence[Scene], key: Callable[[Scene], object]) -> list[list[Scene]]:
+    found: dict[object, list[Scene]] = {}
     for scene in scenes:
-        table = scene.drawn.table if scene.drawn and scene.name not in there else ""
-        found.setdefault(f"{table}/" if table else scene.name, []).append(scene)
-    named = {n if not n.endswith("/") else _title(group): group for n, group in found.items()}
-    return named
+        found.setdefault(key(scene), []).append(scene)
+    return list(found.values())
 
 
-def _title(group: list[Scene]) -> str:
-    return f"{group[0].name}, and {len(group) - 1} more of its table" if len(group) > 1 else group[0].name
+def _kind(scene: Scene) -> tuple[object, ...]:
+    """Return what decides most of a scene's time and disk: all but tube, dose and the draw of the body."""
+    scanner = scene.resolve()
+    shape = (scene.phantom.recipe, scene.phantom.metal, scene.phantom.n_voxel, scanner.scatter.level)
+    return *shape, _text(scanner.geometry), scene.truth, scene.simulation
+
+
+def _text(given: msgspec.Struct, *without: str) -> bytes:
+    """Return the settings of a struct, some of which may be lists, as what a dict takes for a key."""
+    return msgspec.json.encode({key: getattr(given, key) for key in given.__struct_fields__ if key not in without})
 
 
 def _finished(scenes: tuple[Scene, ...], out: Path, force: bool) -> dict[str, Manifest]:

@@ -21,6 +21,8 @@ MOST = 2_000_000
 """Voxels that are compared; of a larger volume every second, third … along each axis."""
 UNRELATED = 0.1
 """Share of a volume's error that may look like the difference between the reference and its mirror image by chance."""
+NEGATIVE = -0.5
+"""Correlation with the reference that no reconstruction has by chance, only one of the wrong sign."""
 
 
 class Turn(NamedTuple):
@@ -77,14 +79,16 @@ def check(name: str, values: NDArray[Any], truth: Truth, unit: Unit, water: floa
     if not (finite := np.isfinite(values)).all():
         raise InputError(f"{name} has {int((~finite).sum())} of {values.size} voxels that are not finite")
     reference = np.minimum(truth.references["effective"], np.float32(tissue_range(truth, "effective")))
-    if (found := _better_unit(values, reference, unit, water)) is not None:
+    if (better := _better_unit(values, reference, unit, water)) is not None:
         mean, own = float(reference.mean()), float(values.mean())
-        instead = f", or {option} {found}" if option else ""
+        instead = f", or {option} {better}" if option else ""
         raise InputError(
-            f"{name} looks like {NAMES[found]}: its mean is {own:.3g}, the reference's {mean:.3g} 1/mm; "
+            f"{name} looks like {NAMES[better]}: its mean is {own:.3g}, the reference's {mean:.3g} 1/mm; "
             f"expected {NAMES[unit]}{instead}"
         )
-    _check_turn(name, to_attenuation(values, unit, water), reference)
+    found = to_attenuation(values, unit, water)
+    _check_sign(name, found, reference)
+    _check_turn(name, found, reference)
 
 
 def _better_unit(values: NDArray[Any], reference: NDArray[np.float32], unit: Unit, water: float | None) -> Unit | None:
@@ -109,6 +113,16 @@ def _distance(one: float, other: float) -> float:
     return abs(math.log(one / other)) if one > 0 and other > 0 else math.inf
 
 
+def _check_sign(name: str, values: NDArray[np.float32], reference: NDArray[np.float32]) -> None:
+    """Refuse the negative of a volume."""
+    top, few = float(reference.max()), _few(reference)
+    target = _standard(reference[few])
+    if values.shape != reference.shape or target is None:
+        return
+    if (own := _correlation(np.clip(values[few], -top, top), target)) < NEGATIVE:
+        raise InputError(f"{name} looks like the negative of a volume: correlation with the reference {own:.2f}")
+
+
 def _check_turn(name: str, values: NDArray[np.float32], reference: NDArray[np.float32]) -> None:
     """Refuse a volume that fits better when it is turned.
 
@@ -118,8 +132,7 @@ def _check_turn(name: str, values: NDArray[np.float32], reference: NDArray[np.fl
     the volume's own error says nothing, since errors look like it by chance.
     """
     clipped = np.clip(values, 0, float(reference.max()))
-    step = math.ceil((reference.size / MOST) ** (1 / 3))
-    few = (slice(None, None, step),) * 3
+    few = _few(reference)
     target = _standard(reference[few])
     fits = [turn for turn in TURNS if turn.apply(clipped).shape == reference.shape]
     if target is None or not fits:
@@ -138,6 +151,11 @@ def _check_turn(name: str, values: NDArray[np.float32], reference: NDArray[np.fl
         return
     if other - own > other * (1 - alike) / 2:
         raise InputError(f"{name} looks {best.text}: correlation with the reference {own:.2f}, turned back {other:.2f}")
+
+
+def _few(reference: NDArray[Any]) -> tuple[slice, ...]:
+    """Return which voxels are compared."""
+    return (slice(None, None, math.ceil((reference.size / MOST) ** (1 / 3))),) * 3
 
 
 def _standard(values: NDArray[Any]) -> NDArray[np.float64] | None:

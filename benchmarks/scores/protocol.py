@@ -145,11 +145,15 @@ def tissue_score(values: NDArray[Any], truth: Truth, kind: ReferenceKind = "effe
 
 
 def aligned_score(values: NDArray[Any], truth: Truth, kind: ReferenceKind) -> Score:
-    """Score the tissue after one least-squares gain, fitted on the body outside the dilated metal."""
+    """Score the tissue after one least-squares gain, fitted on the body outside the dilated metal.
+
+    No gain is applied where only 0 or a negative one would fit: it would turn the negative of a volume into the volume.
+    """
     body = truth.body & ~truth.near_metal
     gain = metrics.least_squares_gain(values, truth.references[kind], body if body.any() else truth.tissue)
-    if gain is None:
-        return _region_score(values, truth, kind, "none: the reconstruction is 0 in the body", {"gain": None})
+    if gain is None or gain <= 0:
+        why = "the reconstruction is 0 in the body" if gain is None else "no positive gain fits"
+        return _region_score(values, truth, kind, f"none: {why}", {"gain": None})
     scaled = values * np.float32(gain)
     return _region_score(scaled, truth, kind, f"one least-squares gain on the body, {gain:.4f}", {"gain": gain})
 

@@ -120,15 +120,21 @@ def _scan(shard: Shard, line: IndexLine, form: ModuleType) -> tuple[Any, dict[st
     )
     arrays = arrays_of(stored, shard.items)
     if missing := [item for item in shard.items if item not in arrays]:
-        raise InputError(f"--items {missing[0]}: {stored.folder} was written without; see truth in its scene.toml")
+        without = (
+            "was written without; see truth in its scene.toml" if stored.has_truth else "is a measured scan without it"
+        )
+        raise InputError(f"--items {missing[0]}: {stored.folder} {without}")
     scene = stored.folder / "scene.toml"  # an imported scan has none
     return entry, arrays, scene.read_text(encoding="utf-8") if scene.exists() else ""
 
 
 def arrays_of(stored: StoredScan, items: tuple[str, ...] = ()) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a scan by item, all that it has where none is named; without metal it is its own twin."""
+    """Return the arrays of a scan by item, all that it has where none is named; without metal it is its own twin.
+
+    A measured scan, whose metal nobody knows, has p and fdk.
+    """
     scans, found = {"p": stored, "fdk": stored}, dict[str, NDArray[Any]]()
-    twin = stored.metal_free if stored.info.metal else stored
+    twin = stored.metal_free if stored.info.metal or not stored.has_truth else stored
     if twin is not None:
         scans |= {"twin_p": twin, "twin": twin}
     for item, source in scans.items():
@@ -137,6 +143,8 @@ def arrays_of(stored: StoredScan, items: tuple[str, ...] = ()) -> dict[str, NDAr
         scan = source.scan
         is_stack = item.endswith("p")
         found[item] = LineIntegrals(scan).of(slice(None))[0] if is_stack else reconstruct(scan).values.numpy()
+    if not stored.has_truth:
+        return found
     truth: dict[str, Callable[[], NDArray[Any]]] = {
         "reference": lambda: stored.reference("effective"),
         "metal": lambda: stored.metal,

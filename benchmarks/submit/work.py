@@ -30,6 +30,8 @@ from ctsim.io.volumes.frame import SKEW
 from ctsim.io.volumes.volumefile import VolumeFile
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.+-]{0,59}")
+INPUTS = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ,;:()/_.+-]{0,59}")
+MOST_CITED = 300
 
 
 def main(argv: list[str]) -> int:
@@ -71,8 +73,13 @@ def _check(given: Flags) -> None:
         raise InputError(f"--name {given.name!r}: expected up to 60 letters, digits, spaces and _.+-")
     if given.name in TABLE or given.name in EXTERNAL:
         raise InputError(f"--name {given.name}: is a method of ctsim, expected another name")
-    if not given.inputs.strip():
-        raise InputError("--inputs is empty, expected a text such as 'counts only' or 'metal mask'")
+    if not INPUTS.fullmatch(given.inputs):
+        raise InputError(
+            f"--inputs {given.inputs!r}: expected a text such as 'counts only' or 'metal mask', of up to 60 letters, "
+            "digits, spaces and ,;:()/_.+-"
+        )
+    if not given.cite.isprintable() or len(given.cite) > MOST_CITED:
+        raise InputError(f"--cite {given.cite[:60]!r}: expected one line of up to {MOST_CITED} characters")
     check_limit(given.seconds)
 
 

@@ -83,9 +83,34 @@ def replacing(path: Path) -> Iterator[Path]:
     except BaseException as error:
         with contextlib.suppress(OSError):
             new.unlink()
-        if isinstance(error, OSError) and error.errno is not None and error.filename in (None, str(new)):
-            raise OSError(error.errno, error.strerror, str(path)) from error
+        _rename(error, new, path)
         raise
+
+
+@contextlib.contextmanager
+def making(folder: Path) -> Iterator[Path]:
+    """Yield a new folder next to `folder`, which takes its place when the block ends, and is removed if it fails.
+
+    Raises OSError with the name of `folder` where something in it cannot be written.
+    """
+    new = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(new, ignore_errors=True)
+    try:
+        new.mkdir(parents=True)
+        yield new
+        put_in_place(new, folder)
+    except BaseException as error:
+        shutil.rmtree(new, ignore_errors=True)
+        _rename(error, new, folder)
+        raise
+
+
+def _rename(error: BaseException, new: Path, final: Path) -> None:
+    """Raise an OSError that names nothing, or what is at `new`, with the name of what that was to become."""
+    if isinstance(error, OSError) and error.errno is not None:
+        named = error.filename
+        if named is None or Path(os.fsdecode(named)).is_relative_to(new):
+            raise OSError(error.errno, error.strerror, str(final)) from error
 
 
 def is_new(name: str) -> bool:

@@ -52,7 +52,7 @@ class StoredScan(ScanWithTruth):
 
     @property
     def has_truth(self) -> bool:
-        """Whether there is a truth to judge volumes by, as of every simulated scan and of no measured one."""
+        """Whether there is a truth to judge volumes by."""
         return any(f"{name}.tif" in self.files for name in ("labels", "metal", "reference_effective"))
 
     def file(self, name: str) -> NDArray[Any]:

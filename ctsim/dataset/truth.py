@@ -71,6 +71,11 @@ class ScanWithTruth(abc.ABC):
         return self.name
 
     @property
+    def has_truth(self) -> bool:
+        """Whether there is a truth to judge volumes by, as of every simulated scan and of no measured one."""
+        return True
+
+    @property
     def is_twin(self) -> bool:
         """Whether this is the twin without metal of another scan."""
         return self.prefix == TWIN

@@ -1,10 +1,12 @@
 """Shards: many scans in a few HDF5 files, compressed without loss, for training.
 
 A shard has one group a scan, named as the scan, with an array for each of `ITEMS`. Stacks [view, v, u] and volumes
-[z, y, x] are in chunks of one image each, so that a slice is read without its neighbours. The file's attribute
+[z, y, x] are in chunks of one image each, so that a slice is read without its neighbours; compressed ones have a
+checksum (Adler-32). The file's attribute
 `contents` lists the scans with their shapes as JSON, so that opening a thousand of them reads no array.
 """
 
+import contextlib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 
 from ctsim.dataset.durable import replacing
 from ctsim.errors import InputError
+from ctsim.io.h5file import writing
 
 STACKS = ("p", "twin_p", "trace")
 VOLUMES = ("fdk", "twin", "reference", "metal")
@@ -50,8 +53,7 @@ def write(
     `items` are those that were asked for.
     """
     entries = []
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as new, h5py.File(new, "w") as file:
+    with _folder(path.parent), replacing(path) as new, writing(new) as (file, check):
         for entry, arrays, scene in scans:
             group = file.create_group(entry.name)
             group.attrs["scene"] = scene
@@ -61,7 +63,21 @@ def write(
                 )
             shapes = {item: array.shape for item, array in arrays.items()}
             entries.append(msgspec.structs.replace(entry, shapes=shapes))
+            check()  # before the next scan is reconstructed
         file.attrs[_CONTENTS] = msgspec.json.encode(Contents(format=FORMAT, scans=tuple(entries), items=items)).decode()
+
+
+@contextlib.contextmanager
+def _folder(path: Path) -> Iterator[None]:
+    """Make a folder, and remove it where it is new and nothing came into it."""
+    is_new = not path.exists()
+    path.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError):
+            path.rmdir() if is_new else None
+        raise
 
 
 def contents(path: Path) -> Contents:
@@ -93,5 +109,10 @@ def shards_of(root: Path) -> Iterator[Path]:
 
 
 def read(file: h5py.File, name: str, item: str, place: tuple[slice | int, ...]) -> NDArray[np.float32]:
-    """Read a part of an item as float32."""
-    return np.asarray(file[name][item][place], np.float32)  # pyright: ignore[reportIndexIssue]
+    """Read a part of an item as float32. Raises InputError where the file is damaged there."""
+    try:
+        return np.asarray(file[name][item][place], np.float32)  # pyright: ignore[reportIndexIssue]
+    except (OSError, KeyError):
+        raise InputError(
+            f"{file.filename}: {item} of {name} is damaged; delete the file, make-dataset shards writes it again"
+        ) from None

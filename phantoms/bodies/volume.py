@@ -44,7 +44,8 @@ class CtVolume(Recipe, frozen=True, kw_only=True, tag="ct_volume"):
     """Size of its voxels (z, y, x) in mm; by default the file's. Needed for TIFF and .npy."""
     metal: str = "Ti"
     rescale: tuple[float, float] | None = None
-    """Slope and intercept: a value v is v·slope + intercept HU. By default the file's, or 1 and 0."""
+    """Slope and intercept: a value v is v·slope + intercept HU. By default the file's, or 1 and 0; values
+    without air are then refused."""
     kev: float = 70.0
     """The energy at which every voxel has the attenuation of its HU."""
     at: tuple[Triple, ...] = ()

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ctsim.dataset.arrayfile import check_size, check_volume
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
+from ctsim.io.h5file import writing
 from ctsim.io.payload import quoted
 from ctsim.io.scans.scanfile import ScanFile, Stated, grid_of
 
@@ -66,7 +67,7 @@ def write_scan(path: Path, geometry: Geometry, counts: NDArray[Any], flat: NDArr
         f"{DETECTOR}/pixel_size_y": geometry.d_detector[0],
         f"{DETECTOR}/pixel_size_x": geometry.d_detector[1],
     }
-    with h5py.File(path, "w") as file:
+    with writing(path) as (file, _):
         file["implements"] = "exchange:measurement"
         file["exchange/data"] = counts[:, ::-1]
         for name, image in levels.items():
@@ -231,6 +232,7 @@ def _scan(path: Path, stated: Stated, found: _Found) -> ScanFile:
     pedestal = np.zeros(found.shape) if found.dark is None else found.dark
     return ScanFile(
         path=path,
+        files=(path,),
         geometry=Geometry(
             dso=dso,
             dsd=dsd,

@@ -4,6 +4,7 @@ Rows are flipped against TIGRE's and ours. Views for testing are held out. Lengt
 scene: the volume is then in the inverse of that unit.
 """
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -50,19 +51,19 @@ def open_r2(path: Path, stated: Stated) -> ScanFile:
         raise InputError(f"{header} is no {NAME} of R2-Gaussian: {' '.join(str(error).split())[:200]}") from None
     shape = _numbers(header, meta.scanner, "nDetector", 2, whole=True)
     n_detector = (int(shape[0]), int(shape[1]))
-    train, test = (
-        [(f.angle, _file(header, f.file_path, n_detector)) for f in part] for part in (meta.proj_train, meta.proj_test)
-    )
-    return _scan(header, meta.scanner, train, test, n_detector)
+    listed = [[(f.angle, _file(header, f.file_path)) for f in part] for part in (meta.proj_train, meta.proj_test)]
+    train, test = ([(a, functools.partial(read_array, file, n_detector)) for a, file in part] for part in listed)
+    files = (header, *dict.fromkeys(file for part in listed for _, file in part))
+    return _scan(files, meta.scanner, train, test, n_detector)
 
 
-def _file(header: Path, name: str, shape: tuple[int, int]) -> Callable[[], NDArray[Any]]:
-    """Return a function that reads a view. Raises InputError for one outside of the folder, or that is not there."""
+def _file(header: Path, name: str) -> Path:
+    """Return the file of a view. Raises InputError for one outside of the folder, or that is not there."""
     found = header.parent / name
     inside = header.parent.resolve()
     if not found.resolve().is_relative_to(inside) or not found.is_file():
         raise InputError(f"{header} names {quoted(name)}, expected a file in its folder or below")
-    return lambda: read_array(found, shape)
+    return found
 
 
 def open_naf(path: Path, stated: Stated) -> ScanFile:
@@ -83,7 +84,8 @@ def open_naf(path: Path, stated: Stated) -> ScanFile:
     if any(stack.shape[1:] != shape for _, stack in stacks):
         raise InputError(f"{path} has views of several shapes")
     n_detector = (int(shape[0]), int(shape[1]))
-    return _scan(path, _rows_first(path, found, n_detector), views[0], views[1] if len(views) > 1 else [], n_detector)
+    scanner = _rows_first(path, found, n_detector)
+    return _scan((path,), scanner, views[0], views[1] if len(views) > 1 else [], n_detector)
 
 
 def _rows_first(path: Path, scanner: dict[str, Any], shape: tuple[int, int]) -> dict[str, Any]:
@@ -121,7 +123,10 @@ def _stack(path: Path, part: dict[str, Any]) -> tuple[NDArray[np.float64], NDArr
     return angles, views
 
 
-def _scan(path: Path, scanner: dict[str, Any], train: Views, test: Views, shape: tuple[int, int]) -> ScanFile:
+def _scan(
+    files: tuple[Path, ...], scanner: dict[str, Any], train: Views, test: Views, shape: tuple[int, int]
+) -> ScanFile:
+    path = files[0]
     train, test = _apart(train, test)
     views = [*train, *test]
     angles = np.degrees([a for a, _ in views])
@@ -153,6 +158,7 @@ def _scan(path: Path, scanner: dict[str, Any], train: Views, test: Views, shape:
 
     return ScanFile(
         path=path,
+        files=files,
         geometry=geometry,
         read=read,
         integrals=True,

@@ -28,10 +28,11 @@ class ScanFile:
     `geometry` has a grid that fits the field of view. Views are readings above a pedestal `dark`, to be compared with
     the open field `flat` [v, u]; without one the air next to the object is measured. With `integrals` views are −ln of
     transmissions. `axis_known` says that the file states where the axis is; `filters` is None where they are unknown.
-    `held` numbers the views that the format sets apart for testing.
+    `held` numbers the views that the format sets apart for testing. `files` is all that is read, with `path`.
     """
 
     path: Path
+    files: tuple[Path, ...]
     geometry: Geometry
     read: Callable[[int], NDArray[Any]]
     dtype: str = "float32"

@@ -39,7 +39,8 @@ def open_scan(path: Path, stated: Stated) -> ScanFile:
         raise InputError(f"{log} declares {declared} images, there are {len(images)} of its prefix next to it")
     geometry = _geometry(log, found, (n_v, n_u), len(images), stated)
     angle = number(log, found, "image rotation", default=0.0)
-    shifts = _shifts(log, len(images))
+    table = _table(log)
+    shifts = None if table is None else _shifts(table, len(images))
     kvp = number(log, found, "source voltage (kv)", "source voltage (kvp)", default=0.0)
     text = found.get("filter", "")
     sheets = filters_of(text)
@@ -50,6 +51,7 @@ def open_scan(path: Path, stated: Stated) -> ScanFile:
     resample = abs(angle) > TURN or shifts is not None
     return ScanFile(
         path=log,
+        files=(log, *images, *([] if table is None else [table])),
         geometry=geometry,
         read=_reader(images, (n_v, n_u), angle if abs(angle) > TURN else 0.0, shifts),
         dtype="float32" if resample else "uint16",
@@ -136,16 +138,19 @@ def _geometry(log: Path, found: Fields, n_detector: tuple[int, int], n_views: in
     )
 
 
-def _shifts(log: Path, n_views: int) -> NDArray[np.float64] | None:
-    """Return how far each image moved, [view, (right, down)] in pixels, by the table next to the log; None without.
-
-    Its first line names the columns; those that contain "x" and "y" count.
-    """
+def _table(log: Path) -> Path | None:
+    """Return the table of shifts next to the log; None where there is none."""
     names = {p.name.casefold(): p for p in log.parent.iterdir()}
-    path = names.get(f"{log.stem}_ts.csv".casefold())
-    if path is None:
-        return None
-    rows = list(csv.reader(re.sub(r"[;\t]", ",", read_text(beside(log, path.name))).splitlines()))
+    found = names.get(f"{log.stem}_ts.csv".casefold())
+    return None if found is None else beside(log, found.name)
+
+
+def _shifts(path: Path, n_views: int) -> NDArray[np.float64]:
+    """Return how far each image moved, [view, (right, down)] in pixels.
+
+    The table's first line names the columns; those that contain "x" and "y" count.
+    """
+    rows = list(csv.reader(re.sub(r"[;\t]", ",", read_text(path)).splitlines()))
     rows = [row for row in rows if any(cell.strip() for cell in row)]
     head = [cell.strip().casefold() for cell in rows[0]] if rows else []
     columns = [next((k for k, cell in enumerate(head) if letter in cell), -1) for letter in "xy"]

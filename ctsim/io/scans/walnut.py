@@ -39,6 +39,7 @@ def open_scan(path: Path, stated: Stated) -> ScanFile:
     circle = as_circle(poses, (rows, columns))
     return ScanFile(
         path=header,
+        files=(header, *images, *opens, *darks),
         geometry=circle.geometry,
         read=_reader(images[::-1], stored, dark, circle.turned),
         flat=circle.turned(_mean(opens, stored) - dark).astype(np.float32),

@@ -25,6 +25,7 @@ PLAIN = (ImplicitVRLittleEndian, ExplicitVRLittleEndian, ExplicitVRBigEndian)
 LARGEST = 2**28  # bytes of a file: a slice of 8192² has half of it
 UNEVEN = 0.1
 """How far a slice may be off its even place, in gaps: stored positions are rounded, a missing slice is a whole gap."""
+OFF = 0.05  # of the gap between positions, by which SpacingBetweenSlices may be rounded
 TILT = 0.05  # degrees, below which a gantry is upright
 SAME = {
     "Rows": 1,
@@ -37,17 +38,20 @@ SAME = {
     "PixelRepresentation": 1,
     "RescaleSlope": 1,
     "RescaleIntercept": 1,
+    "SpacingBetweenSlices": 1,
 }
 """What all slices of a volume share, and how many numbers it has."""
-OPTIONAL = ("RescaleSlope", "RescaleIntercept")
+OPTIONAL = ("RescaleSlope", "RescaleIntercept", "SpacingBetweenSlices")
 OTHERS = ("ImagePositionPatient", "SeriesInstanceUID", "SeriesDescription", "Modality", "SamplesPerPixel")
-OTHERS += ("NumberOfFrames", "GantryDetectorTilt")
+OTHERS += ("NumberOfFrames", "GantryDetectorTilt", "RescaleType")
 Values = tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Slice:
     """What the header of one slice says: the values of `SAME` by name, its position in mm, its series.
+
+    `unit` is its RescaleType, "" for HU.
 
     Its pixels are `n_bytes` that begin `offset` bytes into the file.
     """
@@ -57,6 +61,7 @@ class Slice:
     position: NDArray[np.float64]
     series: str
     description: str
+    unit: str
     big_endian: bool
     offset: int
     n_bytes: int
@@ -101,6 +106,7 @@ def open_volume(path: Path) -> VolumeFile:
         read=read,
         axes=axes,
         rescale=(slope[0], intercept[0] if intercept else 0.0) if slope else None,
+        unit=next((s.unit for s in slices if s.unit), ""),
     )
 
 
@@ -121,12 +127,14 @@ def _read_slice(path: Path) -> Slice | None:
         )
     position = _numbers(path, found, "ImagePositionPatient", 3)
     offset, n_bytes = _pixels_in(found)
+    unit = str(found.get("RescaleType") or "").strip()
     return Slice(
         path=path,
         shared={key: _numbers(path, found, key, n, optional=key in OPTIONAL) for key, n in SAME.items()},
         position=np.array(position),
         series=str(found.get("SeriesInstanceUID") or ""),
         description=str(found.get("SeriesDescription") or "without a description"),
+        unit="" if unit == "HU" else unit,
         big_endian=found.file_meta.TransferSyntaxUID == ExplicitVRBigEndian,
         offset=offset,
         n_bytes=n_bytes,
@@ -215,6 +223,12 @@ def _axes(folder: Path, slices: list[Slice], along: NDArray[np.float64]) -> Axes
         raise InputError(
             f"{folder} has slices {gaps.min():.4g} to {gaps.max():.4g} mm apart, expected equal gaps: "
             "a slice is missing or there twice, or the series must be resampled first"
+        )
+    gap, stated = float(np.linalg.norm(step)), np.abs(slices[0].shared["SpacingBetweenSlices"])
+    if stated.any() and np.abs(stated - gap).max() > OFF * gap:  # some write 0 for none
+        raise InputError(
+            f"{folder} contradicts itself: slices are {stated[0]:g} mm apart by SpacingBetweenSlices, {gap:g} mm by "
+            "ImagePositionPatient; expected the same, or no SpacingBetweenSlices"
         )
     return axes
 

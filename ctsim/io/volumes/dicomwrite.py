@@ -5,7 +5,6 @@ Identifiers follow from the content, so that the same volume gives the same byte
 
 import hashlib
 import math
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from pydicom.dataset import FileDataset, FileMetaDataset
 from pydicom.uid import UID, CTImageStorage, ExplicitVRLittleEndian, generate_uid
 from pydicom.valuerep import format_number_as_ds
 
-from ctsim.dataset.durable import put_in_place
+from ctsim.dataset.durable import making
 from ctsim.errors import InputError
 from ctsim.io.volumes.placed import Placed
 
@@ -33,10 +32,7 @@ def write_volume(path: Path, volume: Placed) -> None:
     Raises InputError for a volume of one slice, and for values that are not finite.
     """
     stored, rescale = quantised(path, volume.values)
-    folder = path.with_name(f".{path.name}.partial")
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    try:
+    with making(path) as folder:
         shown = repr((rescale, volume.spacing, volume.centre, stored.shape)).encode()
         series = hashlib.sha256(shown + stored.tobytes()).hexdigest()
         for k, image in enumerate(stored):
@@ -45,10 +41,6 @@ def write_volume(path: Path, volume: Placed) -> None:
             _add_place(one, volume, k)
             _add_pixels(one, image, rescale)
             one.save_as(folder / f"{k:04d}.dcm", enforce_file_format=True)
-        put_in_place(folder, path)
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
 
 
 def quantised(path: Path, values: NDArray[Any]) -> tuple[NDArray[np.uint16], tuple[int, int]]:

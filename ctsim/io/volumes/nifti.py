@@ -23,7 +23,7 @@ _SIZES = {348: nibabel.Nifti1Header, 540: nibabel.Nifti2Header}
 
 
 def open_volume(path: Path) -> VolumeFile:
-    """Read the header of a .nii or .nii.gz file. Orientation is the sform's, else the qform's."""
+    """Read the header of a .nii or .nii.gz file. Orientation is the sform's or the qform's; both must agree."""
     packed = path.name.lower().endswith(".gz")
     head = _header(path, packed)
     shape = declared(path, _shape(path, head), head.get_data_dtype())
@@ -77,20 +77,24 @@ def _shape(path: Path, head: Header) -> tuple[int, ...]:
 
 
 def _axes(path: Path, head: Header) -> Axes:
-    sform, code = head.get_sform(coded=True)
-    affine = sform if code > 0 else head.get_qform(coded=True)[0]
-    if affine is None:
+    affines = [affine for affine, code in (head.get_sform(coded=True), head.get_qform(coded=True)) if code > 0]
+    if not affines:
         raise InputError(f"{path} states no orientation (sform_code and qform_code are 0); expected one of them")
     if (unit := int(head["xyzt_units"]) & 7) not in UNITS:
         raise InputError(f"{path} has the unit of length {unit}, expected metres (1), mm (2) or µm (3)")
-    lengths, stated = np.linalg.norm(affine[:3, :3], axis=0), np.abs(head["pixdim"][1:4]).astype(np.float64)
+    lengths, stated = np.linalg.norm(affines[0][:3, :3], axis=0), np.abs(head["pixdim"][1:4]).astype(np.float64)
     if not np.allclose(lengths, stated, rtol=SKEW, atol=0):
         raise InputError(
             f"{path} contradicts itself: its voxels are {[float(f'{v:.6g}') for v in stated]} by pixdim, "
             f"{[float(f'{v:.6g}') for v in lengths]} by its orientation"
         )
-    steps = affine[:3, :3].T * FROM_RAS * UNITS[unit]
-    return axes_of(steps[::-1], path)
+    axes, *others = (axes_of((affine[:3, :3].T * FROM_RAS * UNITS[unit])[::-1], path) for affine in affines)
+    if any((other.order, other.flipped) != (axes.order, axes.flipped) for other in others):
+        raise InputError(
+            f"{path} contradicts itself: its axes point to other sides of the patient by sform than by qform; "
+            "expected the same, or a sform_code or qform_code of 0"
+        )
+    return axes
 
 
 def _rescale(path: Path, head: Header) -> tuple[float, float] | None:

@@ -20,7 +20,7 @@ class VolumeFile:
 
     `files` is everything that is read, slices in their order in space. `shape` and `dtype` are those of the stored
     array. `axes` is None where the format states none: the array is then [z, y, x]. `rescale` is slope and intercept
-    to HU where the file states them.
+    to HU where the file states them; `unit` is what they lead to where the file says that it is no HU.
     """
 
     path: Path
@@ -30,6 +30,7 @@ class VolumeFile:
     read: Callable[[], NDArray[Any]]
     axes: Axes | None = None
     rescale: tuple[float, float] | None = None
+    unit: str = ""
 
     @property
     def spacing(self) -> Triple | None:
