@@ -5,7 +5,7 @@ import pytest
 
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.splat import metal
-from ctsim.reconstruct.splat.curve import METAL, MaterialCurve
+from ctsim.reconstruct.splat.curve import DENSEST, MaterialCurve
 from ctsim.reconstruct.splat.kernels import response_reference
 from ctsim.reconstruct.splat.lattice import Lattice
 from ctsim.reconstruct.splat.level import weighted
@@ -45,7 +45,7 @@ def fit_of(volume, p=None, **more):
 def test_the_surface_lies_around_metal_and_not_deep_in_it():
     values = np.zeros(GEOMETRY.n_voxel, np.float32)
     values[1:13, 1:17, 1:15] = CURVE.water
-    values[3:11, 4:14, 3:13] = 1.01 * METAL * CURVE.water
+    values[3:11, 4:14, 3:13] = 1.01 * DENSEST * CURVE.water
     fine = metal.surface(part_of(values))
     deep = np.zeros_like(fine)
     deep[6:8, 7:11, 6:10] = True  # WITHIN voxels from the surface
@@ -123,7 +123,7 @@ def test_fine_metal_explains_readings_that_one_grid_does_not(volume):
     truth = fit_of(volume)
     truth._split(metal.surface(truth.parts[0]))
     views = np.arange(12)
-    inside = truth.parts[1].u > METAL * CURVE.water
+    inside = truth.parts[1].u > DENSEST * CURVE.water
     truth.parts[1].u[:] = np.where(inside, np.float32(IRON), np.float32(CURVE.water))
     p = truth.fitted(views)
     missed = {}

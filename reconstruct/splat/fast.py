@@ -25,7 +25,7 @@ from ctsim.reconstruct.settings import about, keywords
 from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
 from ctsim.reconstruct.splat.common import Common, Energy
 from ctsim.reconstruct.splat.course import PASSES, Course, levels_of, passes_over
-from ctsim.reconstruct.splat.curve import STRONGEST, MaterialCurve
+from ctsim.reconstruct.splat.curve import DENSEST, STRONGEST, MaterialCurve
 from ctsim.reconstruct.splat.filtration import USUAL, Filtration, found
 from ctsim.reconstruct.splat.level import Data
 from ctsim.reconstruct.splat.ordered import Fit
@@ -38,7 +38,6 @@ from ctsim.types import Scan, Status, Volume
 OPEN = 5.0  # standard deviations of an open pixel below which a ray met nothing
 LEAST_OPEN = 0.01
 VIEWS, SHORTEST = 12, 0.5  # views whose pixels stand for all, and the least path in voxels that counts as one
-DENSEST = 15.0  # times water, that is no metal: enamel 9, titanium 43
 ROUND, OBLONG = 1.25, 1.5
 """Greatest ratio of a voxel's sides on the finest grid, where pixels are as fine, and the one from which on it is said:
 a sum of round splats then varies by 10 % and 20 % from one to the next, by 4 % on cubes."""

@@ -63,7 +63,6 @@ class Fit:
     misfit: float = math.inf
     view_updates: int = 0
     steps: int = 0
-    _measured: int = 0
     _total: float = 0.0  # of the losses of this pass
 
     @property
@@ -104,9 +103,9 @@ class Fit:
             turn, k = divmod(self.steps, n)
             if turn == self.metal_from and k == 0:
                 self._split(surface(self.parts[0]))
-            measure = turn == (0 if self.fine is None else self.metal_from) and k % every == 0
+            new = self.parts[turn > 0 :] if turn in (0, self.metal_from) and k % every == 0 else []
             views, length = np.arange(order[k], n_views, n), step_length(self.steps / n, passes)
-            self.loss = self._step(views, measure, length)
+            self.loss = self._step(views, new, length)
             self.steps, self._total = self.steps + 1, (self._total if k else 0.0) + self.loss
             if (k + 1) % every == 0 or k + 1 == n:
                 hundreds = (k % every + 1) / n * n_views / 100
@@ -121,7 +120,7 @@ class Fit:
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Return all that the next step depends on, as arrays that it changes."""
-        numbers = np.array([self.steps, self._measured, self.view_updates])
+        numbers = np.array([self.steps, self.view_updates, *(part.measured for part in self.parts)])
         reals = np.array([self.loss, self.misfit, self._total])
         of_parts = {f"{name}{k}": array for k, part in enumerate(self.parts) for name, array in part.state().items()}
         fine = np.zeros(0, np.uint8) if self.fine is None else np.packbits(self.fine)
@@ -133,9 +132,9 @@ class Fit:
             shape = self.parts[0].lattice.support.shape
             fine = np.unpackbits(state["fine"], count=math.prod(shape)).astype(bool).reshape(shape)
             self._split(fine)
-        self.steps, self._measured, self.view_updates = state["numbers"].tolist()
+        self.steps, self.view_updates, *measured = state["numbers"].tolist()
         self.loss, self.misfit, self._total = state["reals"].tolist()
-        for k, part in enumerate(self.parts):
+        for k, (part, part.measured) in enumerate(zip(self.parts, measured, strict=True)):
             for name, own in part.state().items():
                 if state[f"{name}{k}"].shape != own.shape:  # NumPy would spread a single value
                     raise ValueError(f"{name}{k} has shape {state[f'{name}{k}'].shape}, expected {own.shape}")
@@ -164,9 +163,9 @@ class Fit:
         return sum(rest, first)
 
     def _split(self, fine: NDArray[np.bool_]) -> None:
-        """Give voxels `fine` finer splats; none, or all that there are, change nothing. The curvature begins anew."""
+        """Give voxels `fine` finer splats; none, or all that there are, change nothing."""
         if fine.any() and np.any(self.parts[0].lattice.support & ~fine):
-            self.parts, self.fine, self._measured = split(self.parts[0], fine), fine, 0
+            self.parts, self.fine = split(self.parts[0], fine), fine
 
     def _seen(self, paths: list[Image]) -> tuple[Image, list[Image]]:
         """Return P, as an image of the first part, and its derivatives by every part's paths, as these are."""
@@ -180,10 +179,10 @@ class Fit:
         ]
         return found[0], [np.stack(found[1:], 1), *slopes]
 
-    def _step(self, views: NDArray[np.int64], measure: bool, length: float) -> float:
+    def _step(self, views: NDArray[np.int64], new: list[Part], length: float) -> float:
         """Update the unknowns by `length` of a step from some views; return their mean |P − p|.
 
-        The curvature is that of all views in which it was measured: it changes little from subset to subset.
+        Of the parts `new` the curvature is measured first.
         """
         paths = [part.paths(views) for part in self.parts]
         p, slopes = self._seen(paths)
@@ -201,15 +200,15 @@ class Fit:
         np.maximum(lacking, 0, out=lacking, where=dark)  # a bound is met by all that is darker
         loss = float(np.abs(lacking).sum(dtype=np.float64)) / (len(views) * math.prod(self.data.geometry.n_detector))
         weights *= left
-        if measure:
+        if new:
             along = [part.along(own, path) for part, own, path in zip(self.parts, slopes, paths, strict=True)]
             along = sum(along[1:], along[0]) * coarse.pictures(weights * left)  # J·u: the majoriser's other half
             for part, own in zip(self.parts, slopes, strict=True):
-                part.measure(own, along, views)
-            self._measured += len(views)
+                if any(part is one for one in new):
+                    part.measure(own, along, views)
         lacking *= weights
         for part, own in zip(self.parts, slopes, strict=True):
-            part.move(own, coarse.pictures(lacking), views, length, len(views) / self._measured)
+            part.move(own, coarse.pictures(lacking), views, length)
         self.view_updates += len(views)
         return loss
 

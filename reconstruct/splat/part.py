@@ -39,7 +39,8 @@ class Part:
     finer: int = 1
     exact: bool = False
     projector: LatticeProjector = field(init=False)
-    curvature: Image = field(init=False)  # by both densities, summed over the views that it was measured in
+    curvature: Image = field(init=False)  # by both densities, summed over the views that it was `measured` in
+    measured: int = 0
     _pair: Image = field(init=False)  # densities, then sums by them: memory that is used again costs less than new
     _gradient: Image = field(init=False)
     _roots: Image = field(init=False)
@@ -86,11 +87,15 @@ class Part:
     def measure(self, slopes: Image, along: Image, views: NDArray[np.int64]) -> None:
         """Add the curvature of some views."""
         self.curvature += self.back(slopes, along, views)
+        self.measured += len(views)
 
-    def move(self, slopes: Image, lacking: Image, views: NDArray[np.int64], length: float, share: float) -> None:
-        """Step by `length` of a step towards what pixels lack; `share` makes the curvature that of these views."""
+    def move(self, slopes: Image, lacking: Image, views: NDArray[np.int64], length: float) -> None:
+        """Step by `length` of a step towards what pixels lack.
+
+        The curvature is that of all views in which it was measured: it changes little from subset to subset.
+        """
         gradient = self.curve.transpose(self.u, self.back(slopes, lacking, views), length, self._gradient)
-        curvature = self.curve.transpose(self.u, self.curvature, share, self._roots)
+        curvature = self.curve.transpose(self.u, self.curvature, len(views) / self.measured, self._roots)
         self._move(gradient, curvature, len(views))
 
     def _move(self, gradient: Image, curvature: Image, n_views: int) -> None:
