@@ -47,10 +47,9 @@ Image = NDArray[np.float32]
 class Fit:
     """The splats of a fit, `parts`, and how they fare: at first one lattice.
 
-    From pass `metal_from` on, if there is metal, a second part holds its surface finely: the voxels `fine` [z, y, x].
-    None is for never.
-    `tv` is the denoiser's threshold a hundred views in units of water. `loss` is the mean |P − p| of the last subset,
-    `misfit` that of the last pass.
+    From pass `metal_from` on, never if that is None, a second part holds the surface of dense metal finely: the voxels
+    `fine` [z, y, x]. `tv` is the denoiser's threshold a hundred views in units of water. `loss` is the mean |P − p| of
+    the last subset, `misfit` that of the last pass.
     """
 
     data: Data
