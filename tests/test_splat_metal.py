@@ -138,3 +138,15 @@ def test_an_object_of_metal_alone_stays_on_one_grid(volume):
     fit = fit_of(np.where(volume > CURVE.water, volume, 0))
     fit._split(fit.support)
     assert fit.fine is None and len(fit.parts) == 1
+
+
+def test_a_split_keeps_the_curvature_of_the_tissue(volume):
+    fit = fit_of(volume, fit_of(volume).fitted(np.arange(12)))
+    assert fit.run(1, lambda fit, whole: True)
+    whole = fit.parts[0]
+    a_view = [whole.lattice.scattered(whole.curvature[:, k]) / whole.measured for k in (0, 1)]
+    fit._split(metal.surface(whole))
+    rest, fine = fit.parts
+    for k in (0, 1):
+        assert np.array_equal(rest.curvature[:, k] / rest.measured, rest.lattice.gather(a_view[k]))
+    assert fine.measured == 0 and not fine.curvature.any()
