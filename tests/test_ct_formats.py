@@ -264,14 +264,19 @@ def test_old_names_and_words_of_a_metaimage_are_understood(expected, tmp_path):
     refused(path, r"has Rotation of the lengths \[2\.0, 1\.0, 1\.0\], expected unit vectors")
 
 
+def written(folder, kind, values):
+    """Write values as a format stores them, also one that states no steps."""
+    array, steps = stored(values)
+    if kind not in (".tif", ".npy"):
+        return write(folder, kind, array, steps)
+    path = folder / f"ct{kind}"
+    (tifffile.imwrite if kind == ".tif" else np.save)(path, array)
+    return path
+
+
 @pytest.mark.parametrize("kind", [".nii", ".mha", ".nrrd", ".tif"])
 def test_grey_values_without_hu_need_a_rescale(tmp_path, kind):
-    array, steps = stored((corner() // 16 + 100).clip(0, 255).astype(np.uint8))
-    path = tmp_path / "ct.tif"
-    if kind == ".tif":
-        tifffile.imwrite(path, array)
-    else:
-        path = write(tmp_path, kind, array, steps)
+    path = written(tmp_path, kind, (corner() // 16 + 100).clip(0, 255).astype(np.uint8))
     refused(path, r"rescale: .* holds grey values \(uint8\) that cannot be HU", spacing=SPACING)
     assert body(path, spacing=SPACING, rescale=(16.0, -1600.0)).labels.any()
 
@@ -368,12 +373,7 @@ NO_HU = {
 @pytest.mark.parametrize("kind", [".nii.gz", ".mha", ".nrrd", ".npy"])
 @pytest.mark.parametrize("change", NO_HU.values(), ids=NO_HU)
 def test_values_that_are_no_hu_need_a_rescale(tmp_path, kind, change):
-    array, steps = stored(change(corner()))
-    path = tmp_path / "ct.npy"
-    if kind == ".npy":
-        np.save(path, array)
-    else:
-        path = write(tmp_path, kind, array, steps)
+    path = written(tmp_path, kind, change(corner()))
     refused(path, r"rescale: .* a CT in HU has air .* or rescale = \[1, 0\]", spacing=SPACING)
     assert body(path, spacing=SPACING, rescale=(1.0, 0.0), n_inserts=0).labels.shape  # of a CT without air, say
 

@@ -19,7 +19,7 @@ MATERIALS = ("water", "cortical_bone", "Al", "Ti", "Fe")
 DEEPEST = 8.0  # of P, to which a material's own hardening is fitted
 STRONGEST = 20.0  # times iron, where the curve ends: twice what gold and tungsten have behind 150 mm of water
 METAL = 6.0  # times water: above it a splat is metal to the fit's preconditioner (bone 5.3, aluminium 6.4 at 90 kVp)
-DENSEST = 15.0  # times water, that is bone or enamel (9) and no dense metal (titanium 43)
+DENSEST = 15.0  # times water: above it is dense metal (titanium 43), below bone and, but in soft beams, enamel (9)
 
 Image = NDArray[np.float32]
 
