@@ -21,7 +21,9 @@ from ctsim.errors import InputError
 from ctsim.reconstruct.fdk import reconstruct as fdk
 
 
-def reconstruct(scan, *, steps=0, response="", basis="", nodes=0, e_max=0.0):
+def reconstruct(scan, *, steps=0, response="", basis="", nodes=0, e_max=0.0, tube=None, detector=None):
+    if (tube is None) == (response == "known"):
+        raise AssertionError("only a known response is told the beam")
     if response == "gmm":
         raise InputError("this one has no mixtures")
     return fdk(scan)
