@@ -1,4 +1,4 @@
-"""Scans without their scatter, for methods that have no model of it.
+"""Scans without their scatter, lag and glare, for methods that have no model of them.
 
 The scatter is taken off the counts before a method looks at them. Where next to nothing would remain a share of the
 reading is kept, as the logarithm of what noise leaves there would be wild; Siewerdsen et al., Med. Phys. 33, 2006,
@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from ctsim.reconstruct.log import LineIntegrals, count_floor
+from ctsim.reconstruct.panel import Panel, panel_of, without_panel
 from ctsim.reconstruct.scatter import Scatter, scatter_of
 from ctsim.reconstruct.settings import about
 from ctsim.types import Scan, Volume
@@ -28,17 +29,26 @@ Scattered = Annotated[
 ]
 
 
-class Readings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is done to the readings of a scan before a method sees them: `scatter` is taken off, unless it is 0.
+PanelLight = Annotated[Literal["ideal", "found"], about("lag and glare of the panel: none; found: by the open pixels")]
 
-    "found" is what `ctsim.reconstruct.scatter.scatter_of` finds, with its course over the panel; a number is the same
-    everywhere.
+
+class Readings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is taken off the readings of a scan before a method sees them: lag and glare of its `panel`, and `scatter`.
+
+    "found" is what `ctsim.reconstruct.panel.panel_of` and `ctsim.reconstruct.scatter.scatter_of` find in the scan,
+    scatter with its course over the panel; a number is the same everywhere, and 0 none.
     """
 
+    panel: PanelLight = "ideal"
     scatter: Scattered = 0.0
 
 
 S = TypeVar("S", bound=Readings)
+
+
+def panel_in(scan: Scan, panel: Literal["ideal", "found"]) -> Panel:
+    """Return lag and glare that a setting stands for: none, or what is found in the scan."""
+    return panel_of(scan) if panel == "found" else Panel()
 
 
 def scatter_in(scan: Scan, scattered: Literal["found"] | float) -> Scatter:
@@ -69,17 +79,20 @@ def without_scatter(scan: Scan, scatter: Scatter) -> Scan:
 
 
 def primary(function: Callable[[Scan, S], Volume]) -> Callable[[Scan, S], Volume]:
-    """Hand a method of a scan and settings the scan without the scatter that its settings tell.
+    """Hand a method of a scan and settings the scan without the lag, glare and scatter that its settings tell.
 
-    Where that is not 0, details of the volume hold the scatter's mean, gain and constant, as those of splats do.
+    Details of the volume hold the parts of lag and glare, and the scatter's mean, gain and constant, as those of splats
+    do. At least a tenth of each reading is kept from glare, too.
     """
 
     @functools.wraps(function)
     def method(scan: Scan, settings: S) -> Volume:
-        if settings.scatter == 0:
-            return function(scan, settings)
-        scatter = scatter_in(scan, settings.scatter)
-        volume = function(without_scatter(scan, scatter), settings)
-        return dataclasses.replace(volume, details=volume.details | scatter.details())
+        panel = panel_in(scan, settings.panel)
+        scan, details = without_panel(scan, panel, KEPT), panel.details() if settings.panel == "found" else {}
+        if settings.scatter != 0:
+            scatter = scatter_in(scan, settings.scatter)
+            scan, details = without_scatter(scan, scatter), details | scatter.details()
+        volume = function(scan, settings)
+        return dataclasses.replace(volume, details=volume.details | details)
 
     return method

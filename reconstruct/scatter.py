@@ -26,10 +26,6 @@ LOW, HIGH = 2.0, 5.0  # standard deviations that an open block may be below the 
 CUT, SIGNIFICANT = 0.055, 5.0
 """The mean of a Gaussian above −LOW, and standard deviations of the mean, beyond which open blocks show an excess."""
 FEWEST = 100  # open blocks, below which nothing is told
-VARIED, LARGEST = 0.3, 0.1
-"""Share by which the source has to differ between the far and the near open blocks for gain and constant to be told
-apart (0.36 to 0.76 on the scans of `quick` and `headline`, but for the jaw's 0.08), and the greatest gain that is taken
-where they are not: what by Monte Carlo fits all pixels best is 0.046 to 0.086 on five scans."""
 FAINTEST = 1e-4  # primary over open field below which the source is not told from none
 DARKEST = 0.01  # share of the blocks that may, in the mean around them, hold less than the scatter found
 
@@ -62,7 +58,7 @@ class Scatter:
         if self.source is None:
             return np.full(shape, self.floor, np.float32)
         rows, columns = (
-            _between(n, blocks, step) for n, blocks, step in zip(shape, self.source.shape[1:], self.step, strict=True)
+            between(n, blocks, step) for n, blocks, step in zip(shape, self.source.shape[1:], self.step, strict=True)
         )
         return np.float32(self.floor) + np.float32(self.gain) * (rows @ self.source[view] @ columns.T)
 
@@ -83,36 +79,24 @@ def scatter_of(p: Image, valid: NDArray[np.bool_], geometry: Geometry, i0: float
     excess = means[is_open].astype(np.float64) - 1
     if excess.size < FEWEST or excess.mean() <= (CUT + SIGNIFICANT / math.sqrt(excess.size)) * noise:
         return Scatter(floor=0.0)
-    gap = SPREAD * (geometry.dsd - geometry.dso)
-    sigma = (0.0, *(gap / (d * k) for d, k in zip(geometry.d_detector, step, strict=True)))
+    d_v, d_u = (d * k for d, k in zip(geometry.d_detector, step, strict=True))
     gain, constant, source = 0.0, 0.0, np.zeros_like(means)
     for _ in range(ROUNDS):
-        primary: Image = np.clip(means - gain * source - constant, FAINTEST, 1).astype(np.float32)
-        source = _blurred(-np.log(primary) * primary, sigma)
-        gain, constant = _fitted(source[is_open], excess)
+        source = source_of(np.minimum(means - gain * source - constant, 1), geometry, (d_v, d_u))
+        both = np.stack([source[is_open], np.ones(excess.size)], 1, dtype=np.float64)
+        gain, constant = optimize.nnls(both, excess)[0].tolist()
     held = _held(means, gain * source + constant)
     if gain == 0:
         return Scatter(floor=held * constant)
     return Scatter(floor=held * constant, gain=held * gain, source=source, step=step)
 
 
-def _fitted(source: NDArray[np.float32], excess: NDArray[np.float64]) -> tuple[float, float]:
-    """Return gain and constant, neither below 0, with which open blocks' excess is gain·source + constant.
-
-    Where the source hardly varies over them, as where an object nearly fills the panel, these blocks do not tell gain
-    and constant apart. The object's scatter has no constant, so it is gain up to `LARGEST`. Blocks with more source are
-    nearer to the object and may lie in its shadow's rim, which hides scatter: the quarter with the least source counts.
-    """
-    quarters = np.quantile(source, (0.25, 0.75))
-    far, near = source <= quarters[0], source >= quarters[1]
-    least, most = (float(source[some].mean(dtype=np.float64)) for some in (far, near))
-    if most - least < VARIED * (most + least) / 2:
-        level = max(float(excess[far].mean()), 0.0)
-        gain = min(level / least, LARGEST) if least > 0 else 0.0
-        return gain, level - gain * least
-    both = np.stack([source, np.ones(excess.size)], 1, dtype=np.float64)
-    gain, constant = optimize.nnls(both, excess)[0].tolist()
-    return gain, constant
+def source_of(primary: Image, geometry: Geometry, d: tuple[float, float]) -> Image:
+    """Return where scatter comes from as the panel sees it: −ln(T)·T, blurred, of blocks [view, v, u] `d` (mm) long."""
+    primary = np.maximum(primary, np.float32(FAINTEST))
+    gap = SPREAD * (geometry.dsd - geometry.dso)
+    sigma = (0.0, *(gap / k for k in d))
+    return np.asarray(ndimage.gaussian_filter(-np.log(primary) * primary, sigma, mode="nearest"), np.float32)
 
 
 def _noise(means: Image, photons: float) -> float:
@@ -152,10 +136,6 @@ def _smallest(blocks: NDArray[Any], side: int) -> NDArray[Any]:
     return np.asarray(ndimage.minimum_filter(blocks, (*[1] * (blocks.ndim - 2), side, side), mode="nearest"))
 
 
-def _blurred(blocks: Image, sigma: tuple[float, ...]) -> Image:
-    return np.asarray(ndimage.gaussian_filter(blocks, sigma, mode="nearest"), np.float32)
-
-
 def _mean(blocks: Image) -> Image:
     """Return the mean of the blocks [view, row, column] around each."""
     size: Any = (1, NEAR, NEAR)
@@ -191,7 +171,7 @@ def _block_means(p: Image, valid: NDArray[np.bool_]) -> tuple[Image, tuple[int, 
     return means, (step_v, step_u)
 
 
-def _between(n: int, blocks: int, step: int) -> Image:
+def between(n: int, blocks: int, step: int) -> Image:
     """Return the matrix that interpolates `n` pixels from blocks of `step` pixels, of which the last may be shorter."""
     middles = np.minimum(np.arange(blocks) * step + (step - 1) / 2, (np.arange(blocks) * step + n - 1) / 2)
     weights = [np.interp(np.arange(n), middles, unit) for unit in np.eye(blocks)]

@@ -13,7 +13,8 @@ from ctsim.reconstruct.field.fit import Common, Steps
 from ctsim.reconstruct.field.physics import Curve, Image, Mono, Park
 from ctsim.reconstruct.field.run import Given, Model, Seen, on_cpu, run, truncated
 from ctsim.reconstruct.log import line_integrals
-from ctsim.reconstruct.primary import Scattered, primary, scatter_in
+from ctsim.reconstruct.panel import without_panel
+from ctsim.reconstruct.primary import PanelLight, Scattered, panel_in, primary, scatter_in
 from ctsim.reconstruct.settings import about, keywords
 from ctsim.reconstruct.splat import fast
 from ctsim.reconstruct.splat.common import Energy
@@ -83,6 +84,7 @@ class Field(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     tube: TubeTable = None
     detector: DetectorTable = None
     readout: Annotated[Energy | Literal["hardened"], about("energy at which the volume is read")] = "hardened"
+    panel: PanelLight = "found"
     scatter: Scattered = "found"
 
     def __post_init__(self) -> None:
@@ -99,23 +101,24 @@ class Field(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
 @on_cpu
 def field(scan: Scan, settings: Field) -> Volume:
     """Reconstruct by a field with the response and the material curve of `splat`, in 1/mm; keywords as in `Field`."""
-    scatter: dict[str, Any] = {}
+    panel = panel_in(scan, settings.panel)
+    scan, details = without_panel(scan, panel), panel.details()
 
     def see(scan: Scan, settings: Field) -> Seen:
         found = scatter_in(scan, settings.scatter)
-        scatter.update(found.details())
+        details.update(found.details())
         p, clamped = line_integrals(scan, slice(None))
         weights = weights_and_bounds(scan, p.numpy(), ~clamped.numpy(), found, Below.of(scan).noise)
         data = Data(p=p.numpy(), weights=weights, power=2)
         return Seen(data=data, clamped=int(clamped.sum()), scatter=found.mean)
 
     def make(given: Given) -> Model:
-        return _field_model(given, settings, scatter)
+        return _field_model(given, settings, details)
 
     return run(scan, settings, make, see)
 
 
-def _field_model(given: Given, settings: Field, scatter: dict[str, Any]) -> Model:
+def _field_model(given: Given, settings: Field, readings: dict[str, Any]) -> Model:
     beam = settings.of_splat()
     finest = fast.finer(given.scan.geometry, beam.fineness)
     level = Level(geometry=finest, p=given.data.p, weights=given.data.weights, scatter=given.scatter)
@@ -124,7 +127,7 @@ def _field_model(given: Given, settings: Field, scatter: dict[str, Any]) -> Mode
     curve = MaterialCurve.of(response, fast.rough_length(level, response, fast.least_met(level)))
     physics = curve_physics(given, curve, response, settings.tv)
     read = functools.partial(_read, physics, curve, response, settings.readout)
-    details = {"response": response.described(), **scatter}
+    details = {"response": response.described(), **readings}
     if filtration is not None:
         details |= {"filtration": filtration.described()}
         details |= {"limitation": filtration.sentence} if filtration.sentence else {}
