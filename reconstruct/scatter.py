@@ -67,7 +67,7 @@ def scatter_of(p: Image, valid: NDArray[np.bool_], geometry: Geometry, i0: float
     """Find the scatter of p = −ln(signal/open), float32 [view, v, u], where the `valid` readings have signal.
 
     The open field is taken without an object and so without its scatter, and nothing else makes a ray brighter than
-    that but noise and a drift of the tube. Gain and constant, neither below 0, are fitted (`_fitted`) to the
+    that but noise and a drift of the tube. Gain and constant, neither below 0, are fitted to the
     blocks of pixels that are as bright as the open field, within a noise of at least that of `i0` photons, and not next
     to darker ones. Where these do not exceed the open field significantly, or there are none, scatter is 0. What is
     found is scaled down until 99 % of the blocks hold it.
@@ -144,13 +144,16 @@ def _mean(blocks: Image) -> Image:
 
 def _held(means: Image, scatter: Image) -> float:
     """Return the share of the scatter, both [view, row, column], that all blocks but some of the darkest hold."""
-    # blocks without a pixel, and views that are lost, are no dark ones
+    around = _mean(means)  # noise alone may be darker
+    ratios = (around / np.maximum(scatter, FAINTEST))[alive(means)]
+    return min(float(np.quantile(ratios, DARKEST)), 1.0) if ratios.size else 0.0
+
+
+def alive(means: Image) -> NDArray[np.bool_]:
+    """Return which blocks [view, row, column] are not dead, nor of a view that is lost, nor next to such blocks."""
     lit = means > 0
     somewhere, in_some = np.any(lit, axis=0, keepdims=True), np.any(lit, axis=(1, 2), keepdims=True)
-    alive = _smallest(np.logical_and(somewhere, in_some), NEAR)
-    around = _mean(means)  # noise alone may be darker
-    ratios = (around / np.maximum(scatter, FAINTEST))[alive]
-    return min(float(np.quantile(ratios, DARKEST)), 1.0) if ratios.size else 0.0
+    return np.asarray(_smallest(np.logical_and(somewhere, in_some), NEAR), np.bool_)
 
 
 def _block_means(p: Image, valid: NDArray[np.bool_]) -> tuple[Image, tuple[int, int]]:

@@ -102,7 +102,7 @@ class Field(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
 def field(scan: Scan, settings: Field) -> Volume:
     """Reconstruct by a field with the response and the material curve of `splat`, in 1/mm; keywords as in `Field`."""
     panel = panel_in(scan, settings.panel)
-    scan, details = without_panel(scan, panel), panel.details()
+    scan, details = without_panel(scan, panel), panel.details() if settings.panel == "found" else {}
 
     def see(scan: Scan, settings: Field) -> Seen:
         found = scatter_in(scan, settings.scatter)

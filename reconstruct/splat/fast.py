@@ -127,7 +127,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     details: dict[str, Any] = {
         "response": response.described(),
         **({} if filtration is None else {"filtration": filtration.described()}),
-        **panel.details(),
+        **(panel.details() if settings.panel == "found" else {}),
         **scatter.details(),
         "clamped_pixels": int(clamped.sum()),
         "grid": [n * (1 if fit is None else fit.finer) for n in finest.n_voxel],
@@ -145,9 +145,8 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     missed = _dark_misfit(fit)
     beyond = seen_beyond(data.p, scan.geometry, scan.i0)
     found_at = "" if filtration is None else filtration.sentence
-    limits = [
-        said for said in (as_read.sentence, _unexplained(fit, missed), beyond.sentence, found_at, _flat(finest)) if said
-    ]
+    sentences = as_read.sentence, panel.sentence, _unexplained(fit, missed), beyond.sentence, found_at, _flat(finest)
+    limits = [said for said in sentences if said]
     details |= {
         "read-out": how,
         "dark_misfit": missed,
