@@ -32,7 +32,9 @@ SIDE = 112  # most blocks along a side of the panel
 SHADOW, MARGIN = 0.06, 1  # below the open field, of a block in shadow; blocks next to one that are no open ones
 ROUNDS = 2, 3  # of lag and glare, and of glare and the light without it
 FEWEST = 1000  # open blocks
-NARROW = 0.25  # widest Gaussian over the scatter's: wider ones are hard to tell from it
+RIM, NARROW = 5, 0.25
+"""Blocks in the narrowest Gaussian, since shadows have rims, and the widest one over that of the scatter, from which
+wider ones are hard to tell."""
 LEAST, MOST = (0.004, 0.01), 0.5  # shares of the light from which on lag and glare are taken off, and up to which
 SIGNIFICANT = 5.0  # standard deviations
 EXPLAINED = 0.7  # of what open blocks vary by beyond noise and scatter, that glare has to explain
@@ -217,24 +219,13 @@ class _Fit:
         if np.count_nonzero(is_open) < FEWEST:
             return None
         widest = NARROW * SPREAD * (geometry.dsd - geometry.dso) / SIGMA
-        widths = [w for w in WIDTHS if 2 * max(d) < w < widest]
+        widths = [w for w in WIDTHS if RIM * max(d) < w < widest]
         excess, _ = _centred(light - 1, is_open)
-        straight = light
-        for _ in range(ROUNDS[1]):
-            # a block's own noise would be in what it is explained by, too
-            level = _centred(straight, is_open)[1].astype(np.float32)[:, None, None]
-            clean = np.where(is_open, level, straight)
-            cosines, of_field = (fft.dctn(image, axes=(-2, -1)) for image in (clean * field, field))
-            images = [source_of(np.minimum(straight, 1), geometry, d)]
-            for w in reversed(widths):
-                spread = _transfer(field.shape, ((1, w),), d)
-                images.insert(0, (_filtered(cosines, spread) - clean * _filtered(of_field, spread)) / field)
-            columns, means = (np.stack(both, -1) for both in zip(*(_centred(i, is_open) for i in images), strict=True))
-            shares = _least_squares(columns, excess)
-            parts = _parts(shares, widths)
-            if not parts:
-                break
-            straight = _straight(light * field, parts, d) / _straight(field, parts, d)
+        columns, means = _columns(light, field, is_open, widths, geometry, d)
+        for _ in range(ROUNDS[1] - 1):
+            if parts := _parts(_least_squares(columns, excess), widths):
+                straight = _straight(light * field, parts, d) / _straight(field, parts, d)
+                columns, means = _columns(straight, field, is_open, widths, geometry, d)
         return cls(
             light=light,
             field=field,
@@ -244,7 +235,7 @@ class _Fit:
             excess=excess,
             columns=columns,
             means=means,
-            shares=shares,
+            shares=_least_squares(columns, excess),
         )
 
     def levels(self, read: Image) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -284,11 +275,8 @@ class _GlareOf:
 
     def __init__(self, parts: Parts, geometry: Geometry, open_field: Image) -> None:
         narrowest = min(width for _, width in parts)
-        self._step = (
-            int(narrowest / (WIDE * geometry.d_detector[0])),
-            int(narrowest / (WIDE * geometry.d_detector[1])),
-        )
-        self._step = (max(self._step[0], 1), max(self._step[1], 1))
+        d_v, d_u = geometry.d_detector
+        self._step = max(int(narrowest / (WIDE * d_v)), 1), max(int(narrowest / (WIDE * d_u)), 1)
         self._parts, self._d, self._field = parts, _lengths(geometry, self._step), open_field
         self._rows, self._columns = (
             between(n, -(-n // k), k) for n, k in zip(open_field.shape, self._step, strict=True)
@@ -301,7 +289,27 @@ class _GlareOf:
 
     def _straight(self, signal: Image) -> Image:
         glare = _glare(_blocks(signal, self._step), self._parts, self._d)
-        return (signal - self._rows @ glare @ self._columns.T) / np.float32(1 - _total(self._parts))
+        between_blocks = np.asarray(self._rows @ glare @ self._columns.T, np.float32)
+        return (signal - between_blocks) / np.float32(1 - _total(self._parts))
+
+
+def _columns(
+    light: Image,
+    field: Image,
+    is_open: NDArray[np.bool_],
+    widths: Sequence[float],
+    geometry: Geometry,
+    d: tuple[float, float],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what glare of each width adds to open blocks, and scatter, less their means in a view, and these means."""
+    # a block's own noise would be in what it is explained by, too
+    level = _centred(light, is_open)[1].astype(np.float32)[:, None, None]
+    clean = np.where(is_open, level, light)
+    of_light, of_field = (fft.dctn(image, axes=(-2, -1)) for image in (clean * field, field))
+    transfers = (_transfer(field.shape, ((1, width),), d) for width in widths)
+    glares = [(_filtered(of_light, one) - clean * _filtered(of_field, one)) / field for one in transfers]
+    both = [_centred(image, is_open) for image in (*glares, source_of(np.minimum(light, 1), geometry, d))]
+    return np.stack([values for values, _ in both], -1), np.stack([means for _, means in both], -1)
 
 
 def _total(parts: Parts) -> float:
@@ -322,7 +330,7 @@ def _parts(shares: NDArray[np.float64], scales: Sequence[float]) -> Parts:
 
 def _least_squares(columns: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the coefficients, none below 0, whose sum of columns is nearest to the values."""
-    both = np.linalg.qr(np.column_stack([columns, values]), mode="r")  # as many rows as columns say the same
+    both = np.asarray(np.linalg.qr(np.column_stack([columns, values]), mode="r"))  # few rows that say the same
     return np.asarray(optimize.nnls(both[:, :-1], both[:, -1])[0])
 
 
@@ -358,7 +366,8 @@ def _straight(signal: Image, parts: Parts, d: tuple[float, float]) -> Image:
 def _glare(signal: Image, parts: Parts, d: tuple[float, float]) -> Image:
     """Return the glare in signals [..., v, u] of blocks that are `d` (mm) long; the panel's edge reflects."""
     spread = _transfer(signal.shape[-2:], parts, d)
-    return _filtered(fft.dctn(signal, axes=(-2, -1)), spread / (np.float32(1 - _total(parts)) + spread))
+    transfer = np.asarray(spread / (1 - _total(parts) + spread), np.float32)
+    return _filtered(fft.dctn(signal, axes=(-2, -1)), transfer)
 
 
 def _transfer(shape: tuple[int, ...], parts: Parts, d: tuple[float, float]) -> Image:
