@@ -169,14 +169,15 @@ def test_noise_below_the_dark_level_stays_and_says_how_dark_readings_may_be():
 
 @pytest.mark.parametrize("lost", ["a view", "a row", "a dark view"])
 def test_lost_readings_do_not_hide_the_glare(lost):
-    images = glaring(light(), 0.08)
-    scan = scan_of(images)
-    true = total(panel_of(scan).glare)
+    scan = scan_of(lagging(glaring(light(), 0.08), [(0.05, 0.6)]))
+    true = panel_of(scan)
     if lost == "a row":
         scan.counts[:, 7] = torch.nan
     else:
-        scan.counts[3] = torch.nan if lost == "a view" else DARK
-    assert total(panel_of(scan).glare) == pytest.approx(true, rel=0.1)
+        scan.counts[0] = torch.nan if lost == "a view" else DARK
+    found = panel_of(scan)
+    assert total(found.glare) == pytest.approx(total(true.glare), rel=0.1)
+    assert total(found.lag) == pytest.approx(total(true.lag), abs=0.01)
 
 
 def test_dead_pixels_have_the_light_of_their_neighbours():
@@ -184,11 +185,11 @@ def test_dead_pixels_have_the_light_of_their_neighbours():
     scan = scan_of(glaring(true, 0.08), photons=1e9)
     flat = scan.flat.clone()
     flat[44:52, 54:60] = DARK
-    dead = dataclasses.replace(scan, flat=flat)
+    dead = dataclasses.replace(scan, flat=flat, counts=torch.where(flat > DARK, scan.counts, DARK))
     panel = panel_of(scan)
     away = (true < 1e-6) & (flat.numpy() > DARK)
     whole, left = (without_panel(s, panel).counts.numpy()[away] / I0 for s in (scan, dead))
-    assert abs(float((left - whole).mean())) < 1e-3
+    assert abs(float((left - whole).mean())) < 2e-4
 
 
 def test_a_short_scan_or_a_tiny_panel_says_nothing_and_stays():
@@ -206,6 +207,16 @@ def test_a_tube_that_flickers_or_drifts_is_no_lag():
     walk = 1 + np.cumsum(0.001 * rng.normal(size=VIEWS))
     for course in (1 + 0.01 * rng.normal(size=VIEWS), walk, np.linspace(0.99, 1.01, VIEWS)):
         assert panel_of(scan_of(light() * course[:, None, None])).lag == ()
+
+
+def test_few_views_are_too_few_to_tell_lag_from_flicker():
+    rng = np.random.default_rng(1)
+    shares = light()[:42] * (1 + 0.01 * rng.normal(size=(8, 42)))[..., None, None]
+    geometry = msgspec.structs.replace(GEOMETRY, n_views=42)
+    flat = torch.full((SIZE, SIZE), I0)
+    for share in shares:
+        counts = torch.from_numpy((I0 * share).astype(np.float32))
+        assert panel_of(Scan(geometry=geometry, counts=counts, flat=flat, i0=I0)).lag == ()
 
 
 def test_lag_of_a_panel_that_was_lit_before_is_not_found():
