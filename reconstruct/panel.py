@@ -144,7 +144,8 @@ class _Shares:
 
     def of(self, view: int) -> Image:
         """Return a view's [v, u], NaN where a reading is not finite."""
-        share = (self._scan.counts[view].numpy().astype(np.float32) - self._dark) / self.open_field
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = (self._scan.counts[view].numpy().astype(np.float32) - self._dark) / self.open_field
         self._fill(share)
         share[~np.isfinite(share)] = np.nan
         return share

@@ -271,7 +271,7 @@ def test_limitations_are_named():
     poses = tuple(map(tuple, GEOMETRY.pose_array().tolist()))
     with pytest.raises(InputError, match="circular orbit"):
         fdk(torch.zeros(GEOMETRY.shape), with_(poses=poses))
-    with pytest.raises(InputError, match="device: unknown parameter; expected one of scatter, window, cutoff"):
+    with pytest.raises(InputError, match="device: unknown parameter; expected one of panel, scatter, window, cutoff"):
         reconstruct(make_scan(SMALL, torch.ones(SMALL.shape)), device="cuda")
     with pytest.raises(InputError, match="shape"):
         fdk(torch.zeros(2, 3, 4), GEOMETRY)

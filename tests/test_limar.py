@@ -338,7 +338,7 @@ def test_wrong_settings_are_refused_by_name(iron, name, setting, words):
 
 
 def test_settings_are_set_by_name_and_carry_their_defaults():
-    filtered = {"scatter": 0.0, "window": "cosine", "cutoff": 0.9}
+    filtered = {"panel": "ideal", "scatter": 0.0, "window": "cosine", "cutoff": 0.9}
     bridged = {"mask": "oracle", "interpolation": "rows", "insert": "fdk", "dilation": None}
     assert find("limar").params == filtered | bridged
     method = find("nmar", {"normalisation": "ratio", "mask": "auto"})
@@ -346,7 +346,7 @@ def test_settings_are_set_by_name_and_carry_their_defaults():
         **find("limar").params, "mask": "auto", "prior": "auto", "normalisation": "ratio", "floor": None,
     }  # fmt: skip
     with pytest.raises(
-        InputError, match=r"nmar\.margin: unknown parameter; expected one of scatter, window, cutoff, mask, interp"
+        InputError, match=r"nmar\.margin: unknown parameter; expected one of panel, scatter, window, cutoff, mask, interp"
     ):
         find("nmar", {"margin": 0.9})
 

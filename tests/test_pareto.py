@@ -188,7 +188,7 @@ def test_settings_are_tuned_one_at_a_time_from_the_defaults():
         ("[[method]]\nname = 'fdk'\ntimes = 3", "mine.toml: method 'fdk' has no default iterations"),
         (
             "[[method]]\nname = 'ibhc'\nparameter = 'size'\nvalues = [1]",
-            "mine.toml: ibhc.size: unknown parameter; expected one of scatter, window, cutoff, tube",
+            "mine.toml: ibhc.size: unknown parameter; expected one of panel, scatter, window, cutoff, tube",
         ),
         (
             "[simulator]\nside = 16\nviews = 9\ntolerances = [1e-3, 1.0]\nsubrays = []\ngrids = []\nlevels = []",
