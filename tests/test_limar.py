@@ -346,7 +346,7 @@ def test_settings_are_set_by_name_and_carry_their_defaults():
         **find("limar").params, "mask": "auto", "prior": "auto", "normalisation": "ratio", "floor": None,
     }  # fmt: skip
     with pytest.raises(
-        InputError, match=r"nmar\.margin: unknown parameter; expected one of panel, scatter, window, cutoff, mask, interp"
+        InputError, match=r"nmar\.margin: unknown parameter; expected one of panel, scatter, window, cutoff, mask"
     ):
         find("nmar", {"margin": 0.9})
 
