@@ -8,6 +8,7 @@ lit the panel before. What they read is linear in glare and scatter, so least sq
 """
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -87,7 +88,7 @@ def panel_of(scan: Scan) -> Panel:
 
     Open is what reads nearly the open field, and is not next to what does not. Faint matter around an object looks like
     glare, so that has to explain most of what these pixels vary by, and shadows have to hold it. A tube that grows
-    brighter in the first views looks like lag. Scans of fewer than 60 views have none.
+    brighter in the first views looks like lag. In fewer than 60 views no lag is found.
     """
     shares, step = _Shares(scan), _step(scan.geometry, SIDE)
     d = _lengths(scan.geometry, step)
@@ -120,8 +121,8 @@ def without_panel(scan: Scan, panel: Panel, kept: float = 0.0) -> Scan:
     shares, dark = _Shares(scan), np.float32(scan.dark)
     counts = scan.counts.numpy().astype(np.float32)
     glare = _GlareOf(panel.glare, scan.geometry, shares.open_field) if panel.glare else None
-    for view, light in enumerate(_unlagged(map(shares.of, range(len(counts))), panel.lag)):
-        read = shares.of(view)
+    reads, images = itertools.tee(map(shares.of, range(len(counts))))
+    for view, (read, light) in enumerate(zip(reads, _unlagged(images, panel.lag), strict=True)):
         if glare is not None:
             light = glare.without(light)
         if kept > 0:

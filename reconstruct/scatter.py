@@ -67,10 +67,10 @@ def scatter_of(p: Image, valid: NDArray[np.bool_], geometry: Geometry, i0: float
     """Find the scatter of p = −ln(signal/open), float32 [view, v, u], where the `valid` readings have signal.
 
     The open field is taken without an object and so without its scatter, and nothing else makes a ray brighter than
-    that but noise and a drift of the tube. Gain and constant, neither below 0, are fitted to the
-    blocks of pixels that are as bright as the open field, within a noise of at least that of `i0` photons, and not next
-    to darker ones. Where these do not exceed the open field significantly, or there are none, scatter is 0. What is
-    found is scaled down until 99 % of the blocks hold it.
+    that but noise and a drift of the tube. Gain and constant, neither below 0, are fitted to the blocks of pixels that
+    are as bright as the open field, within a noise of at least that of `i0` photons, and not next to darker ones. Where
+    these do not exceed the open field significantly, or there are none, scatter is 0. What is found is scaled down
+    until 99 % of the blocks hold it.
     """
     means, step = _block_means(p, valid)
     noise = _noise(means, 1 / math.sqrt(i0 * math.prod(step)))

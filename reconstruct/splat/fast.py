@@ -113,10 +113,9 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     scan = without_panel(scan, panel)
     scatter = scatter_in(scan, settings.scatter)  # first: it takes line integrals of its own, which are then gone
     p, clamped = line_integrals(scan, slice(None))
-    valid = ~clamped.numpy()
     finest = finer(scan.geometry, settings.fineness)
     below = Below.of(scan) if panel else as_read
-    weights = weights_and_bounds(scan, p.numpy(), valid, scatter, below.noise)
+    weights = weights_and_bounds(scan, p.numpy(), ~clamped.numpy(), scatter, below.noise)
     doubt_edges(p.numpy(), weights, settings.edges, scatter.mean)
     data = Data(geometry=finest, p=p.numpy(), weights=weights, scatter=scatter.mean)
     levels = levels_of(data, coarse=(settings.passes or PASSES)[0] > 0)
