@@ -7,6 +7,7 @@ enter.
 
 import functools
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -28,7 +29,7 @@ from ctsim.reconstruct.splat.common import Common, Energy
 from ctsim.reconstruct.splat.course import PASSES, Course, levels_of, passes_over
 from ctsim.reconstruct.splat.curve import DENSEST, STRONGEST, MaterialCurve
 from ctsim.reconstruct.splat.filtration import USUAL, Filtration, found
-from ctsim.reconstruct.splat.level import Data
+from ctsim.reconstruct.splat.level import Data, thinned
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import FILTER, Response, basis_functions, evaluate, make_response, tangent
 from ctsim.reconstruct.starved import Below, weights_and_bounds
@@ -173,14 +174,19 @@ def find_filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtr
     if given or min(levels[-1].geometry.n_voxel[1:]) < ENOUGH:
         return None
     levels = levels if len(levels) > 1 else levels_of(levels[-1], coarse=True)
-    few = levels[: 1 + next((k for k, level in enumerate(levels) if min(level.geometry.n_voxel[1:]) >= ENOUGH), 0)]
+    k = next((k for k, level in enumerate(levels) if min(level.geometry.n_voxel[1:]) >= ENOUGH), len(levels) - 1)
     brief = msgspec.structs.replace(settings, passes=TRIAL)
 
-    def fit_of(value: float) -> Fit | None:
-        course = _course(few, settings.make_response(scan.e_max, value), brief, trial=True)
-        return course.go(lambda fit, whole, share: True)
+    def fits_on(few: list[Data]) -> Callable[[float], Fit | None]:
+        def fit_of(value: float) -> Fit | None:
+            course = _course(few, settings.make_response(scan.e_max, value), brief, trial=True)
+            return course.go(lambda fit, whole, share: True)
 
-    return found(fit_of)
+        return fit_of
+
+    # on the finest grid, trials would take as long as the fit
+    fine = fits_on([*levels[: k + 1], thinned(levels[k + 1])]) if k + 2 < len(levels) else None
+    return found(fits_on(levels[: k + 1]), fine)
 
 
 def _fitted(course: Course, scan: Scan, settings: Settings, stopwatch: Stopwatch) -> Fit | None:

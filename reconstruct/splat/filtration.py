@@ -2,10 +2,10 @@
 
 Line integrals of a wrong response are those of no object: views contradict each other wherever dense and thin paths
 cross, and no fit explains them all. What a coarse fit leaves unexplained is averaged over neighbouring rays, whose
-noise and missed edges cancel, while the error of the response does not: it changes slowly. Rays through metal are left
-out, since what its shape leaves is larger; they are the same rays for all filtrations. The misfit falls steeply up to
-the right filtration, and then changes less: beams that are nearly monochromatic all look alike. So the value is the
-one nearest to the usual filtration that explains the scan about as well as the best.
+noise and missed edges cancel, while the error of the response does not: it changes slowly. Of that, what is the same in
+all views is left out: a body that is round about the axis would explain it, so that it tells of an unfinished fit and
+nothing of the beam. A water bottle, which looks the same from all sides, therefore hardly shows its beam. Rays through
+metal are left out, since what its shape leaves is larger; they are the same rays for all filtrations.
 
 Consistency of the data is what other calibrations of a beam without a phantom use, too (Würfl et al., Epipolar
 consistency beam hardening, Med. Phys. 44, 2017).
@@ -26,15 +26,15 @@ from ctsim.reconstruct.splat.response import FILTER
 
 USUAL = 0.5  # mm of aluminium, from which the search starts
 TRIED = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 14.0, 20.0)
-AS_GOOD, PLAUSIBLE = 1.005, 1.05
-"""Times the least misfit: up to the first, the usual filtration is preferred; up to the second, a filtration is not
-excluded, as materials, scatter and spectra are not those assumed."""
+PLAUSIBLE = 1.05  # times the least misfit, at two standard deviations: materials, scatter and spectra are assumed
+UNTOLD = 8.0  # times its least plausible value, from which on the greatest says that the scan does not tell its beam
 WIDTH = 1 / 16  # σ of the averages, in widths of the panel
 MET, DARK = 0.15, 3.0
 """P of rays that count: below they graze the object, above scatter and lacking photons make more than the beam does."""
 METAL, FAINT = 8.0, 1e-3
 """Times water, what is metal; what of P it adds at most to a ray that is said not to meet it."""
 LEAST = 0.3  # of the neighbours that count: an average over fewer is left out
+OFTEN = 0.25  # of the views in which a pixel must count for its mean over them to be taken
 FEWEST = 1000  # averages, below which there is no misfit
 
 
@@ -57,11 +57,18 @@ class Filtration:
 
     @property
     def sentence(self) -> str:
-        """Say that the softest beam of the assumed tube explains the scan best, or nothing.
+        """Say that the scan does not tell its beam, or that the softest one explains it best, or nothing.
 
         The hardest is no such limit: hard beams differ little.
         """
-        if not self.misfits or min(self.misfits, key=lambda t: self.misfits[t]) != FILTER[0]:
+        if not self.misfits:
+            return ""
+        if self.high >= UNTOLD * self.low:
+            return (
+                f"the scan does not tell its beam, as round bodies do not: {self.low:g} to {self.high:g} mm Al explain "
+                'it alike; `filtration` or the response "known" tells it'
+            )
+        if min(self.misfits, key=lambda t: self.misfits[t]) != FILTER[0]:
             return ""
         return (
             f"the beam is as soft as that of the assumed tube behind {FILTER[0]:g} mm Al, or softer: values may be "
@@ -69,12 +76,25 @@ class Filtration:
         )
 
 
-def found(fit_of: Callable[[float], Fit | None]) -> Filtration:
-    """Search the filtration that a scan shows; `fit_of` returns the coarse fit at a filtration, None for nothing."""
-    usual, start = fit_of(USUAL), TRIED.index(USUAL)
-    if usual is None or not math.isfinite(least := misfit(usual, rays := rays_of(usual))):
+def found(coarse: Callable[[float], Fit | None], fine: Callable[[float], Fit | None] | None = None) -> Filtration:
+    """Search the filtration that a scan shows, by `coarse` fits and then, if there are any, `fine` ones around it.
+
+    Both return the fit at a filtration, None for nothing.
+    """
+    misfits = _searched(coarse, USUAL)
+    if misfits and fine is not None:
+        misfits = _searched(fine, min(misfits, key=lambda t: misfits[t])) or misfits
+    if not misfits:
         return Filtration(value=USUAL, low=FILTER[0], high=FILTER[2], misfits={})
-    misfits = {USUAL: least}
+    return _chosen(misfits)
+
+
+def _searched(fit_of: Callable[[float], Fit | None], start: float) -> dict[float, float]:
+    """Return the misfits by filtration from `start` on, both ways while plausible; empty where that has none."""
+    first = fit_of(start)
+    if first is None or not math.isfinite(least := misfit(first, rays := rays_of(first))):
+        return {}
+    misfits = {start: least}
 
     def misfit_at(k: int) -> float:
         if (value := TRIED[k]) not in misfits:
@@ -83,22 +103,26 @@ def found(fit_of: Callable[[float], Fit | None]) -> Filtration:
         return misfits[value]
 
     for way in (1, -1):
-        k = start
+        k = TRIED.index(start)
         # one more than where it stops falling, since a step of the search is not all that it varies by
         while 0 <= k + way < len(TRIED) and misfit_at(k) <= PLAUSIBLE * min(misfits.values()):
             k += way
             misfit_at(k)
-    return _chosen({t: value for t, value in sorted(misfits.items()) if math.isfinite(value)})
+    return {t: value for t, value in sorted(misfits.items()) if math.isfinite(value)}
 
 
 def _chosen(misfits: dict[float, float]) -> Filtration:
-    """Choose on a spline through the misfits, both axes logarithmic."""
-    tried, values, usual = np.log(list(misfits)), np.log(list(misfits.values())), math.log(USUAL)
-    fine = np.sort([*np.linspace(tried[0], tried[-1], 2001), usual])
-    curve = CubicSpline(tried, values)(fine) if len(tried) > 1 else np.full_like(fine, values[0])
-    good, plausible = (fine[curve - curve.min() <= math.log(limit)] for limit in (AS_GOOD, PLAUSIBLE))
-    chosen = (good[np.argmin(np.abs(good - usual))], plausible[0], plausible[-1])
-    value, low, high = (round(math.exp(t), 3) for t in chosen)
+    """Return the mean filtration by how likely each is, on a spline through the misfits, both axes logarithmic.
+
+    Where all explain the scan alike, that is the middle of what was tried.
+    """
+    tried, values = np.log(list(misfits)), np.log(list(misfits.values()))
+    fine = np.linspace(tried[0], tried[-1], 2001)
+    above = CubicSpline(tried, values)(fine) if len(tried) > 1 else np.zeros_like(fine)
+    above -= above.min()
+    plausible = fine[above <= math.log(PLAUSIBLE)]
+    mean = np.average(fine, weights=np.exp(-2 * above / math.log(PLAUSIBLE)))
+    value, low, high = (round(math.exp(t), 3) for t in (mean, plausible[0], plausible[-1]))
     return Filtration(value=value, low=low, high=high, misfits=misfits)
 
 
@@ -111,13 +135,19 @@ def rays_of(fit: Fit) -> NDArray[np.bool_]:
 
 
 def misfit(fit: Fit, rays: NDArray[np.bool_]) -> float:
-    """Return the root mean square of locally averaged p − P over `rays` [view, v, u], infinite for too few."""
+    """Return the root mean square of what locally averaged p − P over `rays` [view, v, u] varies by from view to view.
+
+    Infinite for too few rays.
+    """
     left = fit.data.p - fit.fitted(np.arange(fit.data.geometry.n_views))
     sigma = (0, *[WIDTH * fit.data.geometry.n_detector[1]] * 2)
     share = ndimage.gaussian_filter(rays.astype(np.float32), sigma)
     total = ndimage.gaussian_filter(np.where(rays, left, np.float32(0)), sigma)
     counts = rays & (share > LEAST)
+    counts &= counts.mean(0) >= OFTEN
     if counts.sum() < FEWEST:
         return math.inf
-    value = float(np.sqrt(np.mean(np.square(total[counts] / share[counts], dtype=np.float64))))
+    averages = np.divide(total, share, where=counts, out=np.zeros_like(total))
+    varying = averages - averages.sum(0, dtype=np.float64) / np.maximum(counts.sum(0), 1)
+    value = float(np.sqrt(np.mean(np.square(varying[counts], dtype=np.float64))))
     return value if math.isfinite(value) else math.inf

@@ -13,6 +13,8 @@ from ctsim.reconstruct.splat.kernels import carve_cpu
 from ctsim.reconstruct.starved import WEIGHT
 from ctsim.reconstruct.weights import photon_weights
 
+ENOUGH = 60  # views that tell an object apart from what is left of it between them
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Data:
@@ -79,6 +81,17 @@ def coarser(data: Data) -> Data:
     coarse = weighted(geometry, p, seen, data.scatter)
     coarse.weights[bounds] = -WEIGHT
     return coarse
+
+
+def thinned(data: Data) -> Data:
+    """Return every second view where that leaves enough to tell an object, else all."""
+    geometry = data.geometry
+    if geometry.n_views < 2 * ENOUGH:
+        return data
+    views = np.arange(0, geometry.n_views, 2)
+    poses = tuple(tuple(row) for row in geometry.pose_array()[views].tolist())
+    geometry = msgspec.structs.replace(geometry, n_views=views.size, angles_deg=None, poses=poses)
+    return Data(geometry=geometry, p=data.p[views], weights=data.weights[views], scatter=data.scatter)
 
 
 def refined(values: NDArray[np.float32], fine: Geometry) -> NDArray[np.float32]:
