@@ -172,7 +172,7 @@ class ScannerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     tube: Tube | None = None
     """Replaces the preset's tube, except a focal spot, off-focal radiation and falloff that it does not state."""
     detector: Detector | None = None
-    """Replaces the preset's detector, except blur and lag that it does not state."""
+    """Replaces the preset's detector, except blur and lag that it does not state; a lag of share 0 is none."""
     noise: Noise | None = None
     """How photons become counts."""
     scatter: Scatter | None = None
@@ -234,7 +234,8 @@ class ScannerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         detector = self.detector
         if detector is None or detector.kind == "counting":  # which has no light
             return detector or machine
-        return msgspec.structs.replace(detector, blur=detector.blur or machine.blur, lag=detector.lag or machine.lag)
+        lag = tuple(part for part in detector.lag or machine.lag if part.share)
+        return msgspec.structs.replace(detector, blur=detector.blur or machine.blur, lag=lag)
 
 
 SHAPING = (

@@ -292,7 +292,7 @@ def test_the_plan_says_what_the_panel_does():
         (lambda: Blur(fwhm=1.0, tail=0.1), "tail and tail_fwhm need each other"),
         (lambda: Blur(fwhm=1.0, tail_fwhm=2.0), "tail and tail_fwhm need each other"),
         (lambda: Blur(fwhm=1.0, tail=1.5, tail_fwhm=2.0), r"tail must be a share within \[0, 1\]"),
-        (lambda: Lag(share=0.0, decay=0.5), r"lag: share must be within \(0, 1\)"),
+        (lambda: Lag(share=-0.1, decay=0.5), r"lag: share must be within \[0, 1\)"),
         (lambda: Lag(share=0.1, decay=0.99), r"lag: decay must be within \[0, 0.98\]"),
         (lambda: Detector(lag=(Lag(share=0.6, decay=0.5),) * 2), "add up to less than 1, got 1.2"),
         (lambda: Detector(kind="counting", blur=Blur(fwhm=0.2)), "expected neither blur nor lag"),

@@ -4,6 +4,7 @@ import msgspec
 import pytest
 
 from ctsim.beam.spectrum import Tube
+from ctsim.detector.panel import Blur
 from ctsim.detector.response import Detector
 from ctsim.phantoms.scanners import MACHINES, ScannerSettings
 from ctsim.phantoms.scene import parse_suite
@@ -59,6 +60,12 @@ def test_what_a_scene_states_wins():
     scanner = resolved(preset="c-arm", tube=tube, detector=detector)
     assert scanner.tube == msgspec.convert(tube | {"falloff": True}, Tube)
     assert scanner.detector == msgspec.convert(detector, Detector)
+
+
+def test_lag_and_glare_of_a_preset_can_be_left_out():
+    detector = {"kind": "csi", "thickness": 0.6, "blur": {"fwhm": 0.37}, "lag": [{"share": 0.0, "decay": 0.0}]}
+    got = resolved(preset="c-arm", detector=detector).detector
+    assert got.lag == () and got.blur == Blur(fwhm=0.37)
 
 
 def test_a_counting_detector_has_no_light_to_spread():

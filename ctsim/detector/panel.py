@@ -56,13 +56,13 @@ class Lag(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """
 
     share: float
-    """How much of a view's signal comes later, above 0 and below 1; all parts together below 1."""
+    """How much of a view's signal comes later, 0 for none; all parts together below 1."""
     decay: float
     """How much of what is left stays from one view to the next, 0 to 0.98."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.share < 1:
-            raise InputError(f"lag: share must be within (0, 1), got {self.share}")
+        if not 0 <= self.share < 1:
+            raise InputError(f"lag: share must be within [0, 1), got {self.share}")
         if not 0 <= self.decay <= SLOWEST:
             raise InputError(f"lag: decay must be within [0, {SLOWEST}], got {self.decay}")
 
