@@ -4,6 +4,7 @@ Every reading has a value of its own. A file is read as the library reads it, it
 place of each of its pixels, and the reading with a value must lie where ours with that value does.
 """
 
+import dataclasses
 import json
 import pickle
 import xml.etree.ElementTree as ET
@@ -303,3 +304,24 @@ def test_what_a_layout_cannot_hold_is_refused(tmp_path, to, change, said):
     with pytest.raises(InputError, match=f"^--to {to}: ") as caught:
         write_scan(tmp_path / "a", to, scan)
     assert said in str(caught.value) and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("to", sorted(LAYOUTS))
+def test_a_measured_scan_is_written_where_no_truth_is_needed(tmp_path, to):
+    """R2-Gaussian and NAF do not start without a true volume; the others never see one."""
+    centred = msgspec.structs.replace(GEOMETRY, off_detector=(0.0, 0.0), off_origin=(0.0, 0.0, 0.0))
+    whole = measured(HELD.get(to, centred))
+    scan, out = dataclasses.replace(whole, reference=None), tmp_path / ("a" + LAYOUTS[to].file)
+    if to in ("r2", "naf"):
+        with pytest.raises(InputError, match="comes without one: expected tigre, rtk, astra, leap, dxchange"):
+            write_scan(out, to, scan)
+        assert not list(tmp_path.iterdir())
+        return
+    write_scan(out, to, scan)
+    write_scan(tmp_path / ("b" + LAYOUTS[to].file), to, whole)
+    assert content_of(out) == content_of(tmp_path / ("b" + LAYOUTS[to].file))
+
+
+def content_of(path):
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    return [(p.relative_to(path), p.read_bytes()) for p in files]

@@ -11,6 +11,7 @@ from closed_scans import BODY, GEOMETRY, LEVEL, METAL, counts_of, line_integrals
 from scipy import ndimage
 
 from ctsim.beam.spectrum import Filter, Tube
+from ctsim.benchmarks.export import work as export
 from ctsim.benchmarks.importing import Flags
 from ctsim.benchmarks.importing.settle import water_path
 from ctsim.benchmarks.importing.work import bring
@@ -238,3 +239,14 @@ def test_the_same_import_does_nothing_and_views_are_held_out(tmp_path, capsys):
     assert sorted(itertools.chain(of_held, of_kept)) == list(range(24))
     assert np.array_equal(stored.array("held"), COUNTS[of_held])
     assert np.array_equal(stored.scan.counts.numpy(), COUNTS[of_kept])
+
+
+def test_an_import_goes_on_to_another_library(tmp_path):
+    """The geometry of a circle and the readings are all that most need; R2-Gaussian wants a truth, too."""
+    log = scan_files.skyscan(tmp_path / "scan", COUNTS, GEOMETRY)
+    folder = bring(Flags(scan=log, out=tmp_path / "data", center="file"))
+    export.export(export.Flags(scan=folder, out=tmp_path / "rtk", to="rtk"))
+    assert {path.name for path in (tmp_path / "rtk").iterdir()} == {"geometry.xml", "grid.mha", "projections.mha"}
+    with pytest.raises(InputError, match="the scan comes without one"):
+        export.export(export.Flags(scan=folder, out=tmp_path / "r2", to="r2"))
+    assert not (tmp_path / "r2").exists()

@@ -33,13 +33,14 @@ PER_METRE = 1000  # NAF's lengths are metres
 class Measured:
     """What is exported: line integrals [view, v, u] and the true attenuation [z, y, x] in 1/mm, both float32.
 
-    R2-Gaussian and NAF do not start without a true volume, which they compare their own with. Data Exchange holds
+    R2-Gaussian and NAF do not start without a true volume, which they compare their own with; it is None where the scan
+    comes without. Data Exchange holds
     `counts` [view, v, u] instead, the open field `flat` [v, u], and the level `dark` that both include.
     """
 
     geometry: Geometry
     p: NDArray[np.float32]
-    reference: NDArray[np.float32]
+    reference: NDArray[np.float32] | None
     counts: NDArray[Any]
     flat: NDArray[np.float32]
     dark: float
@@ -48,10 +49,13 @@ class Measured:
 def write_scan(out: Path, to: str, scan: Measured) -> None:
     """Write a scan in a library's layout, whole or not at all.
 
-    Raises InputError for a geometry that the layout cannot hold.
+    Raises InputError for a geometry that the layout cannot hold, and where it lacks the truth that the layout needs.
     """
     layout = LAYOUTS[to]
     geometry = scan.geometry
+    if layout.truth and scan.reference is None:
+        others = ", ".join(name for name, other in LAYOUTS.items() if not other.truth)
+        raise InputError(f"--to {to}: holds a true volume, too, but the scan comes without one: expected {others}")
     if geometry.poses is not None and not layout.poses:
         raise InputError(f"--to {to}: holds a circular orbit only, but the scan's geometry is given by poses")
     if not layout.off_detector and any(geometry.off_detector):
@@ -69,6 +73,12 @@ def write_scan(out: Path, to: str, scan: Measured) -> None:
         return
     with making(out) as new:
         layout.write(new, scan)
+
+
+def _truth(scan: Measured) -> NDArray[np.float32]:
+    """Return the true volume, which `write_scan` has seen to be there."""
+    assert scan.reference is not None
+    return scan.reference
 
 
 def _json(path: Path, content: dict[str, Any]) -> None:
@@ -211,7 +221,7 @@ def _r2(folder: Path, scan: Measured) -> None:
             name = f"{split}/{split}_{number:04d}.npy"
             _save(folder / name, views[view])
             told[split].append({"file_path": name, "angle": float(angles[view])})
-    _save(folder / "vol_gt.npy", volume_to(Library.R2_GAUSSIAN, scan.reference))
+    _save(folder / "vol_gt.npy", volume_to(Library.R2_GAUSSIAN, _truth(scan)))
     low, high = ([o + sign * s / 2 for o, s in zip(g.off_origin, g.s_voxel, strict=True)][::-1] for sign in (-1, 1))
     scanner = {
         "mode": "cone",
@@ -235,7 +245,7 @@ def _naf(path: Path, scan: Measured) -> None:
     """Write NAF's pickle, a dict of arrays, numbers and names. Its rays take the detector as (u, v), v downwards."""
     g = scan.geometry
     views = np.ascontiguousarray(projections_to(Library.R2_GAUSSIAN, scan.p))
-    image = volume_to(Library.R2_GAUSSIAN, scan.reference) * np.float32(PER_METRE)
+    image = volume_to(Library.R2_GAUSSIAN, _truth(scan)) * np.float32(PER_METRE)
     few = slice(0, None, EVERY)
     v, u = g.off_detector
     content = {
@@ -273,7 +283,8 @@ def _dxchange(path: Path, scan: Measured) -> None:
 class Layout:
     """A library's layout: how it is written, and which geometries it can hold.
 
-    `file` is how its name ends where it is one file, "" for a folder. `content` are its readings.
+    `file` is how its name ends where it is one file, "" for a folder. `content` are its readings. `truth` says that it
+    holds the true volume.
     """
 
     write: Callable[[Path, Measured], None]
@@ -283,6 +294,7 @@ class Layout:
     off_detector: bool = True
     off_origin: bool = True
     square: bool = False
+    truth: bool = False
 
 
 LAYOUTS = {
@@ -290,7 +302,7 @@ LAYOUTS = {
     "rtk": Layout(write=_rtk),
     "astra": Layout(write=_astra, poses=True),
     "leap": Layout(write=_leap, square=True),
-    "r2": Layout(write=_r2, off_detector=False),
-    "naf": Layout(write=_naf, file=".pickle", off_origin=False),
+    "r2": Layout(write=_r2, off_detector=False, truth=True),
+    "naf": Layout(write=_naf, file=".pickle", off_origin=False, truth=True),
     "dxchange": Layout(write=_dxchange, file=".h5", content="counts", off_detector=False, off_origin=False),
 }

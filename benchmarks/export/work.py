@@ -73,7 +73,7 @@ def _export_scan(given: Flags, stored: StoredScan) -> None:
     content = Measured(
         geometry=stored.geometry,
         p=p.numpy(),
-        reference=np.asarray(stored.reference("effective"), np.float32),
+        reference=np.asarray(stored.reference("effective"), np.float32) if stored.has_truth else None,
         counts=scan.counts.numpy(),
         flat=scan.flat.numpy(),
         dark=scan.dark,
