@@ -14,7 +14,7 @@ from ctsim.phantoms.recipe import Recipe
 from ctsim.phantoms.recipes import build_recipe
 from ctsim.solids import pack
 from ctsim.tracer.shadow import primitive_corners
-from ctsim.tracer.voxelise import metal_mask
+from ctsim.tracer.voxelise import metal_planes
 from ctsim.types import Phantom
 
 DRAWS = 20
@@ -79,7 +79,7 @@ def _metal_height(phantom: Phantom, stream: str) -> float:
     z, y, x = (float(d) for d in (high - low) / n)
     centre_z, centre_y, centre_x = (float(c) for c in (high + low) / 2)
     grid = msgspec.structs.replace(_GRID, n_voxel=n, d_voxel=(z, y, x), off_origin=(centre_z, centre_y, centre_x))
-    held = np.flatnonzero(metal_mask(solids, grid).any((1, 2)))
+    held = np.flatnonzero(metal_planes(solids, grid))
     if not held.size:  # thinner than half a voxel of that grid everywhere
         return centre_z
     digest = hashlib.sha256(f"{stream}/height".encode()).digest()

@@ -58,7 +58,7 @@ def test_solids_keep_their_volume(kind, params, volume, pitch):
     assert all(v.dtype == np.float32 and v.min() >= 0 for v in got.values())
 
 
-def sample(kernel, solids, grid, cells, dtype):
+def sample(kernel, solids, grid, cells, dtype, sought=(False, False)):
     """Touched voxels [z, y, x] and, of those the fast kernel touches, the shares [k, channel] of Fe and Ti."""
     prims, shape = pack(solids, ("Fe", "Ti")), grid.n_voxel
     start, pitch = np.array([c[0] for c in grid.voxel_centres()]), np.array(grid.d_voxel)
@@ -68,7 +68,8 @@ def sample(kernel, solids, grid, cells, dtype):
     index = np.flatnonzero(listed)
     first = np.searchsorted(index, np.arange(shape[0] + 1) * (shape[1] * shape[2]))
     share = np.zeros((len(index), 2), dtype)
-    kernel.cover(prims, prims[:, MATERIAL].astype(np.int64), start, pitch, (cells,) * 3, shape, index, first, share)
+    channel, sought = prims[:, MATERIAL].astype(np.int64), np.array(sought)
+    kernel.cover(prims, channel, start, pitch, (cells,) * 3, shape, index, first, sought, share)
     return touched, share
 
 
@@ -88,6 +89,33 @@ def test_each_voxel_agrees_with_the_reference(kind, params, volume):
     np.testing.assert_allclose(fast, slow, rtol=0, atol=1 / 250 + 6 * 0.35 / n**2)
     assert not slow[:, 1].any() and not fast[:, 1].any()
     assert not (held > touched).any()
+
+
+@pytest.mark.parametrize("sought", [(True, False), (False, True), (True, True)])
+def test_a_slice_is_left_where_half_a_voxel_of_what_is_sought_is_found(sought):
+    solids = [solid(ELLIPSOID, (2.5, 2.0, 2.2)), solid(BOX, (0.9, 0.9, 0.9), "Ti", centre=(1.1, 0.6, 0.2))]
+    grid = geometry((6, 5, 5), (0.9, 0.9, 0.9))
+    _, fast = sample(voxelise_cpu, solids, grid, 8, np.float32, sought)
+    _, slow = sample(voxelise_reference, solids, grid, 24, np.float64, sought)
+    _, whole = sample(voxelise_cpu, solids, grid, 8, np.float32)
+    assert np.array_equal(fast.any(1), slow.any(1)) and 0 < fast.any(1).sum() < whole.any(1).sum()
+    assert np.array_equal(fast[fast.any(1)], whole[fast.any(1)])
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.4])
+@pytest.mark.parametrize("pitch", [0.2, 0.7, 1.3])
+def test_planes_with_metal_are_those_of_the_mask(tilt, pitch):
+    """Of a thin plate, a rod, and a ball that lies in a hole of tissue."""
+    solids = (
+        solid(BOX, (3.0, 2.0, 0.3), axis=(tilt, 0.1, 1.0)),
+        solid(CAPSULE, (3.0, 0.4), "Ti", centre=(-2.0, 1.0, 2.0), axis=(0.3, 0.2, 1.0)),
+        solid(BOX, (2.0, 2.0, 2.0), "water", metal=False, centre=(1.0, 0.0, -4.0)),
+        solid(ELLIPSOID, (0.8, 0.8, 0.8), centre=(1.0, 0.0, -4.0)),
+    )
+    n = round(14 / pitch)
+    body, grid = phantom(*solids), geometry((n, n, n), (pitch,) * 3)
+    planes = voxelise.metal_planes(body, grid)
+    assert np.array_equal(planes, voxelise.metal_mask(body, grid).any((1, 2))) and 0 < planes.sum() < n
 
 
 def test_solids_that_cross_agree_with_the_reference():

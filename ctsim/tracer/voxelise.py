@@ -163,8 +163,16 @@ def _overlap(
     return first, np.maximum(weights, 0) * (d_in / d), counts
 
 
-def cover_of(phantom: Phantom, geometry: Geometry) -> Cover:
-    """Sample all solids on the grid; serves every volume of the same phantom and grid."""
+def metal_planes(phantom: Phantom, geometry: Geometry) -> NDArray[np.bool_]:
+    """Return in which planes along z `metal_mask` holds metal; a plane is sampled up to its first voxel of it."""
+    return metal_mask(phantom, geometry, cover_of(phantom, geometry, until_metal=True)).any((1, 2))
+
+
+def cover_of(phantom: Phantom, geometry: Geometry, *, until_metal: bool = False) -> Cover:
+    """Sample all solids on the grid; serves every volume of the same phantom and grid.
+
+    With `until_metal` each plane along z is sampled up to its first voxel of which metal fills half.
+    """
     channels = sorted({(phantom.materials.index(s.material), s.metal) for s in phantom.solids})
     rows, of = [np.zeros((0, PRIMITIVE_COLUMNS))], [np.zeros(0, np.int64)]
     for solid in phantom.solids:
@@ -186,5 +194,6 @@ def cover_of(phantom: Phantom, geometry: Geometry) -> Cover:
     mean = math.prod(geometry.d_voxel) ** (1 / 3)
     z, y, x = (min(max(round(_CELLS * d / mean), 1), _MAX_CELLS) for d in geometry.d_voxel)
     share = np.zeros((len(index), len(channels)), np.float32)
-    voxelise_cpu.cover(prims, channel_of, start, pitch, (z, y, x), (nz, ny, nx), index, first, share)
+    sought = np.array([until_metal and metal for _, metal in channels])
+    voxelise_cpu.cover(prims, channel_of, start, pitch, (z, y, x), (nz, ny, nx), index, first, sought, share)
     return Cover(tuple(channels), index, share)

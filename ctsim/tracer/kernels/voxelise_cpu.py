@@ -191,9 +191,9 @@ def mark(prims, start, pitch, touched):
 
 @compiled_once(
     *("int64", "float64[:,::1]", "int64[::1]", "float64[::1]", "float64[::1]", "UniTuple(int64, 3)"),
-    *("UniTuple(int64, 3)", "int64[::1]", "int64[::1]", "float32[:,::1]"),
+    *("UniTuple(int64, 3)", "int64[::1]", "int64[::1]", "boolean[::1]", "float32[:,::1]"),
 )
-def _cover_slice(k, prims, channel, start, pitch, cells, shape, index, first, out):
+def _cover_slice(k, prims, channel, start, pitch, cells, shape, index, first, sought, out):
     _, ny, nx = shape
     reach = 0.5 * math.sqrt(pitch[0] ** 2 + pitch[1] ** 2 + pitch[2] ** 2)
     dz, dy, dx = pitch[0] / cells[0], pitch[1] / cells[1], pitch[2] / cells[2]
@@ -229,6 +229,8 @@ def _cover_slice(k, prims, channel, start, pitch, cells, shape, index, first, ou
         if n == 0:
             if full >= 0:
                 out[m, full] = 1.0
+                if sought[full]:
+                    return
             continue
         total[:] = 0.0
         for kk in range(cells[0]):
@@ -247,21 +249,25 @@ def _cover_slice(k, prims, channel, start, pitch, cells, shape, index, first, ou
                             break
                     if full >= 0:
                         total[full] += left
+        found = np.float32(0)
         for r in range(total.size):  # not by a slice: its error message takes a second to compile
             out[m, r] = total[r]
+            found += out[m, r] * sought[r]
+        if found >= 0.5:
+            return
 
 
 @njit(parallel=True, cache=True)
-def _cover_slices(slice_, prims, channel, start, pitch, cells, shape, index, first, out):
+def _cover_slices(slice_, prims, channel, start, pitch, cells, shape, index, first, sought, out):
     for k in prange(shape[0]):
-        _cover_slice(slice_, k, prims, channel, start, pitch, cells, shape, index, first, out)
+        _cover_slice(slice_, k, prims, channel, start, pitch, cells, shape, index, first, sought, out)
 
 
-def cover(prims, channel, start, pitch, cells, shape, index, first, out):
+def cover(prims, channel, start, pitch, cells, shape, index, first, sought, out):
     """Fill `out` [k, channel] with the share of each listed voxel that each channel is seen in.
 
     `index` [k] are ascending flat voxel numbers, `first` [nz + 1] where each slice begins in them;
     `channel` [primitive] and `cells` (z, y, x) the sub-cells of a voxel. A later primitive covers an
-    earlier one in every sub-cell.
+    earlier one in every sub-cell. A slice is left at the first voxel that `sought` [channel] fill by half.
     """
-    _cover_slices(_cover_slice.address(), prims, channel, start, pitch, cells, shape, index, first, out)
+    _cover_slices(_cover_slice.address(), prims, channel, start, pitch, cells, shape, index, first, sought, out)

@@ -41,20 +41,27 @@ def mark(prims, start, pitch, touched):
             touched[at] = 1
 
 
-def cover(prims, channel, start, pitch, cells, shape, index, first, out):
+def cover(prims, channel, start, pitch, cells, shape, index, first, sought, out):
     """Fill `out` [k, channel] with the share of each listed voxel that each channel is seen in.
 
     `index` [k] are flat voxel numbers, of which `first` tells nothing new; `channel` [primitive] and `cells`
-    (z, y, x) the sample points along a voxel. Each belongs to the last primitive that holds it.
+    (z, y, x) the sample points along a voxel. Each belongs to the last primitive that holds it. A slice is left at the
+    first voxel that `sought` [channel] fill by half.
     """
+    left = -1
     for k, flat in enumerate(index):
-        centre = start + np.array(np.unravel_index(flat, shape)) * pitch
+        at = np.unravel_index(flat, shape)
+        if at[0] == left:
+            continue
+        centre = start + np.array(at) * pitch
         points = _samples(centre, pitch, cells)
         seen = np.full(points.shape[1], -1)
         for prim, number in zip(prims, channel, strict=True):
             seen[_inside(prim, points)] = number
         for number in range(out.shape[1]):
             out[k, number] = np.mean(seen == number)
+        if out[k, sought].sum() >= 0.5:
+            left = at[0]
 
 
 def _samples(centre, size, n) -> _Array:
