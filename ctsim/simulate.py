@@ -7,7 +7,7 @@ before it, which are made again where a run that was interrupted goes on. It giv
 import contextlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import msgspec
@@ -29,7 +29,7 @@ from ctsim.readout import Image, Moments, Readout, panel_of
 from ctsim.scaninfo import TWIN
 from ctsim.signals import Part, Signals, compact, share_rays
 from ctsim.tracer.kernels.raytrace_cpu import STRIP
-from ctsim.tracer.voxelise import body_attenuation, body_labels, cover_of, label_volume, metal_mask, painted
+from ctsim.tracer.voxelise import Cover, body_attenuation, body_labels, cover_of, label_volume, metal_mask, painted
 from ctsim.types import Phantom, Scanner
 
 Scattered = Sequence[ScatterSeries | None]
@@ -289,11 +289,23 @@ def flat_image(plan: Plan, scanner: Scanner) -> Image:
     )
 
 
-def truth_volumes(plan: Plan, phantom: Phantom, scanner: Scanner) -> Iterator[tuple[str, NDArray]]:
+@dataclass(slots=True)
+class SharedTruth:
+    """What the true volumes of variants, as `ctsim.signals.same_rays` has them, share; empty before the first."""
+
+    covers: list[Cover] = field(default_factory=list)
+    labels: dict[Any, NDArray[np.uint8]] = field(default_factory=dict)
+    bodies: dict[Any, NDArray[np.float32]] = field(default_factory=dict)
+
+
+def truth_volumes(
+    plan: Plan, phantom: Phantom, scanner: Scanner, shared: SharedTruth | None = None
+) -> Iterator[tuple[str, NDArray]]:
     """Yield (name, volume) on the reconstruction grid: labels, metal mask, references, and the twin's references.
 
     `reference_50kev` is μ at 50 keV, `reference_effective` Σ ω(E) μ(E) behind the scene's median
-    water-equivalent path, both float32 [z, y, x] in 1/mm.
+    water-equivalent path, both float32 [z, y, x] in 1/mm. `shared` is what an earlier variant left, and keeps what this
+    one draws.
     """
     geometry = scanner.geometry
     energies, omega = effective_weights(plan.spectrum, scanner.detector, plan.l0)
@@ -301,19 +313,46 @@ def truth_volumes(plan: Plan, phantom: Phantom, scanner: Scanner) -> Iterator[tu
     at_50 = _reference_mu(plan.materials, np.array([REFERENCE_KEV]), np.ones(1))
     body = compact(phantom, plan.materials)
     scans = [("", body)] + ([(TWIN, body.without_metal())] if plan.runs("metal-free twin") else [])
-    covers = [cover_of(content, geometry) for _, content in scans]
+    covers = [] if shared is None else shared.covers
+    covers[:] = covers or [cover_of(content, geometry) for _, content in scans]
     yield "metal", metal_mask(body, geometry, covers[0])
-    # the body is the same with and without metal
-    mine = body_labels(undivided(body, plan), geometry)
-    for prefix, content in scans:
-        told = undivided(content, plan)
-        cover = covers[prefix != ""] if told is content else None
-        yield prefix + "labels", label_volume(told, geometry, cover, mine.copy())
+    for (prefix, _), volume in zip(scans, _labels(plan, scans, geometry, covers, shared), strict=True):
+        yield prefix + "labels", volume
     for name, mu in (("reference_effective", effective), ("reference_50kev", at_50)):
-        volume = body_attenuation(body, geometry, mu)
+        volume = _body(body, geometry, mu, shared)
         for (prefix, content), cover in zip(scans, covers, strict=True):
-            last = content is scans[-1][1]
+            last = content is scans[-1][1] and shared is None
             yield prefix + name, painted(volume if last else volume.copy(), content, mu, cover)
+
+
+def _labels(
+    plan: Plan,
+    scans: Sequence[tuple[str, Phantom]],
+    geometry: Geometry,
+    covers: Sequence[Cover],
+    shared: SharedTruth | None,
+) -> list[NDArray[np.uint8]]:
+    """Return the labels of the scan and of its twin; the body is the same with and without metal."""
+    key = tuple(plan.told.index(m) for m in plan.tissues)
+    known = {} if shared is None else shared.labels
+    if (key, "") not in known:
+        mine = body_labels(undivided(scans[0][1], plan), geometry)
+        for (prefix, content), cover in zip(scans, covers, strict=True):
+            told = undivided(content, plan)
+            known[key, prefix] = label_volume(told, geometry, cover if told is content else None, mine.copy())
+    return [known[key, prefix] for prefix, _ in scans]
+
+
+def _body(
+    body: Phantom, geometry: Geometry, mu: Mapping[str, float], shared: SharedTruth | None
+) -> NDArray[np.float32]:
+    """Return the attenuation without solids; of variants, the last two are kept."""
+    if shared is None:
+        return body_attenuation(body, geometry, mu)
+    key = tuple(mu[m] for m in body.materials)
+    volume = shared.bodies.pop(key) if key in shared.bodies else body_attenuation(body, geometry, mu)
+    shared.bodies = dict([*shared.bodies.items()][-1:]) | {key: volume}
+    return volume
 
 
 def _reference_mu(materials: tuple[str, ...], energies: NDArray, omega: NDArray) -> Mapping[str, float]:

@@ -26,7 +26,7 @@ from ctsim.phantoms.variants import build_all
 from ctsim.phantoms.vary import Drawn
 from ctsim.plan import Plan, disk_estimate, make_plan
 from ctsim.signals import Signals, share_rays
-from ctsim.simulate import Scattered, part_of, scan_info, scatter_of, simulate_views, truth_volumes
+from ctsim.simulate import Scattered, SharedTruth, part_of, scan_info, scatter_of, simulate_views, truth_volumes
 from ctsim.types import Phantom, Scanner
 
 FEW_TISSUES = 7  # air among them: what recipes have, mostly
@@ -201,21 +201,24 @@ def _simulate(
         for job, its in zip(jobs, views, strict=True):
             if job.writer.first_view <= k < job.n_views:
                 job.writer.put(*next(its))
-    for job, its, scattered in zip(jobs, views, scatter, strict=True):
+    groups = [id(signals) for signals, _ in shared]
+    truths = {group: SharedTruth() for group in groups if groups.count(group) > 1}
+    for job, its, scattered, group in zip(jobs, views, scatter, groups, strict=True):
         next(its, None)  # the last view is done
-        _write_truth(job.writer, job.plan, job.phantom, job.scanner, scattered)
+        _write_truth(job, scattered, truths.get(group))
         job.writer.write_text("scene.toml", scene_to_toml(job.scene))
     return shared
 
 
-def _write_truth(writer: Writer, plan: Plan, phantom: Phantom, scanner: Scanner, scatter: Scattered) -> None:
+def _write_truth(job: _Job, scatter: Scattered, shared: SharedTruth | None) -> None:
     """Write what a scan has once: the flat, the true volumes, and how both were made."""
-    info = dict(scan_info(plan, phantom, scanner, scatter))
+    writer, scanner = job.writer, job.scanner
+    info = dict(scan_info(job.plan, job.phantom, scanner, scatter))
     writer.write_image("flat", info.pop("flat"), scanner.geometry.d_detector)
-    for name, volume in truth_volumes(plan, phantom, scanner):
+    for name, volume in truth_volumes(job.plan, job.phantom, scanner, shared):
         writer.write_image(name, volume, scanner.geometry.d_voxel)
     writer.write_text("scan.json", _json(info))
-    writer.write_text("plan.json", _json(plan.to_dict()))
+    writer.write_text("plan.json", _json(job.plan.to_dict()))
     writer.write_text("spectrum.csv", spectrum_csv(scanner))
 
 

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from ctsim import simulate
 from ctsim.phantoms import dataset
 from ctsim.phantoms.bodies.teeth import Teeth
 from ctsim.phantoms.bodies.volume import CtVolume
@@ -65,6 +66,24 @@ def test_scenes_made_together_are_what_they_are_alone(tmp_path, more):
         make_scene(scene, tmp_path / "alone")
     assert digests(tmp_path / "together") == digests(tmp_path / "alone")
     assert len(digests(tmp_path / "alone")) > 60
+
+
+def test_doses_share_what_is_drawn_of_the_truth(tmp_path, monkeypatch):
+    """The covers, the body at two sets of energies and both labels are drawn once for all of them."""
+    one, *_ = scenes()
+    many = [
+        msgspec.structs.replace(s, phantom=one.phantom, scanner=msgspec.structs.replace(one.scanner, i0=s.scanner.i0))
+        for s in scenes()
+    ]
+    for scene in many:
+        make_scene(scene, tmp_path / "alone")
+    asked = []
+    for name in ("cover_of", "body_attenuation", "body_labels"):
+        whole = getattr(simulate, name)
+        monkeypatch.setattr(simulate, name, lambda *of, name=name, whole=whole: asked.append(name) or whole(*of))
+    make_scenes(many, tmp_path / "together")
+    assert digests(tmp_path / "together") == digests(tmp_path / "alone")
+    assert sorted(asked) == ["body_attenuation"] * 2 + ["body_labels"] + ["cover_of"] * 2
 
 
 def test_rays_of_variants_are_traced_once(tmp_path, monkeypatch):
