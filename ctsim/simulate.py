@@ -296,6 +296,8 @@ class SharedTruth:
     covers: list[Cover] = field(default_factory=list)
     labels: dict[Any, NDArray[np.uint8]] = field(default_factory=dict)
     bodies: dict[Any, NDArray[np.float32]] = field(default_factory=dict)
+    present: list[int] = field(default_factory=list)
+    """Labels that occur in the body: attenuation of others, as of metal that only solids have, changes nothing."""
 
 
 def truth_volumes(
@@ -349,7 +351,8 @@ def _body(
     """Return the attenuation without solids; of variants, the last two are kept."""
     if shared is None:
         return body_attenuation(body, geometry, mu)
-    key = tuple(mu[m] for m in body.materials)
+    shared.present = shared.present or np.unique(body.labels).tolist()
+    key = tuple(mu[body.materials[label]] for label in shared.present)
     volume = shared.bodies.pop(key) if key in shared.bodies else body_attenuation(body, geometry, mu)
     shared.bodies = dict([*shared.bodies.items()][-1:]) | {key: volume}
     return volume

@@ -203,9 +203,11 @@ def _simulate(
                 job.writer.put(*next(its))
     groups = [id(signals) for signals, _ in shared]
     truths = {group: SharedTruth() for group in groups if groups.count(group) > 1}
-    for job, its, scattered, group in zip(jobs, views, scatter, groups, strict=True):
+    for k, (job, its, scattered, group) in enumerate(zip(jobs, views, scatter, groups, strict=True)):
         next(its, None)  # the last view is done
         _write_truth(job, scattered, truths.get(group))
+        if group not in groups[k + 1 :]:
+            truths.pop(group, None)
         job.writer.write_text("scene.toml", scene_to_toml(job.scene))
     return shared
 

@@ -1,6 +1,7 @@
 """Scenes of one body: built once, traced once, and each what it is alone."""
 
 import hashlib
+import types
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from ctsim import simulate
+from ctsim.geometry import Geometry
 from ctsim.phantoms import dataset
 from ctsim.phantoms.bodies.teeth import Teeth
 from ctsim.phantoms.bodies.volume import CtVolume
@@ -19,8 +21,9 @@ from ctsim.phantoms.scene import Scene, build, parse_suite
 from ctsim.phantoms.variants import build_all, families
 from ctsim.settings import Truth
 from ctsim.signals import Part, same_rays, share_rays
-from ctsim.simulate import part_of
+from ctsim.simulate import SharedTruth, part_of
 from ctsim.tracer.project import Tracer
+from ctsim.types import Phantom
 
 TABLE = """
 [[scene]]
@@ -68,12 +71,32 @@ def test_scenes_made_together_are_what_they_are_alone(tmp_path, more):
     assert len(digests(tmp_path / "alone")) > 60
 
 
-def test_doses_share_what_is_drawn_of_the_truth(tmp_path, monkeypatch):
-    """The covers, the body at two sets of energies and both labels are drawn once for all of them."""
+def test_labels_are_shared_where_the_same_levels_are_put_together():
+    labels = np.arange(8, dtype=np.uint8).reshape(2, 2, 2) % 4
+    materials = ("air", "water", "fat@0.9", "fat@1.1")
+    body = Phantom(labels=labels, materials=materials, d_voxel=(1.0, 1.0, 1.0))
+    grid = Geometry(
+        dso=10, dsd=20, n_voxel=(2, 2, 2), d_voxel=(1, 1, 1), n_detector=(1, 1), d_detector=(1, 1), n_views=1
+    )
+    shared, got = SharedTruth(), []
+    for tissues in (("air", "water", "fat", "fat"), materials, ("air", "water", "fat", "fat")):
+        plan = types.SimpleNamespace(tissues=tissues, told=tuple(dict.fromkeys(tissues)), materials=materials)
+        cover = simulate.cover_of(body, grid)
+        got.append(simulate._labels(plan, [("", body)], grid, [cover], shared)[0])
+    assert np.array_equal(got[0], np.minimum(labels, 2)) and np.array_equal(got[1], labels) and got[2] is got[0]
+
+
+@pytest.mark.parametrize("metals", [("Fe",), ("Fe", "Ti", "Au")])
+def test_doses_and_metals_share_what_is_drawn_of_the_truth(tmp_path, monkeypatch, metals):
+    """The covers, the body without solids at two sets of energies, and the body's labels are drawn once for all."""
     one, *_ = scenes()
     many = [
-        msgspec.structs.replace(s, phantom=one.phantom, scanner=msgspec.structs.replace(one.scanner, i0=s.scanner.i0))
-        for s in scenes()
+        msgspec.structs.replace(
+            s,
+            phantom=msgspec.structs.replace(one.phantom, metal=metals[k % len(metals)]),
+            scanner=msgspec.structs.replace(one.scanner, i0=s.scanner.i0),
+        )
+        for k, s in enumerate(scenes())
     ]
     for scene in many:
         make_scene(scene, tmp_path / "alone")

@@ -33,9 +33,9 @@ PER_METRE = 1000  # NAF's lengths are metres
 class Measured:
     """What is exported: line integrals [view, v, u] and the true attenuation [z, y, x] in 1/mm, both float32.
 
-    R2-Gaussian and NAF do not start without a true volume, which they compare their own with; it is None where the scan
-    comes without. Data Exchange holds
-    `counts` [view, v, u] instead, the open field `flat` [v, u], and the level `dark` that both include.
+    R2-Gaussian and NAF do not start without a true volume, which they compare their own with; it is None for others,
+    and where the scan comes without. Data Exchange holds `counts` [view, v, u] instead, the open field `flat` [v, u],
+    and the level `dark` that both include.
     """
 
     geometry: Geometry

@@ -70,10 +70,11 @@ def _export_scan(given: Flags, stored: StoredScan) -> None:
         raise InputError(f"--to {given.to} writes the scan: expected neither --volume, --hu nor --kev")
     scan = stored.scan
     p, _ = line_integrals(scan, slice(None))
+    truth = LAYOUTS[given.to].truth and "reference_effective.tif" in stored.files
     content = Measured(
         geometry=stored.geometry,
         p=p.numpy(),
-        reference=np.asarray(stored.reference("effective"), np.float32) if stored.has_truth else None,
+        reference=np.asarray(stored.reference("effective"), np.float32) if truth else None,
         counts=scan.counts.numpy(),
         flat=scan.flat.numpy(),
         dark=scan.dark,

@@ -56,7 +56,7 @@ class Lag(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """
 
     share: float
-    """How much of a view's signal comes later, 0 for none; all parts together below 1."""
+    """How much of a view's signal comes later; all parts together below 1. In a scene, 0 leaves out the preset's."""
     decay: float
     """How much of what is left stays from one view to the next, 0 to 0.98."""
 

@@ -171,7 +171,8 @@ def metal_planes(phantom: Phantom, geometry: Geometry) -> NDArray[np.bool_]:
 def cover_of(phantom: Phantom, geometry: Geometry, *, until_metal: bool = False) -> Cover:
     """Sample all solids on the grid; serves every volume of the same phantom and grid.
 
-    With `until_metal` each plane along z is sampled up to its first voxel of which metal fills half.
+    With `until_metal` each plane along z is sampled up to its first voxel of which metal fills half: it serves
+    `metal_planes` alone.
     """
     channels = sorted({(phantom.materials.index(s.material), s.metal) for s in phantom.solids})
     rows, of = [np.zeros((0, PRIMITIVE_COLUMNS))], [np.zeros(0, np.int64)]

@@ -43,7 +43,8 @@ VIEWS, SHORTEST = 12, 0.5  # views whose pixels stand for all, and the least pat
 ROUND, OBLONG = 1.25, 1.5
 """Greatest ratio of a voxel's sides on the finest grid, where pixels are as fine, and the one from which on it is said:
 a sum of round splats then varies by 10 % and 20 % from one to the next, by 4 % on cubes."""
-ENOUGH, TRIAL = 32, (2, 4)  # voxels along an axis on which the filtration is found, and the passes of a trial
+ENOUGH, VIEWED = 32, 4  # voxels along an axis, and views, on which the filtration is found
+TRIAL = (2, 4)  # passes of a trial
 AT_THE_END, FEW, FEWEST, MANY = 0.9, 1e-4, 10, 0.01
 """Share of the curve's last attenuation, which no metal has; the share of the splats, or how many, that may have it;
 and the share with which a fit has diverged."""
@@ -166,15 +167,18 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
 
 
 def find_filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtration | None:
-    """Find the filtration by coarse fits; None where it is given, the beam is known, or the finest grid too coarse.
+    """Find the filtration by coarse fits; None where it is given, the beam is known, or grids or views are too few.
 
-    Edges that no grid holds are then the misfit: on 18 voxels 12 mm of aluminium are found where 0.5 are right.
+    Edges that no grid holds are the misfit on a coarse one: on 18 voxels 12 mm of aluminium are found where 0.5 are
+    right. Two views contradict each other before no beam: 19 mm are found.
     """
     given = settings.response != "tube" or settings.filtration is not None
     if given or min(levels[-1].geometry.n_voxel[1:]) < ENOUGH:
         return None
     levels = levels if len(levels) > 1 else levels_of(levels[-1], coarse=True)
-    k = next((k for k, level in enumerate(levels) if min(level.geometry.n_voxel[1:]) >= ENOUGH), len(levels) - 1)
+    k = next(k for k, level in enumerate(levels) if min(level.geometry.n_voxel[1:]) >= ENOUGH)
+    if levels[k].geometry.n_views < VIEWED:
+        return None
     brief = msgspec.structs.replace(settings, passes=TRIAL)
 
     def fits_on(few: list[Data]) -> Callable[[float], Fit | None]:

@@ -3,9 +3,10 @@
 Line integrals of a wrong response are those of no object: views contradict each other wherever dense and thin paths
 cross, and no fit explains them all. What a coarse fit leaves unexplained is averaged over neighbouring rays, whose
 noise and missed edges cancel, while the error of the response does not: it changes slowly. Of that, what is the same in
-all views is left out: a body that is round about the axis would explain it, so that it tells of an unfinished fit and
-nothing of the beam. A water bottle, which looks the same from all sides, therefore hardly shows its beam. Rays through
-metal are left out, since what its shape leaves is larger; they are the same rays for all filtrations.
+all views is left out: on a circle, a body that is round about the axis would explain it, so that it tells of an
+unfinished fit and nothing of the beam. A water bottle, which looks the same from all sides, therefore hardly shows its
+beam. Rays through metal are left out, since what its shape leaves is larger; they are the same rays for all
+filtrations.
 
 Consistency of the data is what other calibrations of a beam without a phantom use, too (Würfl et al., Epipolar
 consistency beam hardening, Med. Phys. 44, 2017).
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import Akima1DInterpolator
 
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import FILTER
@@ -27,22 +28,22 @@ from ctsim.reconstruct.splat.response import FILTER
 USUAL = 0.5  # mm of aluminium, from which the search starts
 TRIED = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 14.0, 20.0)
 PLAUSIBLE = 1.05  # times the least misfit, at two standard deviations: materials, scatter and spectra are assumed
-UNTOLD = 8.0  # times its least plausible value, from which on the greatest says that the scan does not tell its beam
+UNTOLD, SOFT = 8.0, 1.0
+"""A plausible range from SOFT mm or less to UNTOLD times its lower end or more says that a scan hides its beam."""
 WIDTH = 1 / 16  # σ of the averages, in widths of the panel
 MET, DARK = 0.15, 3.0
 """P of rays that count: below they graze the object, above scatter and lacking photons make more than the beam does."""
 METAL, FAINT = 8.0, 1e-3
 """Times water, what is metal; what of P it adds at most to a ray that is said not to meet it."""
 LEAST = 0.3  # of the neighbours that count: an average over fewer is left out
-OFTEN = 0.25  # of the views in which a pixel must count for its mean over them to be taken
-FEWEST = 1000  # averages, below which there is no misfit
+FEWEST = 1000  # averages less a mean for each pixel, below which there is no misfit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Filtration:
-    """The filtration (mm of aluminium), the least and the greatest that explain the scan nearly as well, all misfits.
+    """The filtration (mm of aluminium), the least and the greatest that explain the scan nearly as well, and misfits.
 
-    `misfits` are the root mean squares of P by the filtration tried, empty where the scan shows too little.
+    `misfits` are those of `misfit` by the filtration tried on the last grid, empty where the scan shows too little.
     """
 
     value: float
@@ -63,9 +64,9 @@ class Filtration:
         """
         if not self.misfits:
             return ""
-        if self.high >= UNTOLD * self.low:
+        if self.low <= SOFT and self.high >= UNTOLD * self.low:
             return (
-                f"the scan does not tell its beam, as round bodies do not: {self.low:g} to {self.high:g} mm Al explain "
+                f"the scan does not tell its beam (round bodies do not): {self.low:g} to {self.high:g} mm Al explain "
                 'it alike; `filtration` or the response "known" tells it'
             )
         if min(self.misfits, key=lambda t: self.misfits[t]) != FILTER[0]:
@@ -82,8 +83,9 @@ def found(coarse: Callable[[float], Fit | None], fine: Callable[[float], Fit | N
     Both return the fit at a filtration, None for nothing.
     """
     misfits = _searched(coarse, USUAL)
-    if misfits and fine is not None:
-        misfits = _searched(fine, min(misfits, key=lambda t: misfits[t])) or misfits
+    if fine is not None:
+        finer = _searched(fine, min(misfits, key=lambda t: misfits[t]) if misfits else USUAL)
+        misfits = finer if len(finer) > 1 or not misfits else misfits
     if not misfits:
         return Filtration(value=USUAL, low=FILTER[0], high=FILTER[2], misfits={})
     return _chosen(misfits)
@@ -104,7 +106,7 @@ def _searched(fit_of: Callable[[float], Fit | None], start: float) -> dict[float
 
     for way in (1, -1):
         k = TRIED.index(start)
-        # one more than where it stops falling, since a step of the search is not all that it varies by
+        # a neighbour that is plausible, too, may yet lead to a better one
         while 0 <= k + way < len(TRIED) and misfit_at(k) <= PLAUSIBLE * min(misfits.values()):
             k += way
             misfit_at(k)
@@ -112,13 +114,14 @@ def _searched(fit_of: Callable[[float], Fit | None], start: float) -> dict[float
 
 
 def _chosen(misfits: dict[float, float]) -> Filtration:
-    """Return the mean filtration by how likely each is, on a spline through the misfits, both axes logarithmic.
+    """Return the mean filtration by how likely each is, on a curve through the misfits, both axes logarithmic.
 
-    Where all explain the scan alike, that is the middle of what was tried.
+    Where all explain the scan alike, that is the middle of what was tried. A cubic spline would dip behind a steep
+    slope, where misfits may be flat.
     """
     tried, values = np.log(list(misfits)), np.log(list(misfits.values()))
     fine = np.linspace(tried[0], tried[-1], 2001)
-    above = CubicSpline(tried, values)(fine) if len(tried) > 1 else np.zeros_like(fine)
+    above = Akima1DInterpolator(tried, values, method="makima")(fine) if len(tried) > 1 else np.zeros_like(fine)
     above -= above.min()
     plausible = fine[above <= math.log(PLAUSIBLE)]
     mean = np.average(fine, weights=np.exp(-2 * above / math.log(PLAUSIBLE)))
@@ -144,10 +147,13 @@ def misfit(fit: Fit, rays: NDArray[np.bool_]) -> float:
     share = ndimage.gaussian_filter(rays.astype(np.float32), sigma)
     total = ndimage.gaussian_filter(np.where(rays, left, np.float32(0)), sigma)
     counts = rays & (share > LEAST)
-    counts &= counts.mean(0) >= OFTEN
-    if counts.sum() < FEWEST:
-        return math.inf
     averages = np.divide(total, share, where=counts, out=np.zeros_like(total))
-    varying = averages - averages.sum(0, dtype=np.float64) / np.maximum(counts.sum(0), 1)
-    value = float(np.sqrt(np.mean(np.square(varying[counts], dtype=np.float64))))
-    return value if math.isfinite(value) else math.inf
+    often = counts.sum(0)
+    freedom = int(np.maximum(often - 1, 0).sum())
+    if freedom < FEWEST:
+        return math.inf
+    same = averages.sum(0, dtype=np.float64) / np.maximum(often, 1)
+    # a view at a time: in float64 all of them would be large
+    squares = sum(float(np.square((view - same)[seen]).sum()) for view, seen in zip(averages, counts, strict=True))
+    value = math.sqrt(squares / freedom)
+    return value if 0 < value < math.inf else math.inf

@@ -13,7 +13,7 @@ from ctsim.reconstruct.splat.kernels import carve_cpu
 from ctsim.reconstruct.starved import WEIGHT
 from ctsim.reconstruct.weights import photon_weights
 
-ENOUGH = 60  # views that tell an object apart from what is left of it between them
+LEAST_VIEWS = 60  # that tell an object from the streaks between them
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,7 +86,7 @@ def coarser(data: Data) -> Data:
 def thinned(data: Data) -> Data:
     """Return every second view where that leaves enough to tell an object, else all."""
     geometry = data.geometry
-    if geometry.n_views < 2 * ENOUGH:
+    if geometry.n_views < 2 * LEAST_VIEWS:
         return data
     views = np.arange(0, geometry.n_views, 2)
     poses = tuple(tuple(row) for row in geometry.pose_array()[views].tolist())
