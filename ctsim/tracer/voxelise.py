@@ -165,7 +165,7 @@ def _overlap(
 
 def metal_planes(phantom: Phantom, geometry: Geometry) -> NDArray[np.bool_]:
     """Return in which planes along z `metal_mask` holds metal; a plane is sampled up to its first voxel of it."""
-    return metal_mask(phantom, geometry, cover_of(phantom, geometry, until_metal=True)).any((1, 2))
+    return np.any(metal_mask(phantom, geometry, cover_of(phantom, geometry, until_metal=True)), axis=(1, 2))
 
 
 def cover_of(phantom: Phantom, geometry: Geometry, *, until_metal: bool = False) -> Cover:
