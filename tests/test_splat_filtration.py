@@ -165,7 +165,7 @@ def test_pixels_that_count_in_few_views_do_not_weigh_down_the_misfit():
     """A mean over n views leaves n − 1 of them: white noise keeps its variance, whatever n is."""
     rng, rays = np.random.default_rng(5), np.zeros((60, 64, 64), bool)
     for view in range(60):
-        rays[view, :, view % 20 * 3 : view % 20 * 3 + 3] = True  # a thin object far from the axis: three views a pixel
+        rays[view, :, view % 20 * 3 : view % 20 * 3 + 4] = True  # a thin object far from the axis: three views a pixel
     noise = (rng.standard_normal((60, 1, 1)) * np.ones(rays.shape) for _ in range(20))
     squares = [filtration.misfit(left(each), rays) ** 2 for each in noise]
     assert math.sqrt(np.mean(squares)) == pytest.approx(1.0, abs=4 / math.sqrt(2 * 20 * 40))  # of 40 free numbers each
