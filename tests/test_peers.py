@@ -321,6 +321,23 @@ def test_a_dataset_is_timed_in_a_process_of_its_own(monkeypatch, capfd):
     assert not capfd.readouterr().out  # which is for the table
 
 
+def test_one_slice_is_made_read_and_reconstructed_with_its_twin(monkeypatch):
+    asked, done = [], []
+    monkeypatch.setattr(host, "use_threads", asked.append)
+    fdk = cases.find("fdk")
+    monkeypatch.setattr(type(fdk), "reconstruct", lambda self, scan: done.append(scan.counts.numpy().copy()))
+    for body in finding.case("row").scenes:
+        done.clear()
+        (found,) = cases.row(setup("row", side=32, repeats=1), body)
+        assert (found.contender, found.views, len(found.runs)) == (OURS, 42, 1)
+        scans, twins = done[::2], done[1::2]
+        assert len(scans) == len(twins) == 2 and scans[0].shape == (42, 1, 641)  # the first run is not counted
+        assert np.array_equal(scans[0], scans[1])
+        changed = (scans[0] != twins[0]).mean()
+        assert 0 < changed < 0.5 and scans[0].sum() < twins[0].sum()  # metal is in view
+    assert asked == [1, 1]
+
+
 @pytest.fixture
 def faked(monkeypatch):
     """Let cases be measured at once, without peers, by the code of a commit; return the list that counts them."""
@@ -367,7 +384,7 @@ def test_a_dry_run_counts_turns_and_the_rest(tmp_path, capsys, faked):
         return [line.split() for line in capsys.readouterr().out.splitlines()]
 
     listed = dry("--repeats", "2")
-    assert [line[0] for line in listed[:-1]] == ["paths", "exact", "paper", "fdk", "poly"]
+    assert [line[0] for line in listed[:-1]] == ["paths", "exact", "paper", "fdk", "poly", "row"]
     assert listed[3] == ["fdk", "58", "s"]  # 3 x 16.3 s + 9 s
     assert [line[0] for line in dry("--small")[:-1]] == ["paths", "exact", "fdk", "poly"]
     assert dry("--small", "--case", "paper")[0] == ["paper", "unknown"]
@@ -406,4 +423,4 @@ def test_help_and_a_dry_run_import_nothing_heavy(words):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "--repeats" in done.stdout or "total: 5 of 5 cases" in done.stdout
+    assert "--repeats" in done.stdout or "total: 6 of 6 cases" in done.stdout

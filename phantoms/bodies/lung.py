@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctsim.phantoms.fields import Canvas, Field, Inside, LabelGrid, Mask, Noise, supply_tree
 from ctsim.phantoms.inserts import count, diameter, inserts
@@ -134,15 +135,23 @@ def _lungs(canvas: Canvas, rng: np.random.Generator, vessels: int) -> None:
         hilum = np.array([0.15 * side, -0.06, 0.10])
         points = rng.uniform((-0.3, -0.5, -0.75), (0.3, 0.45, 0.85), (vessels * 12, 3))
         points[:, 0] += 0.36 * side
-        kept = [p for p in points if _in_lung(p[0], p[1], p[2], side, dome - 0.03)][:vessels]
-        if not kept:
+        x, y, z = points.T
+        ends = points[_in_lung(x, y, z, side, dome - 0.03)][:vessels]
+        if not len(ends):
             continue
-        for start, end, r0, r1 in supply_tree(hilum, np.array(kept), 0.07, 0.011):
-            canvas.capsule(SOFT, start, end, (r0, r1), over=(LUNG,))
-        for start, end, r0, r1 in supply_tree(hilum - np.array([0, 0.05, 0]), np.array(kept[::8]) + 0.03, 0.045, 0.012):
-            canvas.capsule(SOFT, start, end, (r0 + 0.008, r1 + 0.006), over=(LUNG,))
-            canvas.capsule(AIR, start, end, (r0, r1), over=(LUNG, SOFT))
+        _vessels(canvas, hilum, ends)
         _fissure(canvas, side, rng.uniform(-0.1, 0.1), Noise(rng, 3))
+
+
+def _vessels(canvas: Canvas, hilum: NDArray[np.float64], ends: NDArray[np.float64]) -> None:
+    """Paint the vessels that supply points [k, 3] of a lung, and the bronchi beside every eighth of them."""
+    if not canvas.labels.size:  # where only the metal is asked for
+        return
+    for start, end, r0, r1 in supply_tree(hilum, ends, 0.07, 0.011):
+        canvas.capsule(SOFT, start, end, (r0, r1), over=(LUNG,))
+    for start, end, r0, r1 in supply_tree(hilum - np.array([0, 0.05, 0]), ends[::8] + 0.03, 0.045, 0.012):
+        canvas.capsule(SOFT, start, end, (r0 + 0.008, r1 + 0.006), over=(LUNG,))
+        canvas.capsule(AIR, start, end, (r0, r1), over=(LUNG, SOFT))
 
 
 def _pleura(canvas: Canvas, wall: Wall) -> None:

@@ -1,4 +1,4 @@
-"""What `run-benchmark peers` measures: path lengths, line integrals, a dataset and FDK; `poly` has the fifth case.
+"""What `run-benchmark peers` measures: path lengths, line integrals, a dataset, FDK and one slice; `poly` has one more.
 
 Contenders of a case run in one process on the same number of threads, in turns (A B A B …), after an untimed run each.
 Times are of whole sweeps over the views. What a contender can prepare once for a scene (bricks, pose matrices, permuted
@@ -22,18 +22,25 @@ from ctsim.benchmarks.cli import quietly
 from ctsim.benchmarks.engine import host
 from ctsim.benchmarks.engine.process import Process
 from ctsim.benchmarks.engine.record import Task
+from ctsim.benchmarks.methods import find
 from ctsim.benchmarks.oracles import SIZE, relative, scanner_of, upright_chord, voxelised
 from ctsim.benchmarks.studies.peers import finding
 from ctsim.benchmarks.studies.peers.finding import OURS, RTK, SIDES, XCIST, Measurement, Setup, versions
 from ctsim.benchmarks.studies.peers.libraries import Rtk, Xcist
 from ctsim.benchmarks.studies.peers.poly import poly
 from ctsim.benchmarks.studies.peers.study import Flags
+from ctsim.dataset.store import open_scan
 from ctsim.look import present_materials
 from ctsim.materials import attenuation
 from ctsim.phantoms.bodies.lung import Lung
+from ctsim.phantoms.bodies.random import Random
 from ctsim.phantoms.bodies.rods import Validation
+from ctsim.phantoms.dataset import make_scene
 from ctsim.phantoms.recipes import build_recipe
+from ctsim.phantoms.scanners import ScannerSettings
+from ctsim.phantoms.scene import Scene
 from ctsim.reconstruct.fdk import fdk as ours_fdk
+from ctsim.settings import Truth
 from ctsim.simulate import compact
 from ctsim.tracer.project import Tracer, path_lengths
 from ctsim.tracer.voxelise import attenuation_volume
@@ -187,7 +194,40 @@ def paper(setup: Setup, scene: str) -> list[Measurement]:
     return [Measurement(contender=OURS, peak_bytes=peak, note=note, **timed)]
 
 
-CASES: dict[str, Callable[[Setup, str], list[Measurement]]] = {f.__name__: f for f in (paths, exact, paper, fdk, poly)}
+ROW_BODIES = {"lung": Lung(n_voxel=(104, 104, 104), metal="Fe"), "random": Random(n_voxel=(104, 104, 104), metal="Ti")}
+
+
+def row(setup: Setup, body: str) -> list[Measurement]:
+    """Measure one slice in one thread: the scan and its metal-free twin, made and written, and FDK of both.
+
+    One detector row of 641 pixels, a slice of 416². A worker that makes a training set does this again and again.
+    Comes last: the process keeps to one thread from then on.
+    """
+    scanner = ScannerSettings(preset="ideal", n_views=setup.views, n_detector=(1, 641), n_voxel=(1, 416, 416))
+    scene = Scene(
+        name="row",
+        phantom=ROW_BODIES[body],
+        scanner=scanner,
+        truth=Truth(trace=True),
+        truncated=True,  # a body higher than one row
+        metal_in_view=True,
+    )
+    method = find("fdk")
+
+    def make(folder: Path) -> None:
+        stored = open_scan(make_scene(scene, folder, force=True))
+        for scan in (stored, stored.metal_free):
+            assert scan is not None  # twins are made by default
+            method.reconstruct(scan.scan)
+
+    host.use_threads(1)
+    with tempfile.TemporaryDirectory(prefix="ctsim-peers-") as folder:
+        timed = setup.timed({OURS: lambda: make(Path(folder))})
+    return [msgspec.structs.replace(m, note="one thread of a warm process") for _, m in timed.values()]
+
+
+NAMED = (paths, exact, paper, fdk, poly, row)
+CASES: dict[str, Callable[[Setup, str], list[Measurement]]] = {case.__name__: case for case in NAMED}
 
 
 def measure(task: Task, given: Flags) -> list[Measurement]:
