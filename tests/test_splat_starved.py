@@ -20,7 +20,7 @@ from ctsim.reconstruct.scatter import Scatter
 from ctsim.reconstruct.splat import fast
 from ctsim.reconstruct.splat.curve import MaterialCurve
 from ctsim.reconstruct.splat.fast import reconstruct
-from ctsim.reconstruct.splat.level import Data, coarser
+from ctsim.reconstruct.splat.level import Data, coarser, never_read
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import make_response
 from ctsim.reconstruct.starved import WEIGHT, Below, weights_and_bounds
@@ -172,6 +172,7 @@ def test_dense_metal_is_not_hollow_and_is_said_to_be_uncertain(tmp_path, monkeyp
     core = [score.values["core_ratio"] for score in scores]
     assert core[0] > 2 * core[1]  # 0.52 and 0.18
     assert "metal is thinner than the grid" in with_bounds.details["limitation"]
+    assert with_bounds.details["metal_unread"] > 0.2 and "known from below" in with_bounds.details["limitation"]
 
 
 @pytest.mark.parametrize(
@@ -195,3 +196,28 @@ def test_splats_at_the_end_of_the_curve_are_said_and_many_are_divergence(runaway
 def test_metal_that_explains_its_shadow_is_not_doubted(tmp_path):
     volume = reconstruct(made(tmp_path, "Ti").scan)
     assert "limitation" not in volume.details and volume.details["dark_misfit"] < 0.4
+    assert volume.details["metal_unread"] < 0.05
+
+
+def test_metal_that_no_view_reads_is_known_from_below_alone():
+    """A shadow of 5 × 5 pixels in every view, of bounds but for what noise makes of them; then a view that reads it."""
+    p, weights = np.ones(GEOMETRY.shape, np.float32), np.full(GEOMETRY.shape, 0.3, np.float32)
+    v, u = (n // 2 for n in GEOMETRY.n_detector)
+    weights[:, v - 2 : v + 3, u - 2 : u + 3] = -WEIGHT
+    noisy = np.random.default_rng(3).random(weights.shape) < 0.1
+    weights[noisy & (weights < 0)] = 1e-4
+    fine = msgspec.structs.replace(GEOMETRY, n_voxel=(21, 21, 21), d_voxel=(0.5, 0.5, 0.5))
+    data = Data(geometry=GEOMETRY, p=p, weights=weights)
+    unread = never_read(data, fine)
+    z, y, x = (np.abs(c) for c in fine.voxel_centres())
+    far = np.maximum(z[:, None, None], np.hypot(y[:, None], x))
+    magnified = GEOMETRY.d_detector[0] * GEOMETRY.dso / GEOMETRY.dsd
+    assert unread[far < 1.2 * magnified].all() and not unread[far > 3 * magnified].any()
+    assert (far < 1.2 * magnified).sum() > 10 and (far > 3 * magnified).sum() > 10
+    weights[3, v - 2 : v + 3, u - 2 : u + 3] = 1e-4
+    assert not never_read(data, fine)[far < 1.2 * magnified].any()
+
+
+@pytest.mark.parametrize("share, said", [(None, ""), (0.05, ""), (0.45, "45% of the metal")])
+def test_unread_metal_is_said(share, said):
+    assert fast._bounded(share).startswith(said) and bool(fast._bounded(share)) == bool(said)

@@ -29,7 +29,7 @@ from ctsim.reconstruct.splat.common import Common, Energy
 from ctsim.reconstruct.splat.course import PASSES, Course, levels_of, passes_over
 from ctsim.reconstruct.splat.curve import DENSEST, STRONGEST, MaterialCurve
 from ctsim.reconstruct.splat.filtration import USUAL, Filtration, found
-from ctsim.reconstruct.splat.level import Data, thinned
+from ctsim.reconstruct.splat.level import Data, never_read, thinned
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import FILTER, Response, basis_functions, evaluate, make_response, tangent
 from ctsim.reconstruct.starved import Below, weights_and_bounds
@@ -51,6 +51,7 @@ and the share with which a fit has diverged."""
 UNEXPLAINED, DARK_SHARE = 0.2, 1e-4
 """The root mean square that a fit misses dark readings by before it is said to, and their least share. Right metal has
 0.05 to 0.13, wire of which a third is there 0.25; but 0.05 has the hip, too, whose core no reading shows whole."""
+UNREAD = 0.05  # share of the metal that no reading crosses before it is said
 Image = NDArray[np.float32]
 
 
@@ -143,14 +144,16 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         return Volume(values=empty, status=status, reason=reason, details=details, at_energy=at_energy)
     values, rho, how = _read(fit, settings, scan.geometry)
     status, reason = _verdict(fit, values)
-    missed = _dark_misfit(fit)
+    missed, unread = _dark_misfit(fit), _unread(fit, rho, scan.geometry)
     beyond = seen_beyond(data.p, scan.geometry, scan.i0)
     found_at = "" if filtration is None else filtration.sentence
-    sentences = as_read.sentence, panel.sentence, _unexplained(fit, missed), beyond.sentence, found_at, _flat(finest)
+    of_metal = _unexplained(fit, missed), _bounded(unread)
+    sentences = as_read.sentence, panel.sentence, *of_metal, beyond.sentence, found_at, _flat(finest)
     limits = [said for said in sentences if said]
     details |= {
         "read-out": how,
         "dark_misfit": missed,
+        "metal_unread": unread,
         **({"limitation": "; ".join(limits)} if limits else {}),
         "misfit": fit.misfit if math.isfinite(fit.misfit) else None,
         "view_updates": fit.view_updates,
@@ -267,6 +270,22 @@ def _unexplained(fit: Fit, missed: float | None) -> str:
     if runaway > max(FEW * of, FEWEST):
         return f"metal reaches {AT_THE_END * STRONGEST:g} times iron, where the assumed materials end"
     return ""
+
+
+def _unread(fit: Fit, rho: Image, geometry: Geometry) -> float | None:
+    """Return the share of dense metal through which there are no readings, None where there is no such metal."""
+    metal = _summed(fit.curve.tangent, rho) > DENSEST * fit.curve.water
+    return float(never_read(fit.data, geometry)[metal].mean()) if metal.any() else None
+
+
+def _bounded(unread: float | None) -> str:
+    """Say that a share of the metal is known from below alone, or nothing."""
+    if unread is None or unread <= UNREAD:
+        return ""
+    return (
+        f"{unread:.0%} of the metal lies where rays lose all photons that noise lets count, so it is known from below "
+        "alone: it may attenuate several times as much"
+    )
 
 
 def _flat(finest: Geometry) -> str:

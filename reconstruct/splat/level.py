@@ -14,6 +14,7 @@ from ctsim.reconstruct.starved import WEIGHT
 from ctsim.reconstruct.weights import photon_weights
 
 LEAST_VIEWS = 60  # that tell an object from the streaks between them
+AROUND = 3  # pixels whose majority counts: noise alone makes a reading of some pixel without photons in some view
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,4 +120,18 @@ def carve(data: Data, open_below: float) -> NDArray[np.bool_]:
     z, y, x = data.geometry.voxel_centres()
     state = np.zeros(data.geometry.n_voxel, np.int8)
     carve_cpu.carve(data.geometry.pose_array(), near, z, y, x, state)
+    return state == 1
+
+
+def never_read(data: Data, geometry: Geometry) -> NDArray[np.bool_]:
+    """Return the voxels of a grid, [z, y, x], through which no view has readings: only bounds, or nothing.
+
+    How much they attenuate is then known from below alone.
+    """
+    dark = np.empty(data.p.shape, np.bool_)
+    for shadow, weights in zip(dark, data.weights, strict=True):  # a view at a time: weights are large
+        shadow[...] = ndimage.uniform_filter((weights > 0).astype(np.float32), AROUND, mode="nearest") < 0.5
+    z, y, x = geometry.voxel_centres()
+    state = np.zeros(geometry.n_voxel, np.int8)
+    carve_cpu.carve(data.geometry.pose_array(), dark, z, y, x, state)
     return state == 1
