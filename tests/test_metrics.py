@@ -243,6 +243,29 @@ def test_a_metal_that_is_shifted_by_one_voxel():
     assert found["boundary_rms"] == pytest.approx(0.5 * math.sqrt(off / n), rel=1e-12)
 
 
+def test_the_gain_is_fitted_where_it_is_judged():
+    t = truth()
+    seen = np.broadcast_to(np.arange(28) < 20, t.body.shape)
+    cut = dataclasses.replace(t, judged=t.judged & seen, tissue=t.tissue & seen, cut=True)
+    values = t.references["effective"] * np.where(seen, np.float32(0.8), np.float32(5))
+    assert evaluate(values, cut)["aligned"].values["gain"] == pytest.approx(1.25, rel=1e-6)
+
+
+def test_each_kind_of_metal_has_a_half_of_its_own():
+    metal, kinds = np.zeros((13, 14, 30), bool), np.zeros((13, 14, 30), np.uint8)
+    metal[3:10, 3:11, 5:25] = True
+    kinds[3:10, 3:11, 5:15], kinds[3:10, 3:11, 15:25] = 4, 7
+    kinds[3, 3, 5] = 0  # a voxel of metal whose label is another's
+    values = np.where(kinds == 7, 10.0, np.where(metal, 1.0, 0.02))
+    given = (values, values, metal, np.ones_like(metal), (1.0, 1.0, 1.0))
+    assert metrics.metal_metrics(*given)["dice"] < 0.7  # half of the heavier one, or of both's median
+    assert metrics.metal_metrics(*given, kinds) == {"core_ratio": 1.0, "dice": 1.0, "boundary_rms": 0.0}
+    hollow = np.where(kinds == 7, 0.0, values)  # the heavier one vanished
+    assert metrics.metal_metrics(hollow, *given[1:], kinds)["dice"] == pytest.approx(2 / 3, rel=0.01)
+    one = metrics.metal_metrics(*given, np.where(metal, 4, 0).astype(np.uint8))
+    assert one == metrics.metal_metrics(*given)
+
+
 def test_half_maximum_is_half_of_the_core():
     metal = np.zeros((9, 9, 21), bool)
     metal[2:7, 2:7, 5:16] = True

@@ -3,11 +3,13 @@ import pytest
 
 from ctsim.benchmarks import make_dataset
 from ctsim.benchmarks.scores.judge import Judge
+from ctsim.benchmarks.scores.score import COLUMNS, PROTOCOLS
 from ctsim.benchmarks.tools import sensitivity
-from ctsim.benchmarks.tools.sensitivity import FAULTS, FOR, NONE, SHOWN, Scene, measure, page, sees, table
+from ctsim.benchmarks.tools.sensitivity import EXEMPT, FAULTS, FOR, NONE, SHOWN, Scene, measure, page, sees, table
 from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
 
+DERIVED = {"no_reference", "metal_cost", "against", "anchored", "cost"}  # of those above, of no truth, or of no volume
 SCENE = """
 name = "thorax"
 seed = 2
@@ -30,6 +32,13 @@ def judge(tmp_path_factory):
     (folder / "scene.toml").write_text(SCENE, encoding="utf-8")
     assert make_dataset.main([str(folder / "scene.toml"), str(folder / "data")]) == 0
     return Judge.of(open_scan(list_scans(folder / "data")[0]))
+
+
+def test_each_column_of_the_results_has_a_fault_that_it_is_for_or_a_reason():
+    columns = {(protocol, metric) for protocol in PROTOCOLS for metric in COLUMNS[protocol]}
+    seen = {place for places in FOR.values() for place in places}
+    assert seen | set(EXEMPT) == columns and not seen & set(EXEMPT) and set(SHOWN) == seen
+    assert {protocol for protocol in COLUMNS if protocol not in PROTOCOLS} == DERIVED
 
 
 @pytest.mark.slow

@@ -185,23 +185,45 @@ def dice(found: Mask, truth: Mask) -> float | None:
 
 
 def metal_metrics(
-    values: Array, reference: Array, metal: Mask, judged: Mask, d_voxel: tuple[float, float, float]
+    values: Array,
+    reference: Array,
+    metal: Mask,
+    judged: Mask,
+    d_voxel: tuple[float, float, float],
+    kinds: Array | None = None,
 ) -> dict[str, float | None]:
     """Return how the metal came out: mean ratio in its core, Dice at half maximum, boundary RMS (mm).
 
-    The core is the mask eroded by one voxel (the whole mask where nothing is left). The threshold is
-    half the reconstruction's median in the core. Dice counts every voxel of `judged` above it; the
+    The core is the mask eroded by one voxel (the whole mask where nothing is left). A voxel is found to be metal above
+    half the reconstruction's median in the core of the metal nearest to it: of its kind where `kinds`, labels above 0,
+    tell several apart, since titanium has less than half of gold's. Dice counts every voxel of `judged` above it; the
     boundary is compared within 8 voxels of the metal, so that distant streaks count once, in Dice.
     """
-    core = erode(metal)
-    if not core.any():
-        core = metal
-    level = float(np.median(values[core]))
+    core = _core(metal)
     mean_reference = float(reference[core].mean(dtype=np.float64))
     ratio = float(values[core].mean(dtype=np.float64)) / mean_reference if mean_reference else None
-    found = (values >= level / 2) & judged if level > 0 else np.zeros_like(metal)
+    level = _levels(values, metal, np.zeros(metal.shape, np.uint8) if kinds is None else kinds)
+    found = (values >= level / 2) & judged & (level > 0)
     return {
         "core_ratio": ratio,
         "dice": dice(found, metal),
         "boundary_rms": boundary_rms(found & dilate(metal, 8), metal, d_voxel),
     }
+
+
+def _core(mask: Mask) -> Mask:
+    """Return a mask eroded by one voxel, or as it is where nothing is left."""
+    core = erode(mask)
+    return core if core.any() else mask
+
+
+def _levels(values: Array, metal: Mask, kinds: Array) -> Array:
+    """Return the median of the core of each voxel's nearest kind of metal, [z, y, x]; one where no kinds are told."""
+    told = metal & (kinds > 0)
+    medians = {kind: float(np.median(values[_core(told & (kinds == kind))])) for kind in np.unique(kinds[told])}
+    if len(medians) < 2:
+        return np.full(metal.shape, np.median(values[_core(metal)]), np.float64)
+    nearest = ndimage.distance_transform_edt(~told, return_distances=False, return_indices=True)
+    table = np.zeros(int(max(medians)) + 1)
+    table[list(medians)] = list(medians.values())
+    return table[kinds[tuple(nearest)]]

@@ -33,7 +33,8 @@ class Truth:
     """The truth that a volume is compared with: two references and the regions, all [z, y, x].
 
     `tissue` is the judged region of the protocols `tissue` and `aligned`; `judged` is the dilated body. `cut` says that
-    both end at the field of view, because the body does not.
+    both end at the field of view, because the body does not. `kinds` are the metals' labels, 0 elsewhere; None
+    where there is one metal at most.
     """
 
     references: dict[str, NDArray[np.float32]]
@@ -45,6 +46,7 @@ class Truth:
     d_voxel: tuple[float, float, float]
     l0: float
     cut: bool = False
+    kinds: NDArray[np.uint8] | None = None
 
 
 def truth_of(stored: ScanWithTruth) -> Truth:
@@ -73,8 +75,16 @@ def truth_of(stored: ScanWithTruth) -> Truth:
         near_metal=near_metal,
         d_voxel=stored.geometry.d_voxel,
         l0=float(stored.l0),
+        kinds=_kinds(stored, metal),
         cut=cut,
     )
+
+
+def _kinds(stored: ScanWithTruth, metal: Mask) -> NDArray[np.uint8]:
+    """Return the labels of the metal's voxels that have a metal's label, else 0."""
+    labels = np.asarray(stored.labels)
+    names = [k for k, name in enumerate(stored.info.materials) if name in stored.info.metal]
+    return np.where(metal & np.isin(labels, names), labels, 0).astype(np.uint8)
 
 
 def _thin_metal(stored: ScanWithTruth, body: Mask) -> Mask:
@@ -145,11 +155,11 @@ def tissue_score(values: NDArray[Any], truth: Truth, kind: ReferenceKind = "effe
 
 
 def aligned_score(values: NDArray[Any], truth: Truth, kind: ReferenceKind) -> Score:
-    """Score the tissue after one least-squares gain, fitted on the body outside the dilated metal.
+    """Score the tissue after one least-squares gain, fitted on the judged body outside the dilated metal.
 
     No gain is applied where only 0 or a negative one would fit: it would turn the negative of a volume into the volume.
     """
-    body = truth.body & ~truth.near_metal
+    body = truth.body & truth.tissue
     gain = metrics.least_squares_gain(values, truth.references[kind], body if body.any() else truth.tissue)
     if gain is None or gain <= 0:
         why = "the reconstruction is 0 in the body" if gain is None else "no positive gain fits"
@@ -185,7 +195,7 @@ def metal_score(values: NDArray[Any], truth: Truth) -> Score:
         alignment="none",
         data_range=None,
         n_voxels=int(truth.metal.sum()),
-        values=metrics.metal_metrics(values, reference, truth.metal, truth.judged, truth.d_voxel),
+        values=metrics.metal_metrics(values, reference, truth.metal, truth.judged, truth.d_voxel, truth.kinds),
         note="" if cored else "the metal is too thin to be eroded: its core is all of it",
     )
 

@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from ctsim.benchmarks.scores import metrics
 from ctsim.benchmarks.scores.artefact import MIN_VOXELS, distance_to_metal, is_near
-from ctsim.benchmarks.scores.metrics import Mask, dilate
+from ctsim.benchmarks.scores.metrics import Mask, dilate, erode
 from ctsim.benchmarks.scores.protocol import Truth
 from ctsim.benchmarks.scores.score import COLUMNS, Score
 
@@ -72,9 +72,9 @@ class SoftLayout:
     """Where soft tissue is judged in a scan. Masks are [z, y, x].
 
     `region` holds all voxels of soft classes, `classes` each class's own; `even` those whose 26 neighbours are of the
-    same class, and `wide` those whose neighbours within 2 voxels are. `pair` names two classes to tell apart. `fine`
-    holds fine structures and what is up to 2 voxels from them, away from bone and air. The `reference` is in HU.
-    `near` is what `is_near` calls so. `edges` are cubes with structure, "near" metal and "far".
+    same class, and `wide` those whose neighbours within 2 voxels are, and are judged. `pair` names two classes to tell
+    apart. `fine` holds fine structures and what is up to 2 voxels from them, away from bone and air. The `reference` is
+    in HU. `near` is what `is_near` calls so. `edges` are cubes with structure, "near" metal and "far".
     """
 
     water: float
@@ -109,6 +109,7 @@ def soft_layout(
     wide = np.zeros_like(truth.tissue)
     for mask in classes.values():
         wide |= _within(labels, mask, HIGH_PASS // 2)
+    wide &= erode(truth.tissue, HIGH_PASS // 2)  # errors of the metal's edge next to it are no noise
     distance = distance_to_metal(truth)
     pair = _pair(reference, even)
     told = "no two classes to tell apart" if pair is None else f"contrast of {pair[0]} and {pair[1]}"
@@ -196,6 +197,7 @@ def soft_score(values: NDArray[Any], layout: SoftLayout | str) -> Score:
         even = layout.even[name]
         found[f"bias:{name}"] = float(error[even].mean()) if even.any() else None
         found[f"rmse:{name}"] = math.sqrt(float(np.mean(error[mask] ** 2)))
+    found |= {f"worst_{what}": _greatest(found, f"{what}:") for what in ("bias", "rmse")}
     return Score(
         region=REGION,
         reference="effective spectrum, in HU",
@@ -206,6 +208,12 @@ def soft_score(values: NDArray[Any], layout: SoftLayout | str) -> Score:
         identical=mse == 0,
         note=layout.note,
     )
+
+
+def _greatest(found: dict[str, float | None], start: str) -> float | None:
+    """Return the value of greatest magnitude among those whose name starts so."""
+    values = [value for name, value in found.items() if name.startswith(start) and value is not None]
+    return max(values, key=abs) if values else None
 
 
 def _told_apart(hu: NDArray[np.float64], error: NDArray[np.float64], layout: SoftLayout) -> dict[str, float | None]:

@@ -18,7 +18,7 @@ from ctsim.benchmarks.scores.artefact import MAX_PIECES, near_mm, pieces_of
 from ctsim.benchmarks.scores.metrics import Mask, erode
 from ctsim.benchmarks.scores.protocol import Truth
 from ctsim.benchmarks.scores.score import COLUMNS, Score
-from ctsim.benchmarks.scores.soft import SoftLayout
+from ctsim.benchmarks.scores.soft import SOFT_HU, SoftLayout
 
 BONE_HU = 1000.0
 """What attenuates twice as much as water reads as bone, whatever cortical bone has under a soft spectrum."""
@@ -79,14 +79,14 @@ def structure_score(values: NDArray[Any], layout: StructureLayout | str) -> Scor
     """Score false bone and false air; all None with the reason where the layout is a sentence.
 
     A voxel reads as bone above `BONE_HU`, or where it is nearer to cortical bone than to its own reference if that is
-    less; as air where it is nearer to air.
+    less, but not within `SOFT_HU` of its reference, which may hold a part of bone; as air where it is nearer to air.
     """
     if isinstance(layout, str):
         return Score.none(REGION, COLUMNS["structure"], layout)
     region = layout.near | layout.between
     reference = layout.soft.reference[region]
     hu = (values[region].astype(np.float64) / layout.soft.water - 1) * 1000
-    bone = hu > np.minimum((reference + layout.bone) / 2, BONE_HU)
+    bone = hu > np.maximum(np.minimum((reference + layout.bone) / 2, BONE_HU), reference + SOFT_HU)
     air = hu < (reference + layout.air) / 2
     parts = {"": np.ones_like(bone), "_near": layout.near[region], "_between": layout.between[region]}
     found: dict[str, float | None] = {}
