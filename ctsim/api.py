@@ -126,8 +126,7 @@ def score_volume(
     if twin is not None:
         pair = Twin(values=_arrays(twin, scan, (str(Status.OK),))[0])
     judge = _judge_with_views(scan) if variant == METAL and PROJECTION in protocols else _judge(scan)
-    found = judge.scores(values, variant, pair, at_50kev)
-    return {name: score for name, score in found.items() if name in protocols}
+    return judge.scores(values, variant, pair, at_50kev, protocols)
 
 
 @functools.lru_cache(maxsize=1)

@@ -44,6 +44,8 @@ class Scans(Dataset[dict[str, torch.Tensor]]):
         split: str = "",
     ) -> None:
         self.root, self.items, self.plane = Path(root), tuple(items), plane
+        if not self.items:
+            raise InputError(f"items: expected at least one of {', '.join(ITEMS)}")
         if unknown := [item for item in self.items if item not in ITEMS]:
             raise InputError(f"items: {unknown[0]!r} is unknown, expected some of {human_choice(ITEMS, unknown[0])}")
         if plane is not None and plane not in AXES:

@@ -26,6 +26,7 @@ from ctsim.settings import Simulation, Truth
 from ctsim.tracer.layers import crossed
 from ctsim.types import Phantom, Scanner
 
+ROUGH, ROUND = 48, 720  # points on an edge of the object's bounding cylinder: over many views, and for one alone
 _LATER = {"metal_in_view": False, "drawn": None}  # keys that old ids mean by their default: see `identity`
 
 
@@ -198,9 +199,8 @@ def check_geometry(geometry: Geometry, size: float, truncated: bool, height: flo
     """
     poses = geometry.pose_array()
     _check_source(poses[:, :3], geometry, size)
-    if geometry.poses is None:
-        poses = poses[:: max(1, len(poses) // 1000)]  # on a circle every view casts the same shadow
-    u, v = _shadow(poses, size, height)
+    circle = geometry.poses is None  # on which every view casts the same shadow
+    u, v = _shadow(poses[:1] if circle else poses, size, height, ROUND if circle else ROUGH)
     half_v, half_u = ((n / 2) for n in geometry.n_detector)
     fan = geometry.n_detector[0] == 1 < geometry.n_detector[1]  # a slice is all that one row is to see
     seen = (u.min(1) < half_u) & (u.max(1) > -half_u) & (v.min(1) < half_v) & (v.max(1) > -half_v)
@@ -235,9 +235,14 @@ def _check_source(source: NDArray[np.float64], geometry: Geometry, size: float) 
         )
 
 
-def _shadow(poses: NDArray[np.float64], size: float, height: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Detector coordinates (pixels from the centre) of the object's bounding cylinder: u, v [view, point]."""
-    angle = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+def _shadow(
+    poses: NDArray[np.float64], size: float, height: float, n: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Detector coordinates (pixels from the centre) of the object's bounding cylinder, u, v [view, point].
+
+    `n` points on each of its edges stand for them.
+    """
+    angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
     ring = REACH * size / 2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
     points = np.concatenate([np.add(ring, [0, 0, h]) for h in (-height * size / 2, height * size / 2)])
     source, centre, du, dv = (poses[:, k : k + 3] for k in (0, 3, 6, 9))

@@ -15,6 +15,7 @@ from typing import Annotated, Any
 
 import msgspec
 
+from ctsim.dataset.manifest import is_name
 from ctsim.errors import InputError
 from ctsim.phantoms.ct_headers import digest_at, volume_at
 from ctsim.phantoms.messages import explain
@@ -46,6 +47,8 @@ class Many(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     def __post_init__(self) -> None:
         if self.split and not (min(self.split.values()) > 0 and abs(sum(self.split.values()) - 1) < 1e-6):
             raise InputError(f"split must be positive shares that sum to 1, got {self.split}")
+        if wrong := [name for name in self.split if not is_name(name)]:
+            raise InputError(f"split {wrong[0]!r}: expected a name of letters, digits and ._+- (it names files)")
 
 
 class Drawn(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -134,7 +134,7 @@ def test_a_dry_run_of_many_plans_one_of_a_recipe_and_geometry(tmp_path, suite, c
 
     assert listed(PLANNED)[0] == [f"s{k}" for k in range(PLANNED)]
     titles, total = listed(1000)
-    assert titles == [f"s{k}, and 499 more of its recipe, metal and geometry" for k in (0, 1)]
+    assert titles == [f"s{k}, and 499 more of its recipe, metal, grids and number of views" for k in (0, 1)]
     assert total.endswith("(planned 2 of 1000 scenes)")
 
 

@@ -9,6 +9,7 @@ from ctsim.benchmarks.studies.methods.records import FILE, NAME, WHAT, RunRecord
 from ctsim.benchmarks.studies.methods.study import main as run_benchmark
 from ctsim.benchmarks.studies.methods.volumes import read_volume, write_volume
 from ctsim.benchmarks.tools import rescore
+from ctsim.errors import InputError
 
 SCENE = """
 name = "rods"
@@ -56,6 +57,19 @@ def test_kept_volumes_are_scored_as_the_runs_were(folders, capsys):
     assert run_benchmark([str(data), str(results), "--method", "fdk", "--method", "limar"]) == 0
     assert len(read(results)) == 8  # the methods need not run
     assert rescore.main([str(results), str(data)]) == 0 and len(read(results)) == 8
+
+
+@pytest.mark.slow
+def test_protocols_that_are_not_named_keep_their_scores(folders):
+    data, results = folders
+    known = {(r.label, r.task.part): r.scores for r in read(results)}
+    as_before(results, lambda record: True)
+    assert rescore.main([str(results), str(data), "soft", "metal"]) == 0
+    for record in (r for r in read(results) if r.task.version == VERSION):
+        scores = known[record.label, record.task.part]
+        assert record.scores == {name: scores[name] for name in ("soft", "metal") if name in scores}
+    with pytest.raises(InputError, match="'sofft': expected protocols among"):
+        rescore.main([str(results), str(data), "sofft"])
 
 
 @pytest.mark.slow

@@ -67,6 +67,15 @@ def test_every_scan_is_in_one_shard_of_its_split(folder):
         assert {index[n].about.split if index[n].about else "all" for n in names} == {path.rpartition("-")[0]}
 
 
+def test_a_split_of_another_folder_is_refused(folder, tmp_path):
+    shutil.copytree(folder / "data", tmp_path / "data")
+    index = tmp_path / "data" / "index.jsonl"
+    index.write_text(index.read_text().replace('"split":"train"', '"split":"../train"'))
+    with pytest.raises(InputError, match=r"names the split '\.\./train', expected"):
+        main([str(tmp_path / "data"), str(tmp_path / "out" / "shards")])
+    assert not list(tmp_path.rglob("*.h5"))
+
+
 def test_arrays_are_those_of_the_scan(folder):
     stored = open_scan(folder / "data/rods-00001")
     assert stored.metal_free is not None
@@ -217,6 +226,7 @@ def test_what_is_not_there_is_one_sentence(folder, tmp_path):
     for call, said in (
         (lambda: Scans(tmp_path), "holds no shards"),
         (lambda: Scans(folder / "out", ("fdkk",)), "items: 'fdkk' is unknown"),
+        (lambda: Scans(folder / "out", ()), "items: expected at least one"),
         (lambda: Scans(folder / "out", plane="w"), "plane must be 'z', 'y', 'x' or None"),
         (lambda: Scans(folder / "out", split="val"), "no scan in split 'val', expected test, train"),
         (lambda: main([str(folder / "data"), str(tmp_path), "--items", "fdkk"]), "--items fdkk: expected some of p"),

@@ -92,12 +92,12 @@ def alike(scenes: Sequence[Scene]) -> list[tuple[Scene, int, str]]:
     """Return what a dry run plans: a scene that stands for others, how many they are with it, and what they share.
 
     These are the scenes of a table with `count`, and those that differ in their seed alone. Where that leaves more than
-    `PLANNED`, one scene stands for all of its recipe, metal and geometry.
+    `PLANNED`, one scene stands for all of its recipe, metal, grids and number of views.
     """
     groups = _grouped(scenes, lambda s: s.drawn.table if s.drawn else _text(s, "name", "seed"))
     if len(groups) <= PLANNED:
         return [(g[0], len(g), "of its table" if g[0].drawn else "that differ in their seed alone") for g in groups]
-    return [(g[0], len(g), "of its recipe, metal and geometry") for g in _grouped(scenes, _kind)]
+    return [(g[0], len(g), "of its recipe, metal, grids and number of views") for g in _grouped(scenes, _kind)]
 
 
 def _grouped(scenes: Sequence[Scene], key: Callable[[Scene], object]) -> list[list[Scene]]:
@@ -108,10 +108,11 @@ def _grouped(scenes: Sequence[Scene], key: Callable[[Scene], object]) -> list[li
 
 
 def _kind(scene: Scene) -> tuple[object, ...]:
-    """Return what decides most of a scene's time and disk: all but tube, dose and the draw of the body."""
+    """Return what decides most of a scene's time and disk: not tube, dose, the draw of the body and sizes in mm."""
     scanner = scene.resolve()
     shape = (scene.phantom.recipe, scene.phantom.metal, scene.phantom.n_voxel, scanner.scatter.level)
-    return *shape, _text(scanner.geometry), scene.truth, scene.simulation
+    geometry = scanner.geometry
+    return *shape, geometry.n_views, geometry.n_detector, geometry.n_voxel, scene.truth, scene.simulation
 
 
 def _text(given: msgspec.Struct, *without: str) -> bytes:

@@ -1,5 +1,6 @@
 """All scores of one volume: every protocol that applies to it, from one scan's truth."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +11,7 @@ from ctsim.benchmarks.scores.artefact import Layout, artefact_score, effective_a
 from ctsim.benchmarks.scores.metrics import METAL
 from ctsim.benchmarks.scores.projection import HeldOut, held_out, projection_score, with_floor
 from ctsim.benchmarks.scores.protocol import Truth, evaluate, truth_of
-from ctsim.benchmarks.scores.score import NO_TWIN, Score
+from ctsim.benchmarks.scores.score import NO_TWIN, PROJECTION, PROTOCOLS, Score
 from ctsim.benchmarks.scores.soft import SoftLayout, soft_layout, soft_score
 from ctsim.benchmarks.scores.structure import StructureLayout, structure_layout, structure_score
 from ctsim.dataset.truth import ScanWithTruth
@@ -60,24 +61,31 @@ class Judge:
         )
 
     def scores(
-        self, values: NDArray[Any], variant: str, twin: Twin, at_50kev: NDArray[Any] | None = None
+        self,
+        values: NDArray[Any],
+        variant: str,
+        twin: Twin,
+        at_50kev: NDArray[Any] | None = None,
+        protocols: Collection[str] = PROTOCOLS,
     ) -> dict[str, Score]:
-        """Score a volume under every protocol that applies to the `variant` of its scan, with or without metal.
+        """Score a volume under those `protocols` that apply to the `variant` of its scan, with or without metal.
 
         `at_50kev` is the volume at 50 keV of a method that knows energies.
         """
-        scores = evaluate(values, self.truth, at_50kev=at_50kev, anchor=variant != "metal")
-        scores["soft"] = soft_score(values, self.soft)
-        if self.truth.metal.any():
-            scores["structure"] = structure_score(values, self.structure)
-        if variant == "metal":
-            scores["projection"] = projection_score(values, self.views, at_50kev)
-        if variant == "metal" and self.absent:
-            scores["metal"] = Score.none("metal", METAL, self.absent)
-            scores["artefact"] = artefact_score(values, None, self.layout, self.truth, self.absent)
-        elif variant == "metal" and self.truth.metal.any():
-            scores["artefact"] = artefact_score(values, twin.values, self.layout, self.truth, twin.reason)
-        return scores
+        whole, metal = variant == "metal", self.truth.metal.any()
+        found = evaluate(values, self.truth, at_50kev=at_50kev, anchor=not whole, protocols=protocols)
+        if "soft" in protocols:
+            found["soft"] = soft_score(values, self.soft)
+        if "structure" in protocols and metal:
+            found["structure"] = structure_score(values, self.structure)
+        if PROJECTION in protocols and whole:
+            found[PROJECTION] = projection_score(values, self.views, at_50kev)
+        if "metal" in protocols and whole and self.absent:
+            found["metal"] = Score.none("metal", METAL, self.absent)
+        if "artefact" in protocols and whole and (self.absent or metal):
+            pair, why = (None, self.absent) if self.absent else (twin.values, twin.reason)
+            found["artefact"] = artefact_score(values, pair, self.layout, self.truth, why)
+        return found
 
 
 def _absent(stored: ScanWithTruth, truth: Truth) -> str:

@@ -4,6 +4,7 @@ A score always comes with its region, reference, alignment and data range: in th
 numbers, and in the caption of every table.
 """
 
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from ctsim.benchmarks.scores import metrics
 from ctsim.benchmarks.scores.metrics import Mask
-from ctsim.benchmarks.scores.score import AS_RETURNED, AT_50KEV, Score
+from ctsim.benchmarks.scores.score import AS_RETURNED, AT_50KEV, PROTOCOLS, Score
 from ctsim.dataset.truth import ScanWithTruth
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -201,9 +202,14 @@ def metal_score(values: NDArray[Any], truth: Truth) -> Score:
 
 
 def evaluate(
-    values: NDArray[Any], truth: Truth, *, at_50kev: NDArray[Any] | None = None, anchor: bool = False
+    values: NDArray[Any],
+    truth: Truth,
+    *,
+    at_50kev: NDArray[Any] | None = None,
+    anchor: bool = False,
+    protocols: Collection[str] = PROTOCOLS,
 ) -> dict[str, Score]:
-    """Score a volume [z, y, x] in 1/mm under every protocol that applies.
+    """Score a volume [z, y, x] in 1/mm under those `protocols` of this module that apply.
 
     Protocols at 50 keV score `at_50kev`, if given. With `anchor`, for a scan without the metal, only `tissue` and
     `aligned` apply. The volumes must be finite.
@@ -211,14 +217,13 @@ def evaluate(
     if values.shape != truth.metal.shape:
         raise InputError(f"the volume has shape {values.shape}, the reference {truth.metal.shape}")
     mono, which = (values, AS_RETURNED) if at_50kev is None else (at_50kev, AT_50KEV)
-    scores = {
-        "tissue": tissue_score(values, truth),
-        "aligned": aligned_score(values, truth, "effective"),
-        "aligned_50kev": replace(aligned_score(mono, truth, "50kev"), volume=which),
+    scores: dict[str, Callable[[], Score]] = {
+        "tissue": lambda: tissue_score(values, truth),
+        "aligned": lambda: aligned_score(values, truth, "effective"),
+        "aligned_50kev": lambda: replace(aligned_score(mono, truth, "50kev"), volume=which),
     }
-    if anchor:
-        return scores
-    scores["paper"] = replace(paper_score(mono, truth), volume=which)
-    if truth.metal.any():
-        scores["metal"] = metal_score(values, truth)
-    return scores
+    if not anchor:
+        scores["paper"] = lambda: replace(paper_score(mono, truth), volume=which)
+    if not anchor and truth.metal.any():
+        scores["metal"] = lambda: metal_score(values, truth)
+    return {name: score() for name, score in scores.items() if name in protocols}

@@ -1,8 +1,9 @@
 """Score the kept volumes of a results folder again, after a protocol changed and no method did.
 
-    python -m ctsim.benchmarks.tools.rescore results/ data/
+    python -m ctsim.benchmarks.tools.rescore results/ data/ [PROTOCOL ...]
 
-Each last record of an older protocol version gets one of the present version with new scores. Its volume, cost, time
+Each last record of an older protocol version gets one of the present version with new scores: of the protocols named,
+which are those that the new version changed, or of all; the others keep theirs. Its volume, cost, time
 and commit stay those of the run; the details name the commit that scored it again. What has no volume is left out and
 said.
 """
@@ -18,7 +19,7 @@ from ctsim.benchmarks.engine.host import commit
 from ctsim.benchmarks.engine.record import Store, latest
 from ctsim.benchmarks.scores.judge import Judge, Twin
 from ctsim.benchmarks.scores.projection import HeldOut
-from ctsim.benchmarks.scores.score import NO_TWIN, NOT_ASKED, TWIN_ENDED, VERSION
+from ctsim.benchmarks.scores.score import NO_TWIN, NOT_ASKED, PROJECTION, PROTOCOLS, TWIN_ENDED, VERSION
 from ctsim.benchmarks.studies.methods import heldout
 from ctsim.benchmarks.studies.methods.attempt import SCORED
 from ctsim.benchmarks.studies.methods.records import FILE, METAL, WHAT, RunRecord, read
@@ -31,9 +32,11 @@ AGAIN = "scored again"  # among the details
 
 def main(arguments: list[str]) -> int:
     """Append the new records; return 0 if all could be scored, else 1."""
-    if len(arguments) != 2:
-        raise InputError("expected RESULTS and DATA")
-    results = Path(arguments[0])
+    if len(arguments) < 2:
+        raise InputError("expected RESULTS, DATA and protocols or none")
+    results, protocols = Path(arguments[0]), tuple(arguments[2:]) or PROTOCOLS
+    if unknown := [name for name in protocols if name not in PROTOCOLS]:
+        raise InputError(f"{unknown[0]!r}: expected protocols among {', '.join(PROTOCOLS)}")
     scans = {scan.content_hash: scan for scan in map(open_scan, list_scans(Path(arguments[1])))}
     shown = latest(read(results))
     store, missing = Store(results, FILE, RunRecord, WHAT), 0
@@ -43,7 +46,7 @@ def main(arguments: list[str]) -> int:
             sys.stderr.write(f"{rows[0].task.case}: the scan is not in {arguments[1]}\n")
             missing += len(rows)
             continue
-        for record in _scored(rows, scans[data], results):
+        for record in _scored(rows, scans[data], results, protocols):
             missing += record is None
             if record is not None:
                 store.append([record])
@@ -51,16 +54,18 @@ def main(arguments: list[str]) -> int:
     return 1 if missing else 0
 
 
-def _scored(rows: Sequence[RunRecord], stored: StoredScan, results: Path) -> Iterator[RunRecord | None]:
+def _scored(
+    rows: Sequence[RunRecord], stored: StoredScan, results: Path, protocols: Sequence[str]
+) -> Iterator[RunRecord | None]:
     """Score the rows of one scan again, the scan itself before its twin, whose volume it needs as the run left it."""
-    views = heldout.kept(stored, results)
+    views = heldout.kept(stored, results) if PROJECTION in protocols else "not scored again"
     judge = Judge.of(stored, views)
     if views is None and isinstance(judge.views, HeldOut):
         heldout.keep(judge.views, stored, results)
     for row in sorted(rows, key=lambda r: r.task.part != METAL):
         if row.task.version != VERSION:
             twin = next((r for r in rows if r.label == row.label and r.task.part != METAL), None)
-            yield _again(row, _pair(twin, stored, results), judge, results)
+            yield _again(row, _pair(twin, stored, results), judge, results, protocols)
 
 
 def _pair(twin: RunRecord | None, stored: StoredScan, results: Path) -> Twin:
@@ -74,7 +79,7 @@ def _pair(twin: RunRecord | None, stored: StoredScan, results: Path) -> Twin:
     return Twin(reason=NOT_ASKED) if path is None else Twin(values=read_volume(path))
 
 
-def _again(row: RunRecord, pair: Twin, judge: Judge, results: Path) -> RunRecord | None:
+def _again(row: RunRecord, pair: Twin, judge: Judge, results: Path, protocols: Sequence[str]) -> RunRecord | None:
     """Return a record with new scores, and let the volume name its run; None where the volume is not there."""
     result, task = row.found[0], replace(row.task, version=VERSION)
     if result.status not in SCORED:
@@ -85,7 +90,7 @@ def _again(row: RunRecord, pair: Twin, judge: Judge, results: Path) -> RunRecord
         return None
     at_50kev = own_at_50kev(path, row.identity)
     values, mono = read_volume(path), None if at_50kev is None else read_volume(at_50kev)
-    scores = judge.scores(values, row.task.part, pair, mono)
+    scores = result.scores | judge.scores(values, row.task.part, pair, mono, protocols)
     keep(path, values, mono, task.identity)
     return replace(row, task=task, found=(replace(result, scores=scores, details=result.details | {AGAIN: commit()}),))
 

@@ -176,6 +176,10 @@ def read_index(data_dir: Path) -> dict[str, IndexLine]:
                 f"{path}: line {number} names the scene {entry.name!r}, expected a folder's name of letters, digits "
                 "and ._+-"
             )
+        if entry.about and entry.about.split and not is_name(entry.about.split):
+            raise InputError(
+                f"{path}: line {number} names the split {entry.about.split!r}, expected letters, digits and ._+-"
+            )
         found[entry.name] = entry
     return found
 
