@@ -37,6 +37,8 @@ def find_scene(suite: str, name: str, *, seed: int | None = None) -> Scene:
     InputError for an unknown suite or scene.
     """
     check_kind("suite", suite, str, "the name of a suite or the path of a TOML file, as a text")
+    if isinstance(seed, bool) or not isinstance(seed, int | None):
+        raise InputError(f"seed: expected a whole number or None, got {seed!r}")
     scenes = load(suite)
     names = [scene.name for scene in scenes]
     if name not in names:
@@ -67,6 +69,7 @@ def reconstruct_scan(scan: ScanWithTruth | Scan, method: str = "fdk", **paramete
         For an unknown method, parameter or value, where the method skips this scan, and where it returns no volume.
     """
     check_kind("scan", scan, (Scan, ScanWithTruth), "a scan, such as of open_scan or simulate_scene")
+    check_kind("method", method, str, "the name of a method or module:function")
     found = with_beam(find(method, parameters), scan if isinstance(scan, ScanWithTruth) else None)
     given = _readings(found, scan)
     if (reason := found.skip(given)) is not None:
@@ -114,6 +117,7 @@ def score_volume(
     check_kind("scan", scan, ScanWithTruth, "a scan with its truth, such as of open_scan or simulate_scene")
     if not scan.has_truth:
         raise InputError(f"{scan.place}: is a measured scan, which has no truth to score a volume with")
+    check_kind("protocols", protocols, Iterable, "names of protocols")
     protocols = {protocols} if isinstance(protocols, str) else set(protocols)
     if unknown := sorted(protocols - set(PROTOCOLS)):
         raise InputError(f"protocols: expected names among {', '.join(PROTOCOLS)}, got {unknown[0]!r}")

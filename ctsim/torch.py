@@ -88,7 +88,8 @@ class Scans(Dataset[dict[str, torch.Tensor]]):
             if item not in entry.shapes:
                 raise InputError(
                     f"{path}: {entry.name} has no {item!r}, expected some of {', '.join(entry.shapes)}"
-                    + ("; the trace needs truth.trace = true in the scene" if item == "trace" else "")
+                    + "; name it under --items of make-dataset shards"
+                    + (", and let the scene have truth.trace = true" if item == "trace" else "")
                 )
         if self.plane is None:
             return 1
@@ -125,5 +126,8 @@ class Scans(Dataset[dict[str, torch.Tensor]]):
         if self._process != os.getpid():
             self._files, self._process = {}, os.getpid()
         if path not in self._files:
-            self._files[path] = h5py.File(path, "r")
+            try:
+                self._files[path] = h5py.File(path, "r")
+            except OSError as error:
+                raise InputError(f"{path}: cannot be opened any more ({' '.join(str(error).split())})") from None
         return self._files[path]

@@ -3,7 +3,7 @@
 import functools
 import hashlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -175,7 +175,22 @@ def _scenes(data: dict[str, Any], where: str) -> tuple[Scene, ...]:
         data = {"scene": [data]} if "count" in data else data
         if "scene" not in data:
             return (decode(data, Scene, where),)
-    return scenes_of(data, Scene, where, expand)
+    scenes = scenes_of(data, Scene, where, expand)
+    _check_splits(scenes, where)
+    return scenes
+
+
+def _check_splits(scenes: Sequence[Scene], where: str) -> None:
+    """Refuse an individual that two tables put into two splits: what is tested on would have been trained on."""
+    known: dict[str, Scene] = {}
+    for scene in scenes:
+        if scene.drawn and scene.drawn.split:
+            other = known.setdefault(individual(scene), scene)
+            if other.drawn and other.drawn.split != scene.drawn.split:
+                raise InputError(
+                    f"{where}: {other.name} ({other.drawn.split}) and {scene.name} ({scene.drawn.split}) are of one "
+                    "individual; give their tables the same split, or seeds that do not overlap"
+                )
 
 
 def _plain(value: Any) -> Any:

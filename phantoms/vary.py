@@ -22,8 +22,8 @@ from ctsim.phantoms.messages import explain
 
 Table = dict[str, Any]
 MOST = 100_000
-BY_SCAN = ("phantom.metal", "scanner.tube.", "scanner.noise.", "scanner.i0", "scanner.scan_mas", "scanner.scan_kerma")
-"""Keys, or their beginnings, that are drawn for every scan; others are drawn for every individual."""
+BY_SCAN = ("phantom.metal", "scanner.tube", "scanner.noise", "scanner.i0", "scanner.scan_mas", "scanner.scan_kerma")
+"""Keys and tables that are drawn for every scan; others are drawn for every individual."""
 _GOLDEN = 0x9E3779B97F4A7C15  # 2^64 over the golden ratio: its multiples modulo 2^64 fill the range evenly
 _DIGITS = 6  # of a drawn number
 
@@ -84,15 +84,18 @@ def expand(place: str, table: Table, where: str) -> Iterator[tuple[str, Table]]:
     if not isinstance(name, str) or isinstance(first, bool) or not isinstance(first, int):
         yield place, base  # which names the missing or wrong key
         return
+    keys = [key for key, _ in _flat(many.vary)]
     rules = {key: _rule(f"{where}: {place}.vary.{key}", rule) for key, rule in _flat(many.vary)}
     for key in rules:
+        if twice := [other for other in keys if other.startswith(f"{key}.")] or [key] * (keys.count(key) > 1):
+            raise InputError(f"{where}: {place}.vary.{key}: is drawn twice, {twice[0]} being drawn too")
         if not key.startswith(("phantom.", "scanner.")):
             raise InputError(f"{where}: {place}.vary.{key}: expected a key of phantom or scanner")
     for k in range(many.count):
         individual = k // many.scans_each
         scene = {"metal_in_view": True, **base, "name": f"{name}-{k:05d}", "seed": first + individual}
         for key, rule in rules.items():
-            unit = k if key.startswith(BY_SCAN) else individual
+            unit = k if _by_scan(key) else individual
             scene = _with(scene, key.split("."), rule(_share(f"{name}/{first}/{key}/{unit}")))
         split = _split(scene, many.split, where) if many.split else ""
         scene["drawn"] = {"table": name, "index": k, "keys": list(rules), "split": split}
@@ -102,6 +105,10 @@ def expand(place: str, table: Table, where: str) -> Iterator[tuple[str, Table]]:
 def individual_of(recipe: str, seed: int, sha256: str) -> str:
     """Name the individual of a scene: the CT where it is from a file, else the recipe and the seed."""
     return f"ct-{sha256[:12]}" if sha256 else f"{recipe}-{seed}"
+
+
+def _by_scan(key: str) -> bool:
+    return any(f"{key}.".startswith(f"{name}.") for name in BY_SCAN)
 
 
 def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:

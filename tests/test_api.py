@@ -233,3 +233,14 @@ def test_a_method_that_knows_energies_is_read_at_50_kev(simulated):
     assert found["tissue"] == plain["tissue"]
     half = msgspec.structs.replace(score_volume(values.numpy() / 2, simulated)["paper"], volume=found["paper"].volume)
     assert found["paper"] == half != plain["paper"]
+
+
+@pytest.mark.parametrize("seed", [1.5, True, "a"])
+def test_a_seed_is_a_whole_number(seed):
+    with pytest.raises(InputError, match="seed: expected a whole number or None"):
+        ctsim.find_scene("quick", "lung-Fe", seed=seed)
+
+
+def test_a_folder_is_a_text_or_a_path():
+    with pytest.raises(InputError, match="folder: expected the folder of a scan"):
+        ctsim.open_scan(None)

@@ -222,6 +222,23 @@ def test_a_measured_scan_has_what_is_known_of_it(tmp_path):
     assert not (tmp_path / "none").exists()
 
 
+def test_a_shard_that_went_away_is_one_sentence(folder, tmp_path):
+    shutil.copytree(folder / "out", tmp_path / "out")
+    scans = Scans(tmp_path / "out", ("fdk",))
+    for path in (tmp_path / "out").glob("*.h5"):
+        path.unlink()
+    with pytest.raises(InputError, match="cannot be opened any more"):
+        scans[0]
+
+
+def test_contents_that_are_no_text_are_damage(folder, tmp_path):
+    path = tmp_path / "train-00000.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs["contents"] = np.bytes_(b'{"format": \xff}')
+    with pytest.raises(InputError, match="is no shard"):
+        Scans(tmp_path)
+
+
 def test_what_is_not_there_is_one_sentence(folder, tmp_path):
     for call, said in (
         (lambda: Scans(tmp_path), "holds no shards"),

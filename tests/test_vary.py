@@ -122,6 +122,32 @@ def test_what_cannot_be_drawn_is_one_sentence(old, new, said):
     assert str(e.value).startswith("s.toml: ") and "\n" not in str(e.value)
 
 
+def test_a_tube_drawn_as_a_whole_is_drawn_for_every_scan():
+    text = TABLE.format(count=24).replace(
+        "scanner.tube.kvp = { uniform = [80, 140] }", "scanner.tube = [{ kvp = 80 }, { kvp = 120 }]"
+    )
+    drawn = [scene.scanner.tube.kvp for scene in parse_suite(text, "s.toml")]
+    assert any(a != b for a, b in zip(drawn[::2], drawn[1::2], strict=True))  # two scans of one individual
+
+
+def test_a_key_that_is_drawn_twice_is_refused():
+    for key in ('"scanner.tube.kvp" = [80, 90]', "scanner.tube = [{ kvp = 80 }]"):
+        text = TABLE.format(count=4).replace('"phantom.metal"', f'{key}\n"phantom.metal"')
+        if "scanner.tube =" in key:
+            text = text.replace("scanner.tube.kvp = {", '"scanner.tube.kvp" = {')
+        with pytest.raises(InputError, match=r"vary.scanner.tube.*is drawn twice"):
+            parse_suite(text, "s.toml")
+
+
+def test_no_individual_is_in_two_splits_of_two_tables():
+    table = TABLE.format(count=40)
+    second = table[table.index("[[scene]]") :].replace('name = "rods"', 'name = "more"')
+    assert len(parse_suite(table + second, "s.toml")) == 80
+    other = second.replace("train = 0.8, val = 0.1, test = 0.1", "train = 0.2, test = 0.8")
+    with pytest.raises(InputError, match=r"s.toml: rods-.* \(train\) and more-.* \(test\) are of one individual"):
+        parse_suite(table + other, "s.toml")
+
+
 def test_seeds_do_not_go_with_count():
     with pytest.raises(InputError, match="--seeds: rods-00000 comes from count"):
         select(scenes(2), (), (1, 2))

@@ -17,7 +17,7 @@ from ctsim.dataset.manifest import list_scans, verify
 from ctsim.dataset.tiffstack import map_array
 from ctsim.dataset.truth import ScanWithTruth, readings
 from ctsim.dataset.writer import SceneWriter, Stack, is_complete
-from ctsim.errors import InputError
+from ctsim.errors import InputError, check_kind
 from ctsim.scaninfo import TWIN, ScanInfo, read_info
 
 __all__ = ["SceneWriter", "Stack", "StoredScan", "is_complete", "list_scans", "open_scan", "verify"]
@@ -79,6 +79,7 @@ def open_scan(folder: str | Path) -> StoredScan:
         When the folder is half-written, damaged (a file missing or of another size), of another format, or its
         scan.json says what cannot be.
     """
+    check_kind("folder", folder, (str, Path), "the folder of a scan, as a text or a path")
     folder = Path(folder)
     manifest = mf.read_manifest(folder)
     problems = mf.check_sizes(folder, manifest)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ctsim.dataset import durable
 from ctsim.dataset import manifest as mf
 from ctsim.dataset.folder import Progress, is_complete, lock_of, partial_of, read_progress
-from ctsim.dataset.locks import Lock
+from ctsim.dataset.locks import Busy, Lock
 from ctsim.dataset.sources import source_hash
 from ctsim.dataset.tiffstack import create_stack, write_all, write_image
 from ctsim.errors import InputError
@@ -166,7 +166,7 @@ class SceneWriter:
         durable.recover(final)
         if final.exists() and not self.force:
             is_complete(self.data_dir, self.name, self.scene_id)  # names another scene
-            raise InputError(f"{final}: already complete; replace it with --force")
+            raise Busy(f"{final}: already complete; replace it with --force")  # also by another process just now
         known = self._known()
         if known is None or known.views == 0:
             shutil.rmtree(self._partial, ignore_errors=True)

@@ -91,7 +91,7 @@ def contents(path: Path) -> Contents:
     try:
         with h5py.File(path, "r") as file:
             found = msgspec.json.decode(str(file.attrs[_CONTENTS]), type=Contents)
-    except (OSError, KeyError, msgspec.DecodeError) as error:
+    except (OSError, KeyError, UnicodeError, msgspec.DecodeError) as error:
         raise InputError(
             f"{path}: is no shard ({' '.join(str(error).split())}); make-dataset shards writes them"
         ) from None

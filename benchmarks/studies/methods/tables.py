@@ -231,16 +231,25 @@ def _grid_of(
     own: Sequence[RunRecord],
     protocol: str = MAIN_TABLE,
 ) -> tuple[list[Column], list[list[Cell]]]:
-    """Return columns and rows of a table with all scenes side by side, then their mean."""
+    """Return columns and rows of a table with all scenes side by side, then their mean.
+
+    What has fewer seeds than another row says so and has no rank: other noise and other bodies do not compare.
+    """
     scenes = list(dict.fromkeys(r.run.scene for r in own))
     groups = [*scenes, *["mean"] * (len(scenes) > 1), *["harm rate"] * (protocol == "anchored")]
     failed = {(r.run.scene, (r.inputs, r.label)): r.status for r in own if r.status != OK}
+    seeds: dict[tuple[str, str], int] = defaultdict(int)
+    for (scene, _, metric), number in chosen.items():
+        seeds[scene, metric] = max(seeds[scene, metric], number[2])
     rows = []
     for row in dict.fromkeys((r.inputs, r.label) for r in own):
         cells = []
         for scene in scenes:
             for metric, how in metrics.items():
-                cell = _cell(chosen.get((scene, row, metric)), metric, how)
+                number = chosen.get((scene, row, metric))
+                cell = _cell(number, metric, how)
+                if number is not None and 0 < number[2] < seeds[scene, metric]:
+                    cell = Cell(f"{cell.text} ({number[2]}/{seeds[scene, metric]} seeds)")
                 if (scene, row) in failed:
                     status = failed[scene, row]
                     cell = Cell(status if cell.number is None or protocol == "cost" else f"{cell.text} ({status})")
