@@ -18,6 +18,7 @@ import numpy as np
 
 from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.engine.table import html_prose, simple
+from ctsim.benchmarks.scalebar import length_of
 from ctsim.benchmarks.studies.methods.records import RunRecord, latest
 from ctsim.benchmarks.studies.methods.tables import tables
 from ctsim.reports import figures, slices
@@ -172,18 +173,20 @@ def _tile(case: Case | Measured, frame: slices.Frame, row: str, caption: str, la
     _, d_y, d_x = case.stored.geometry.d_voxel
     height, width = ((part.stop - part.start) for part in (frame.rows, frame.columns))
     ratio = f'style="aspect-ratio: {width * d_x:.6g} / {height * d_y:.6g}"'
+    length = length_of(width * d_x)
+    bar = f'<i class="bar" style="width: {100 * length / (width * d_x):.4g}%">{length:g} mm</i>'
     judged = isinstance(case, Case)
     ring = '<img class="stencil ring" data-kind="ring" alt="">' if judged else ""
     only = "" if label and judged else " only"
     alt = html.escape(label or "reference")
     frames = (
         f'<div class="frame volume{only}" {ratio}><img class="values" data-kind="volume" data-row="{row}" '
-        f'alt="{alt}: volume">{ring}</div>'
+        f'alt="{alt}: volume">{ring}{bar}</div>'
     )
     if label and judged:
         frames += (
             f'<div class="frame error" {ratio}><img class="values" data-kind="error" data-row="{row}" '
-            f'alt="{alt}: error"><img class="stencil" data-kind="fill" alt="">{ring}</div>'
+            f'alt="{alt}: error"><img class="stencil" data-kind="fill" alt="">{ring}{bar}</div>'
         )
     return (
         f'<figure class="tile" data-method="{html.escape(label)}"><div class="pair">{frames}</div>'

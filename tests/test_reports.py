@@ -25,6 +25,7 @@ from ctsim import reports
 from ctsim.benchmarks import cli, make_dataset
 from ctsim.benchmarks.engine import host
 from ctsim.benchmarks.engine.record import Task
+from ctsim.benchmarks.scalebar import length_of
 from ctsim.benchmarks.studies.methods import study as cli_run
 from ctsim.benchmarks.studies.methods import tables
 from ctsim.benchmarks.studies.methods.volumes import at_50kev_of, write_volume
@@ -170,6 +171,15 @@ def test_the_page_needs_nothing_from_elsewhere(written):
     assert "default-src 'none'" in written
     own = re.sub(r'xmlns(:\w+)?="[^"]*"|<(rdf:RDF|metadata).*?</\1>', "", written, flags=re.S)
     assert not re.search(r"(?i)(src|href|action)=[\"'](?!#|data:)|url\((?!#)|@import|\bimport\(|fetch\(|XMLHttp", own)
+
+
+def test_each_picture_of_a_slice_has_a_scale(case, written):
+    bars = re.findall(r'<i class="bar" style="width: ([0-9.]+)%">([0-9.]+) mm</i>', written)
+    assert len(bars) == len(re.findall('<div class="frame ', written)) == 7  # the reference, and two of each method
+    columns = slices.frame_of(case, 100).columns
+    width = (columns.stop - columns.start) * case.stored.geometry.d_voxel[2]
+    for share, length in bars:
+        assert float(length) == length_of(width) == pytest.approx(float(share) / 100 * width, rel=1e-3)
 
 
 def test_the_page_carries_the_slices_of_the_volumes(case, written):

@@ -148,13 +148,12 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     beyond = seen_beyond(data.p, scan.geometry, scan.i0)
     found_at = "" if filtration is None else filtration.sentence
     of_metal = _unexplained(fit, missed), _bounded(unread)
-    sentences = as_read.sentence, panel.sentence, *of_metal, beyond.sentence, found_at, _flat(finest)
-    limits = [said for said in sentences if said]
+    limits = as_read.sentence, panel.sentence, *of_metal, beyond.sentence, found_at, _flat(finest)
     details |= {
         "read-out": how,
         "dark_misfit": missed,
         "metal_unread": unread,
-        **({"limitation": "; ".join(limits)} if limits else {}),
+        **({"limitation": "; ".join(filter(None, limits))} if any(limits) else {}),
         "misfit": fit.misfit if math.isfinite(fit.misfit) else None,
         "view_updates": fit.view_updates,
         **stopwatch.details(),

@@ -121,6 +121,7 @@ shown = (("noise-free P", p, top), ("P of the counts", counted, top), ("what the
 for axes, (title, image, high) in zip(drawing.subplots(1, 3), shown, strict=True):
     drawing.colorbar(axes.imshow(image, cmap="gray", origin="lower", vmin=0, vmax=high), ax=axes, fraction=0.046)
     axes.set(title=f"{title}, view {view}", xticks=[], yticks=[])
+    scale_bar(axes, image.shape, scanner.geometry.d_detector[1], where="at the detector")
 show.figure(drawing, "physics-line-integrals")
 
 # %% [markdown]

@@ -9,6 +9,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 
 from ctsim.benchmarks.engine.table import pictured
+from ctsim.benchmarks.scalebar import scale_bar
 from ctsim.geometry import Geometry
 
 CELL, LABEL = 2.6, 1.1  # inches
@@ -32,7 +33,7 @@ def draw_bare(title: str, geometry: Geometry, rows: Sequence[tuple[str, NDArray[
     low, high = window_of(rows[0][1])
     window = {"vmin": low, "vmax": high}
     image = None
-    for axes, (caption, volume) in zip(grid, rows, strict=True):
+    for i, (axes, (caption, volume)) in enumerate(zip(grid, rows, strict=True)):
         for k, axis in enumerate((0, 1)):
             d_v, d_u = (d for a, d in enumerate(geometry.d_voxel) if a != axis)
             shown = np.take(volume, volume.shape[axis] // 2, axis)
@@ -40,6 +41,8 @@ def draw_bare(title: str, geometry: Geometry, rows: Sequence[tuple[str, NDArray[
                 shown, cmap="gray", origin="lower", aspect=d_v / d_u, interpolation="nearest", **window
             )
             axes[k].set(xticks=[], yticks=[])
+            if i == 0:
+                scale_bar(axes[k], shown.shape, d_u)
         axes[0].set_ylabel(pictured(caption), rotation=0, ha="right", va="center", fontsize=8)
     for k, name in enumerate("zy"):
         grid[0, k].set_title(f"slice {geometry.n_voxel[k] // 2} normal to {name}", fontsize=8)

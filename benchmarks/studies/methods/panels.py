@@ -185,6 +185,7 @@ def draw(stored: StoredScan, truth: Truth, rows: list[PanelRow]) -> Figure:
             _worked(grid[i, -2:], row.shown, truth, at, look)
     if view is not None and measured is not None:
         _projection(grid[0, -2], measured, shadow, look)
+        scale_bar(grid[0, -2], measured.shape, stored.geometry.d_detector[1], where="at the detector")
         grid[0, -2].set_title(f"measured, view {view}", fontsize=8)
         grid[0, -2].set_xlabel("as backprojected", fontsize=8)
     _heads(grid, at, worked)
