@@ -4,6 +4,7 @@ The wheel lies on the path before the environment's packages, and `-S` leaves ou
 PyPI's package `phantoms` is installed next to it, else a stub of that name.
 """
 
+import json
 import os
 import re
 import subprocess
@@ -129,10 +130,50 @@ def test_an_installed_ctsim_imports_and_runs_the_readme(project, site, smallest,
 
     Files in a new place are compiled again: 20 s here, and a minute more for the simulator. `test_docs` runs all of it.
     """
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(project / "compiled"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(site.parent / "compiled"))
     (scan,) = list_scans(smallest)
     (example,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(encoding="utf-8"), re.M | re.S)
     assert SIMULATED in example
     where, psnr = run(project, site, USED + example.replace(SIMULATED, f"ctsim.open_scan({str(scan)!r})")).split()
     assert where == str(site / "ctsim" / "__init__.py") and 10 < float(psnr) < 60
     assert (project / "views.png").stat().st_size
+
+
+COMMAND = """
+import sys
+from ctsim.benchmarks import cli
+
+sys.argv = {words!r}
+sys.exit(getattr(cli, sys.argv[0].replace("-", "_"))())
+"""
+NET = """
+import torch
+
+from ctsim import Scan, Volume
+
+
+def reconstruct(scan: Scan) -> Volume:
+    return Volume(values=torch.full(scan.geometry.n_voxel, 0.01))
+"""
+
+
+@pytest.mark.slow
+def test_an_installed_ctsim_simulates_and_scores_the_readmes_own_scene(project, site, monkeypatch):
+    """The README's TOML block, and the commands after it, with a method of a package in the user's folder."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(site.parent / "compiled"))
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    (scene,) = re.findall(r"^```toml\n(.*?)^```", text, re.M | re.S)
+    commands = re.findall(r"^```bash\n(.*?)^```", text[text.index(scene) :], re.M | re.S)[0].splitlines()
+    assert [line.split()[0] for line in commands] == ["make-dataset", "run-benchmark"]
+    (project / commands[0].split()[1]).write_text(scene, encoding="utf-8")
+    (project / "my_lab").mkdir()
+    (project / "my_lab" / "__init__.py").touch()
+    (project / "my_lab" / "net.py").write_text(NET, encoding="utf-8")
+    for line in commands:
+        run(project, site, COMMAND.format(words=line.split()))
+    results = project / commands[1].split()[2]
+    rows = [json.loads(line)["task"] for line in (results / "records.jsonl").read_text(encoding="utf-8").splitlines()]
+    assert {(row["subject"], row["part"]) for row in rows} == {
+        (method, part) for method in ("fdk", "my_lab.net:reconstruct") for part in ("metal", "metal_free")
+    }
+    assert (results / "panels" / "walnut-pins.png").stat().st_size > 10_000
