@@ -13,7 +13,8 @@
 # %% [markdown]
 # # Train a network on simulated slices
 # One table of a scene file becomes 280 fan-beam scans with metal and their twins without it. A small U-Net learns from
-# 202 of them to remove artefacts. It is then compared with LIMAR on individuals that it has never seen.
+# 192 of them to remove artefacts (10 more have no voxel of metal in their mask). It is then compared with LIMAR on
+# individuals that it has never seen.
 #
 # Two controls tell how much of its gain has to do with metal. Any network that is trained on the true attenuation also
 # takes away noise, blur and the wrong level that beam hardening leaves. LIMAR does not attempt that.
