@@ -7,7 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import h5py
+try:
+    import h5py
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError("ctsim.torch reads HDF5: pip install 'ctsim[io]'", name=error.name) from None
 import torch
 from torch.utils.data import Dataset
 

@@ -131,4 +131,8 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    try:
+        main(sys.argv[1:])
+    except InputError as error:
+        sys.stderr.write(f"drawings: {error}\n")
+        sys.exit(2)

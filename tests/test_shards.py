@@ -248,6 +248,7 @@ def test_what_is_not_there_is_one_sentence(folder, tmp_path):
         (lambda: Scans(folder / "out", split="val"), "no scan in split 'val', expected test, train"),
         (lambda: main([str(folder / "data"), str(tmp_path), "--items", "fdkk"]), "--items fdkk: expected some of p"),
         (lambda: main([str(folder / "data"), str(tmp_path), "--scans-per-shard", "0"]), "expected 1 or more"),
+        (lambda: main([str(folder / "data"), str(folder / "s.toml")]), "s.toml: is a file, expected a folder"),
     ):
         with pytest.raises(InputError, match=said):
             call()

@@ -54,6 +54,8 @@ def shards(given: Flags) -> None:
         raise InputError(f"--items {unknown[0]}: expected some of {human_choice(form.ITEMS, unknown[0])}")
     if given.scans_per_shard < 1:
         raise InputError(f"--scans-per-shard {given.scans_per_shard}: expected 1 or more")
+    if given.out.is_file():
+        raise InputError(f"{given.out}: is a file, expected a folder")
     wanted = list(_divided(given))
     if others := sorted({*given.out.glob("*.h5")} - {given.out / shard.path.name for shard in wanted}):
         raise InputError(
