@@ -251,7 +251,7 @@ def _check_source(source: NDArray[np.float64], geometry: Geometry, size: float) 
 
 
 def _shadow(
-    poses: NDArray[np.float64], size: float, height: float, n: int
+    poses: NDArray[np.float64], size: float, height: float, n: int = ROUGH
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Detector coordinates (pixels from the centre) of the object's bounding cylinder, u, v [view, point].
 
