@@ -332,9 +332,9 @@ def test_one_slice_is_made_read_and_reconstructed_with_its_twin(monkeypatch):
         assert (found.contender, found.views, len(found.runs)) == (OURS, 42, 1)
         scans, twins = done[::2], done[1::2]
         assert len(scans) == len(twins) == 2 and scans[0].shape == (42, 1, 641)  # the first run is not counted
-        assert np.array_equal(scans[0], scans[1])
-        changed = (scans[0] != twins[0]).mean()
-        assert 0 < changed < 0.5 and scans[0].sum() < twins[0].sum()  # metal is in view
+        assert not np.array_equal(twins[0], twins[1])  # another body and another beam
+        for scan, twin in zip(scans, twins, strict=True):
+            assert 0 < (scan != twin).mean() < 0.5 and scan.sum() < twin.sum()  # metal is in view
     assert asked == [1, 1]
 
 

@@ -27,11 +27,11 @@ def folders(tmp_path):
     return data, results
 
 
-def as_before(results, change):
-    """Make all records those of the version before, with other scores, and their volumes those of these runs."""
+def as_before(results, change, back=1):
+    """Make all records those of a version before, with other scores, and their volumes those of these runs."""
     records = []
     for record in read(results):
-        task = msgspec.structs.replace(record.task, version=VERSION - 1)
+        task = msgspec.structs.replace(record.task, version=VERSION - back)
         found = msgspec.structs.replace(record.found[0], scores={})
         path = results / record.volume
         write_volume(path, read_volume(path), task.identity if change(record) else "another run")
@@ -68,6 +68,10 @@ def test_protocols_that_are_not_named_keep_their_scores(folders):
     for record in (r for r in read(results) if r.task.version == VERSION):
         scores = known[record.label, record.task.part]
         assert record.scores == {name: scores[name] for name in ("soft", "metal") if name in scores}
+    as_before(results, lambda record: True, back=2)  # other protocols may have changed in between
+    assert rescore.main([str(results), str(data), "soft"]) == 1
+    assert not [r for r in read(results) if r.task.version == VERSION]
+    assert rescore.main([str(results), str(data)]) == 0
     with pytest.raises(InputError, match="'sofft': expected protocols among"):
         rescore.main([str(results), str(data), "sofft"])
 

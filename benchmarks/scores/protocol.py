@@ -35,7 +35,7 @@ class Truth:
 
     `tissue` is the judged region of the protocols `tissue` and `aligned`; `judged` is the dilated body. `cut` says that
     both end at the field of view, because the body does not. `kinds` are the metals' labels, 0 elsewhere; None
-    where there is one metal at most.
+    where they are not told, so that all metal is of one kind.
     """
 
     references: dict[str, NDArray[np.float32]]

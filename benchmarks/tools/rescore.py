@@ -3,7 +3,8 @@
     python -m ctsim.benchmarks.tools.rescore results/ data/ [PROTOCOL ...]
 
 Each last record of an older protocol version gets one of the present version with new scores: of the protocols named,
-which are those that the new version changed, or of all; the others keep theirs. Its volume, cost, time
+which are those that the new version changed, or of all; the others keep theirs, which only records of the version
+before may. Its volume, cost, time
 and commit stay those of the run; the details name the commit that scored it again. What has no volume is left out and
 said.
 """
@@ -42,8 +43,9 @@ def main(arguments: list[str]) -> int:
     store, missing = Store(results, FILE, RunRecord, WHAT), 0
     for data in dict.fromkeys(record.task.data for record in shown if record.task.version != VERSION):
         rows = [record for record in shown if record.task.data == data]
-        if data not in scans:
-            sys.stderr.write(f"{rows[0].task.case}: the scan is not in {arguments[1]}\n")
+        if data not in scans or not scans[data].has_truth:
+            why = "was measured: run the methods again" if data in scans else f"is not in {arguments[1]}"
+            sys.stderr.write(f"{rows[0].task.case}: the scan {why}\n")
             missing += len(rows)
             continue
         for record in _scored(rows, scans[data], results, protocols):
@@ -84,9 +86,10 @@ def _again(row: RunRecord, pair: Twin, judge: Judge, results: Path, protocols: S
     result, task = row.found[0], replace(row.task, version=VERSION)
     if result.status not in SCORED:
         return replace(row, task=task)
-    path = _volume_of(row, results)
-    if path is None:
-        sys.stderr.write(f"{row.task.case}: {row.label}, {row.task.part}: the run's volume is not in {results}\n")
+    path, whole = _volume_of(row, results), set(protocols) == set(PROTOCOLS)
+    if path is None or not (whole or row.task.version == VERSION - 1):
+        why = f"the run's volume is not in {results}" if path is None else f"of version {row.task.version}: name none"
+        sys.stderr.write(f"{row.task.case}: {row.label}, {row.task.part}: {why}\n")
         return None
     at_50kev = own_at_50kev(path, row.identity)
     values, mono = read_volume(path), None if at_50kev is None else read_volume(at_50kev)

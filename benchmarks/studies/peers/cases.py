@@ -5,6 +5,7 @@ Times are of whole sweeps over the views. What a contender can prepare once for 
 volumes) is prepared before the clock starts.
 """
 
+import itertools
 import tempfile
 import time
 from collections.abc import Callable
@@ -17,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ctsim.beam.spectrum import Tube
 from ctsim.benchmarks import make_dataset
 from ctsim.benchmarks.cli import quietly
 from ctsim.benchmarks.engine import host
@@ -200,22 +202,24 @@ ROW_BODIES = {"lung": Lung(n_voxel=(104, 104, 104), metal="Fe"), "random": Rando
 def row(setup: Setup, body: str) -> list[Measurement]:
     """Measure one slice in one thread: the scan and its metal-free twin, made and written, and FDK of both.
 
-    One detector row of 641 pixels, a slice of 416². A worker that makes a training set does this again and again.
-    Comes last: the process keeps to one thread from then on.
+    One detector row of 641 pixels, a slice of 416². A worker that makes a training set does this again and again, each
+    time with another body and another beam, for which nothing is prepared. Comes last: the process keeps to one thread.
     """
     scanner = ScannerSettings(preset="ideal", n_views=setup.views, n_detector=(1, 641), n_voxel=(1, 416, 416))
-    scene = Scene(
-        name="row",
-        phantom=ROW_BODIES[body],
-        scanner=scanner,
-        truth=Truth(trace=True),
-        truncated=True,  # a body higher than one row
-        metal_in_view=True,
-    )
-    method = find("fdk")
+    method, number = find("fdk"), itertools.count()
 
     def make(folder: Path) -> None:
-        stored = open_scan(make_scene(scene, folder, force=True))
+        k = next(number)
+        scene = Scene(
+            name=f"row-{k}",
+            phantom=ROW_BODIES[body],
+            scanner=msgspec.structs.replace(scanner, tube=Tube(kvp=90.0 + k)),
+            seed=k,
+            truth=Truth(trace=True),
+            truncated=True,  # a body higher than one row
+            metal_in_view=True,
+        )
+        stored = open_scan(make_scene(scene, folder))
         for scan in (stored, stored.metal_free):
             assert scan is not None  # twins are made by default
             method.reconstruct(scan.scan)
@@ -223,7 +227,8 @@ def row(setup: Setup, body: str) -> list[Measurement]:
     host.use_threads(1)
     with tempfile.TemporaryDirectory(prefix="ctsim-peers-") as folder:
         timed = setup.timed({OURS: lambda: make(Path(folder))})
-    return [msgspec.structs.replace(m, note="one thread of a warm process") for _, m in timed.values()]
+    note = "one thread of a warm process; another body and beam each time"
+    return [msgspec.structs.replace(m, note=note) for _, m in timed.values()]
 
 
 NAMED = (paths, exact, paper, fdk, poly, row)
