@@ -1,4 +1,4 @@
-"""The one error a user can cause."""
+"""The errors that a user can cause."""
 
 
 class InputError(ValueError):
@@ -7,6 +7,10 @@ class InputError(ValueError):
     The commands print the message as one line and exit with code 2; msgspec prefixes the path of
     the key when it is raised while a file is decoded.
     """
+
+
+class Unsuited(InputError):
+    """A method is not made for a scan of this kind, whatever its values: a benchmark skips it instead of failing."""
 
 
 def check_kind(name: str, value: object, kinds: type | tuple[type, ...], expected: str) -> None:

@@ -21,6 +21,8 @@ SAME = 1e-5
 BLOOM = 2.0
 """Distance (mm) to metal within which its blur is replaced, too."""
 NO_CHANGE = (1.0, 0.0)
+PLATEAU = 8
+"""Voxels of the greatest value in one piece from which a CT may be cut off there."""
 AIR = -200.0
 """HU below which a CT has some voxel, of the air around the body; grey values and attenuations have none."""
 
@@ -111,6 +113,25 @@ def read_hu(settled: Settled) -> NDArray[np.float32]:
             f"path: {settled.file.path} holds values that are no finite HU under rescale = {settled.rescale}"
         )
     return hu
+
+
+def cut_off(hu: NDArray[np.float32]) -> int:
+    """Return the size of the largest piece of voxels that have the greatest value, 0 unless a CT is cut off there.
+
+    The brightest of a CT that is not cut off are few, and fewer than those of the next value: a histogram ends with
+    its thinnest bin. One that is cut off ends with all that lay above it.
+    """
+    top = float(hu.max())
+    at_top = hu == top
+    number = int(np.count_nonzero(at_top))
+    if number < PLATEAU or number == hu.size:
+        return 0
+    below = np.max(hu, initial=-np.inf, where=~at_top)
+    if number <= 2 * int(np.count_nonzero(hu == below)):
+        return 0
+    names: Any = ndimage.label(at_top, np.ones((3, 3, 3)))[0]
+    size = int(np.bincount(names.ravel())[1:].max())
+    return size if size >= PLATEAU else 0
 
 
 def without_metal(ct: Ct, metal_hu: float) -> Ct:

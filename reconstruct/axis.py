@@ -22,6 +22,7 @@ SMOOTH = (
 )
 REACH = 0.25  # of the columns: how far off the middle the axis is sought
 COARSE, FINE = 1.0, 0.01  # pixels
+FLAT = 0.5  # of the median cost: with an object the least one is below a tenth, with noise alone above eight tenths
 UNEVEN = 1.5  # ratio of the largest to the smallest step of views above which a turn has a gap
 MOST_ROWS = 32
 
@@ -30,7 +31,8 @@ def axis_shift(scan: Scan) -> float:
     """Return how many columns the axis lies to the right of the detector's middle (−off_detector[1] / d_detector[1]).
 
     The squared differences of opposite rays are weighted with the transmission, so that rays through metal, whose
-    logarithm is all noise, count little. Raises InputError for a scan that is no full turn on a circle.
+    logarithm is all noise, count little. Raises InputError for a scan that is no full turn on a circle, and where
+    opposite rays tell no axis: without an object in view, or with an axis beyond a quarter of the columns.
     """
     geometry = scan.geometry
     order, angles = _turn(geometry)
@@ -39,7 +41,17 @@ def axis_shift(scan: Scan) -> float:
     reach = REACH * geometry.n_detector[1]
     shifts = np.arange(-math.floor(reach), math.floor(reach) + 1) * COARSE
     costs = np.array([model.cost(float(shift)) for shift in shifts])
-    best = float(shifts[int(np.argmin(costs))])
+    least = int(np.argmin(costs))
+    if not costs[least] < FLAT * np.median(costs):
+        raise InputError(
+            "--center auto finds no axis: opposite rays agree as well at any other, as without an object in view; "
+            "expected --center PIXELS"
+        )
+    if least in (0, len(shifts) - 1):
+        raise InputError(
+            f"--center auto finds no axis within {reach:.4g} columns of the detector's middle; expected --center PIXELS"
+        )
+    best = float(shifts[least])
     found: Any = optimize.minimize_scalar(
         model.cost, bounds=(best - COARSE, best + COARSE), method="bounded", options={"xatol": FINE}
     )

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ctsim.errors import InputError
+from ctsim.errors import InputError, Unsuited
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.filters import RAMP, Filter, filter_rows, padded_length, ramp_response
 from ctsim.reconstruct.kernels.backproject_cpu import backproject
@@ -154,7 +154,7 @@ def _planes(geometry: Geometry, rows: slice) -> slice:
 
 def _orbit_weights(geometry: Geometry) -> RayWeights:
     if geometry.poses is not None:
-        raise InputError("FDK needs a circular orbit: give angles_deg or arc_deg instead of poses")
+        raise Unsuited("FDK needs a circular orbit: give angles_deg or arc_deg instead of poses")
     return ray_weights(geometry)
 
 

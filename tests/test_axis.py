@@ -74,6 +74,19 @@ def test_what_has_no_opposite_views_is_refused():
         axis_shift(scan)
 
 
+@pytest.mark.parametrize("photons", [None, 1e4, 50.0])
+def test_images_without_an_object_have_no_axis(photons):
+    with pytest.raises(InputError, match="finds no axis: opposite rays agree as well at any other"):
+        axis_shift(shifted(3.7, (), photons=photons))
+
+
+@pytest.mark.parametrize("beyond", [11.4, -13.0])
+def test_an_axis_at_the_end_of_the_search_is_refused(beyond):
+    """Beyond it the least cost is where the fewest rays are compared."""
+    with pytest.raises(InputError, match="finds no axis within 12 columns"):
+        axis_shift(shifted(beyond, (*BODY, *METAL), photons=1e4))
+
+
 def test_opposite_rays_agree_at_the_axis():
     """At the true shift the costs are left to interpolation: a tenth of those of the mirrored relation of angles."""
     scan = shifted(3.7, BEAN, views=180)

@@ -4,7 +4,9 @@ Every reader gets 500 files: bytes flipped, cut short, shifted, and numbers of t
 """
 
 import gzip
+import io
 import re
+import subprocess
 import sys
 import tracemalloc
 import zlib
@@ -186,6 +188,19 @@ def test_a_deflated_slice_is_not_inflated(tmp_path):
     one.file_meta.TransferSyntaxUID = "1.2.840.10008.1.2.1.99"
     one.save_as(path / "IM37")
     assert "is compressed ('Deflated Explicit VR Little Endian')" in read(path)
+
+
+def test_a_decoder_says_nothing_of_its_own(tmp_path):
+    """tifffile logs what it finds wrong; a process that sets up no logging would print that before our sentence."""
+    whole = io.BytesIO()
+    tifffile.imwrite(whole, corner(), photometric="minisblack")
+    path, code = tmp_path / "ct.tif", "import sys\nfrom ctsim.dataset.arrayfile import read_array\nread_array(PATH)"
+    for cut in (-700, 300):
+        path.write_bytes(whole.getvalue()[:cut])
+        told = code.replace("PATH", f"__import__('pathlib').Path({str(path)!r})")
+        found = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, check=False)
+        *_, last = found.stderr.splitlines()
+        assert found.stderr.startswith("Traceback") and last.startswith(f"ctsim.errors.InputError: {path} ")
 
 
 def test_the_command_ends_with_2(tmp_path, capsys):

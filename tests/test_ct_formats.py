@@ -13,6 +13,7 @@ import pydicom
 import pytest
 import tifffile
 from ct_files import SPACING, corner, oblique, stored, write, write_slices
+from scipy import ndimage
 
 from ctsim.errors import InputError
 from ctsim.io.volumes.formats import open_volume
@@ -343,10 +344,60 @@ def test_metal_of_the_ct_is_refused_or_replaced_never_kept(tmp_path):
     np.save(tmp_path / "ct.npy", hu)
     found = body(tmp_path / "ct.npy", existing_metal="mask", **given)
     assert np.array_equal(found.labels, expected.labels) and np.array_equal(found.density, expected.density)
-    kept = body(tmp_path / "ct.npy", metal_hu=10_000.0, **given)
+    kept = body(tmp_path / "ct.npy", existing_metal="none", **given)
     assert not np.array_equal(kept.density, expected.density)
     np.save(tmp_path / "all.npy", np.full((4, 4, 4), 5000, np.int16))
     refused(tmp_path / "all.npy", "metal_hu: all voxels are above 3000 HU", existing_metal="mask", **given)
+
+
+@pytest.mark.parametrize("to", [500, 1500, 2600])
+@pytest.mark.parametrize("metal", ["refuse", "mask"])
+def test_metal_that_is_cut_off_below_the_limit_is_not_kept(tmp_path, to, metal):
+    """Bone with an implant, blurred as a scanner does, of which the file has lost what is above `to`."""
+    hu = np.full((24, 24, 24), -1000.0)
+    hu[4:20, 4:20, 4:20] = 40
+    hu[8:16, 8:16, 6:18] = 1200
+    bone = ndimage.gaussian_filter(hu, 1.0) + np.random.default_rng(0).normal(0, 20, hu.shape)
+    hu[10:14, 10:14, 8:16] = 9000
+    hu = ndimage.gaussian_filter(hu, 1.0) + np.random.default_rng(0).normal(0, 20, hu.shape)
+    given = {"spacing": (1.0, 1.0, 1.0), "existing_metal": metal}
+    np.save(tmp_path / "ct.npy", np.minimum(hu, to).astype(np.int16))
+    refused(tmp_path / "ct.npy", rf"ends at {to} HU, with \d+ voxels of that value in one piece", **given)
+    np.save(tmp_path / "bone.npy", bone.astype(np.int16))  # 12 bits end above it, and its brightest voxels are few
+    body(tmp_path / "bone.npy", **given)
+
+
+def test_grey_values_of_a_few_levels_end_without_being_cut_off(tmp_path):
+    """A smooth bone in steps of 50 HU: its last level is its thinnest."""
+    z, y, x = np.meshgrid(*[np.linspace(-1, 1, 64)] * 3, indexing="ij")
+    hu = 50 * np.round((2500 * np.exp(-2 * (x * x + y * y + z * z)) - 1000) / 50)
+    np.save(tmp_path / "ct.npy", hu.astype(np.int16))
+    assert np.count_nonzero(hu == hu.max()) > 8
+    body(tmp_path / "ct.npy", spacing=(1.0, 1.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("unit", "scale"), [("mm", 1.0), ("\\u00B5m", 1e-3), ("cm", 10.0), ("pixel", None), ("", None)]
+)
+def test_the_spacing_of_an_imagej_stack_is_the_files(tmp_path, unit, scale, expected):
+    """ImageJ states pixels a unit along x and y, and the unit along z; without one it states nothing."""
+    path, factor = tmp_path / "ct.tif", scale or 1.0
+    z, y, x = (d / factor for d in SPACING)
+    told = {"spacing": z, "axes": "ZYX"} | ({"unit": unit} if unit else {})
+    tifffile.imwrite(path, corner(), imagej=True, resolution=(1 / x, 1 / y), metadata=told)
+    if scale is None:
+        refused(path, "states none")
+        assert np.array_equal(body(path, spacing=SPACING).labels, expected.labels)
+        return
+    assert np.array_equal(body(path).labels, expected.labels)
+    assert np.array_equal(body(path, spacing=SPACING).labels, expected.labels)
+    refused(path, "expected the same or none", spacing=(3.0, 3.0, 3.0))
+
+
+def test_a_name_in_capitals_is_the_same_format(tmp_path, expected):
+    with (tmp_path / "CT.NPY").open("wb") as file:
+        np.save(file, corner())
+    assert np.array_equal(body(tmp_path / "CT.NPY", spacing=SPACING).labels, expected.labels)
 
 
 def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch):

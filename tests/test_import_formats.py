@@ -204,3 +204,19 @@ def test_a_view_for_testing_is_not_reconstructed_from(tmp_path, write):
         assert np.allclose(scan.read(k), P[view], atol=1e-6)
     every = scans.open_scan(write(tmp_path / "all.pickle", P, GEOMETRY, test=tuple(range(len(P))), both=True), "auto")
     assert every.held == () and every.geometry.n_views == len(P)  # nothing else to reconstruct from
+
+
+@pytest.mark.parametrize(("unit", "angles"), [("", False), ("rad", True), ("", True)])
+def test_angles_without_a_unit_that_span_a_turn_in_radians_are_refused(tmp_path, unit, angles):
+    path = scan_files.dxchange(tmp_path / "a.h5", COUNTS, GEOMETRY, FLAT, DARK)
+    with h5py.File(path, "r+") as file:
+        theta = file["exchange/theta"]
+        theta[...] = -GEOMETRY.angles if angles else -np.degrees(GEOMETRY.angles)
+        del theta.attrs["units"]
+        if unit:
+            theta.attrs["units"] = unit
+    if angles and not unit:
+        with pytest.raises(InputError, match=r"'exchange/theta' has no attribute units and spans 6\.02"):
+            scans.open_scan(path)
+        return
+    assert np.allclose(scans.open_scan(path).geometry.angles, GEOMETRY.angles)

@@ -1,6 +1,7 @@
 """A simulated scan in SkyScan's layout comes back with the same counts and geometry, and FDK of it is the same."""
 
 import itertools
+import re
 
 import msgspec
 import numpy as np
@@ -11,6 +12,7 @@ from closed_scans import BODY, GEOMETRY, LEVEL, METAL, counts_of, line_integrals
 from scipy import ndimage
 
 from ctsim.beam.spectrum import Filter, Tube
+from ctsim.benchmarks.export import Flags as Export
 from ctsim.benchmarks.export import work as export
 from ctsim.benchmarks.importing import Flags
 from ctsim.benchmarks.importing.settle import water_path
@@ -121,6 +123,34 @@ def test_shifted_images_are_moved_back(tmp_path):
     assert "shifts of _TS.csv" in " ".join(stored.info.notes)
 
 
+@pytest.mark.parametrize("coding", ["utf-8", "latin-1"])
+def test_a_log_may_write_micrometres_with_their_sign(tmp_path, coding):
+    log = scan_files.skyscan(tmp_path / "scan", COUNTS, GEOMETRY, filter="Al 500 µm")
+    log.write_bytes(log.read_text().replace("(um)", "(µm)").encode(coding))
+    found = scans.open_scan(log)
+    assert found.geometry.d_detector == pytest.approx(GEOMETRY.d_detector)
+    assert found.filters == (Filter(material="Al", thickness=0.5),)
+
+
+@pytest.mark.parametrize("photons", [300, 3000, 100_000])
+def test_the_level_and_the_photons_of_an_open_pixel(tmp_path, photons):
+    """Of few photons a percentile of single pixels is noise: 3.1 deviations above the level, 18 % for 300 photons."""
+    counts = counts_of(line_integrals(GEOMETRY, BODY), photons=photons)
+    info = brought(tmp_path, scan_files.skyscan(tmp_path / "scan", counts, GEOMETRY)).info
+    # 24 strips of 64 pixels have the median of their noise to 2 %, and each strip its own median to a tenth
+    assert 0.85 < info.i0 / photons < 1.15
+    assert not any("open field is the brightest" in note for note in info.notes)
+
+
+@pytest.mark.parametrize("moved", [False, True], ids=["tilted", "shifted"])
+def test_noise_is_that_of_pixels_before_they_are_turned_or_moved(tmp_path, moved):
+    """Interpolation between four pixels leaves a quarter of the noise's variance: four times the photons."""
+    log = scan_files.skyscan(tmp_path / "scan", COUNTS, GEOMETRY, tilt=0.0 if moved else 1.5)
+    if moved:
+        scan_files.shifts(log, np.full((24, 2), 0.5))
+    assert 0.85 < brought(tmp_path, log).info.i0 / 2e5 < 1.15
+
+
 @pytest.mark.parametrize(
     ("text", "sheets"),
     [
@@ -169,6 +199,18 @@ def test_an_axis_that_is_assumed_is_said(tmp_path, capsys):
         assert (assumed in " ".join(stored.info.notes), assumed in capsys.readouterr().out) == (said, said)
     turn = scan_files.skyscan(tmp_path / "turn", COUNTS, GEOMETRY)
     assert assumed not in " ".join(open_scan(bring(Flags(scan=turn, out=tmp_path / "data"))).info.notes)
+
+
+def test_the_axis_is_told_where_a_format_has_no_place_for_it(tmp_path, capsys):
+    """An axis and a grid that Data Exchange does not hold come back by the words that its export prints."""
+    log = scan_files.skyscan(tmp_path / "scan", COUNTS, msgspec.structs.replace(GEOMETRY, off_detector=(0.0, 0.0)))
+    stored = open_scan(bring(Flags(scan=log, out=tmp_path / "data", hold=0, center="2.75")))
+    export.export(Export(scan=stored.folder, out=tmp_path / "scan.h5", to="dxchange"))
+    told = re.search(r"axis is: \+2\.75 columns .* needs (--center 2\.75),", capsys.readouterr().out)
+    assert told
+    center = told[1].split()[1]
+    again = open_scan(bring(Flags(scan=tmp_path / "scan.h5", out=tmp_path / "data", hold=0, center=center)))
+    np.testing.assert_allclose(again.geometry.pose_array(), stored.geometry.pose_array(), atol=1e-9)
 
 
 def test_voxels_that_are_no_cubes_are_said(tmp_path, capsys):

@@ -12,8 +12,10 @@ import scan_files
 from closed_scans import BODY, GEOMETRY, METAL, counts_of, line_integrals
 from PIL import Image
 
+from ctsim.baselines import metal
 from ctsim.benchmarks.importing import Flags
 from ctsim.benchmarks.importing.work import bring
+from ctsim.benchmarks.scores import unreferenced
 from ctsim.benchmarks.scores.judge import Twin
 from ctsim.benchmarks.scores.score import NEED_TRUTH, NO_REFERENCE
 from ctsim.benchmarks.scores.unreferenced import HeldViews, Unreferenced, consistency
@@ -91,12 +93,53 @@ def test_a_measured_scan_is_of_no_code_of_the_simulator(data, smallest, tmp_path
         assert ("other code of the simulator" in caplog.text) == warned
 
 
-def test_a_volume_made_elsewhere_has_no_truth_to_be_scored_with(data, tmp_path):
-    volume = tmp_path / "mine.npy"
-    np.save(volume, np.zeros(open_scan(data / "rods").geometry.n_voxel, np.float32))
-    with pytest.raises(InputError, match="--scene 'rods': is a measured scan, it has no truth"):
-        submit(Submitted(data=data, results=tmp_path / "results", volume=volume, scene="rods", name="mine"))
-    assert not (tmp_path / "results").exists()
+def test_a_volume_made_elsewhere_has_the_scores_that_need_no_truth(data, tmp_path, capsys):
+    """FDK's own volume scores as FDK does; it lies as FDK's does, or is refused."""
+    results, volume = tmp_path / "results", tmp_path / "mine.npy"
+    values = fdk(open_scan(data / "rods").scan).values.numpy()
+    assert main([str(data), str(results), "--method", "fdk"]) == 0
+    given = Submitted(data=data, results=results, volume=volume, scene="rods", name="mine")
+    np.save(volume, values)
+    submitted = submit(given)[0]
+    own = next(r for r in records.read(results) if r.label == "fdk")
+    assert [*submitted.scores] == [NO_REFERENCE]
+    assert submitted.scores[NO_REFERENCE].values == own.scores[NO_REFERENCE].values
+    for wrong, said in ((values[:, :, ::-1], "looks flipped along x"), (10 * values, "looks like 1/cm")):
+        np.save(volume, wrong)
+        with pytest.raises(InputError, match=said):
+            submit(given)
+
+
+def test_a_method_that_is_not_made_for_the_orbit_is_skipped(data, tmp_path):
+    """Views of a walnut that leave the circle: FDK, and what begins with it, cannot use them; SIRT can."""
+    poses = TRUE.pose_array()[::8]
+    poses[:, 2] += np.linspace(0, 3, len(poses))
+    counts = counts_of(line_integrals(msgspec.structs.replace(TRUE, n_views=12), BODY))
+    flat, dark = np.full((1, *TRUE.n_detector), 40000.0), np.zeros((1, *TRUE.n_detector))
+    nut = scan_files.walnut(tmp_path / "nut", counts, poses, flat, dark)
+    bring(Flags(scan=nut, out=tmp_path / "data", n_voxel=16, hold=2))
+    told = [word for name in ("fdk", "limar", "nmar", "cgls") for word in ("--method", name)]
+    assert main([str(tmp_path / "data"), str(tmp_path / "results"), *told, "--set", "cgls.iterations=2"]) == 0
+    found = {r.label.partition("[")[0]: r for r in records.read(tmp_path / "results")}
+    assert {name: r.status for name, r in found.items()} == {
+        "fdk": "skipped", "limar": "skipped", "nmar": "skipped", "cgls": "ok"
+    }  # fmt: skip
+    assert all("needs a circular orbit" in found[name].reason for name in ("fdk", "limar", "nmar"))
+
+
+def test_rays_through_a_doubtful_mask_are_not_outside_the_trace(data, monkeypatch, tmp_path, capsys):
+    """What may be metal is left out of "outside", and no ray counts as in the trace; the screen says what happened."""
+    stored = open_scan(data / "rods")
+    sure = Unreferenced.of(stored).views.regions
+    monkeypatch.setattr(metal, "FACTORS", (1e3, 1e3))  # no metal is that bright
+    found = Unreferenced.of(stored)
+    assert "rays through what is bright" in found.note
+    assert np.array_equal(found.views.regions["outside"], sure["outside"])
+    assert sure["trace"].any() and not found.views.regions["trace"].any()
+    assert main([str(data), str(tmp_path / "results"), "--method", "nmar"]) == 0
+    assert "rods, nmar[mask=auto]: nothing was corrected, for its mask is doubtful" in capsys.readouterr().out
+    monkeypatch.setattr(unreferenced, "SUSPECT", 1e3)
+    assert Unreferenced.of(stored).views.regions["outside"].sum() > sure["outside"].sum()
 
 
 def test_scores_see_what_they_are_for(data):

@@ -2,12 +2,22 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
+from ctsim.benchmarks.make_dataset import main as make_dataset
 from ctsim.benchmarks.scores import placement
 from ctsim.benchmarks.scores.protocol import Truth
+from ctsim.dataset.store import open_scan
 from ctsim.errors import InputError
+from ctsim.reconstruct.fdk import reconstruct as fdk
 
 WATER = 0.02
+HIPS = """
+name = "hip"
+seed = 1
+phantom = { recipe = "hip", metal = "Ti", head = "CoCr", size = 180.0, n_voxel = [85, 85, 85] }
+scanner = { preset = "c-arm", arc_deg = 360.0, n_voxel = [48, 48, 48], n_detector = [72, 72], n_views = 45 }
+"""
 
 
 def body(shape=(12, 14, 16)):
@@ -28,7 +38,7 @@ def truth_of(reference):
 
 
 def check(values, reference, unit="1/mm"):
-    placement.check("mine", values, truth_of(reference), unit, WATER, "--unit")
+    placement.check("mine", values, placement.tissue_of(truth_of(reference)), unit, WATER, "--unit")
 
 
 def noisy(values, size=0.5, seed=0):
@@ -89,10 +99,42 @@ def test_a_negative_is_refused_by_name(negative):
         check(negative(noisy(reference, 0.1)), reference)
 
 
-def test_a_volume_without_content_is_scored():
+@pytest.mark.parametrize("level", [0.0, WATER])
+def test_a_volume_of_one_value_is_refused(level):
     reference = body()
-    check(np.zeros_like(reference), reference)
-    check(np.full_like(reference, WATER), reference)
+    with pytest.raises(InputError, match=f"^mine holds {level:g} in every voxel, expected a reconstruction"):
+        check(np.full_like(reference, level), reference)
+
+
+@pytest.mark.parametrize("values", [lambda v: 1000 * v, lambda v: np.round(255 * v / v.max())])
+def test_what_is_stated_to_be_hu_has_air(values):
+    """1/m, and grey values of 8 bits: their mean is near the reference's as HU, since 0 HU are water."""
+    reference = body()
+    with pytest.raises(InputError, match=r"^mine is not in HU: the air in it has -?[0-9.e-]+, expected -1000"):
+        check(values(noisy(reference, 0.05)), reference, "hu")
+
+
+def nearly_alike(seed):
+    """Return a body that its mirror image differs from by little, with smooth errors that are larger than that."""
+    reference = np.maximum(body(), 0.999 * body()[:, :, ::-1])
+    reference[3:6, 5:8, 2] += 0.3 * WATER
+    errors = ndimage.gaussian_filter(np.random.default_rng(seed).normal(0, 1, reference.shape), 1)
+    return reference, (reference + 0.5 * WATER * errors / errors.std()).astype(np.float32)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_nearly_symmetric_body_tells_how_a_clean_volume_lies(seed):
+    reference, bad = nearly_alike(seed)
+    good = reference + (bad - reference) / 20
+    check(good, reference)
+    with pytest.raises(InputError, match="looks flipped along x"):
+        check(good[:, :, ::-1], reference)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_errors_that_are_larger_than_what_tells_a_body_from_its_image_are_no_flip(seed):
+    reference, bad = nearly_alike(seed)
+    check(bad, reference)
 
 
 def test_a_symmetric_body_has_no_orientation():
@@ -108,3 +150,23 @@ def test_numbers_that_are_not_finite_are_counted():
     values[0, 0, :3] = np.nan
     with pytest.raises(InputError, match=r"^mine has 3 of 2688 voxels that are not finite"):
         check(values, body())
+
+
+@pytest.fixture(scope="module")
+def hips(tmp_path_factory):
+    """Both hips with implants of CoCr and Ti on 48³ voxels: 0.4 % of the variance tells left from right."""
+    folder = tmp_path_factory.mktemp("hips")
+    (folder / "scene.toml").write_text(HIPS, encoding="utf-8")
+    assert make_dataset([str(folder / "scene.toml"), str(folder / "data")]) == 0
+    return open_scan(folder / "data" / "hip")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("twin", [False, True], ids=["metal", "twin"])
+def test_an_uncorrected_hip_is_accepted_as_it_is_and_refused_mirrored(hips, twin):
+    scan = hips.metal_free.scan if twin else hips.scan
+    reference, values = placement.reference_of(hips), fdk(scan).values.numpy()
+    placement.check("mine", values, reference, "1/mm", None)
+    for turn in (turn for turn in placement.TURNS[1:] if turn.order == (0, 1, 2)):
+        with pytest.raises(InputError, match=f"^mine looks {turn.text}:"):
+            placement.check("mine", turn.apply(values), reference, "1/mm", None)

@@ -82,6 +82,13 @@ def _export_scan(given: Flags, stored: StoredScan) -> None:
     write_scan(given.out, given.to, content)
     shape, what = " × ".join(str(n) for n in stored.geometry.shape), LAYOUTS[given.to].content
     sys.stdout.write(f"{given.out}: {shape} {what} (view × v × u) for {given.to}\n")
+    grid = stored.geometry
+    if LAYOUTS[given.to].axis_told and grid.off_detector[1]:
+        axis = -grid.off_detector[1] / grid.d_detector[1]
+        sys.stdout.write(
+            f"The format does not say where the axis is: {axis:+.4g} columns from the detector's middle. "
+            f"make-dataset import needs --center {axis:.4g}, or finds it\n"
+        )
 
 
 def _check_out(out: Path, to: str) -> None:

@@ -65,7 +65,7 @@ class Settled:
         g = self.geometry
         tube = "spectrum unknown" if self.tube is None else f"{self.tube.kvp:g} kV behind {_sheets(self.tube)}"
         held = f", {len(self.held)} more held out" if len(self.held) else ""
-        axis = f"{self.axis + 0.0:+.2f}"  # no -0.00
+        axis = f"{round(self.axis, 2) + 0.0:+.2f}"  # no -0.00
         sizes = [f"{d:.4g}" for d in g.d_voxel]
         size = sizes[0] if len({*sizes}) == 1 else " × ".join(sizes)
         return (
@@ -154,7 +154,7 @@ def _opened(
             notes.append(f"line integrals do not tell the photons: {I0:g} assumed, or --i0")
         return np.full(geometry.n_detector, i0, np.float32), i0, i0
     known = None if scan.flat is None else float(np.median(scan.flat)) - scan.dark
-    found = open_field(scan.read, geometry.n_views, scan.dark, known)
+    found = open_field(scan.stored or scan.read, geometry.n_views, scan.dark, known)
     if not (math.isfinite(found.level) and found.level > 0):
         raise InputError(f"{scan.path} has no reading above its dark level, {scan.dark:g}")
     if found.note:

@@ -1,7 +1,7 @@
 """Whether a volume made elsewhere has the scan's axes and unit: it is compared with the reference, turned every way.
 
 Volumes are [z, y, x]. The reference is clipped at the 99.9 percentile of the tissue, as the data range of `tissue` is,
-so that metal, which no method gets right, does not decide.
+so that metal, which no method gets right, does not decide. A measured scan has none: FDK's volume takes its place.
 """
 
 import itertools
@@ -11,16 +11,23 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.benchmarks.scores.protocol import Truth, tissue_range
+from ctsim.benchmarks.scores.protocol import Truth, tissue_range, truth_of
+from ctsim.dataset.store import StoredScan
 from ctsim.errors import InputError
+from ctsim.reconstruct.fdk import reconstruct as fdk
 
 Unit = Literal["1/mm", "1/cm", "hu"]
 NAMES: dict[Unit, str] = {"1/mm": "1/mm", "1/cm": "1/cm", "hu": "HU"}
 AXES = "zyx"
 MOST = 2_000_000
 """Voxels that are compared; of a larger volume every second, third … along each axis."""
-UNRELATED = 0.1
-"""Share of a volume's error that may look like the difference between the reference and its mirror image by chance."""
+METAL_FROM = 99.5
+"""Percentile of a measured scan's FDK above which there may be metal."""
+TURNED = 0.1
+"""What a volume differs by from its own turned copy agrees to −1 with the reference's where the volume lies right, to
++1 where it is turned; from this value on it is refused."""
+LEAST_AIR = -500.0
+"""HU: the median of what is air lies below in any reconstruction, whatever its streaks and its noise."""
 NEGATIVE = -0.5
 """Correlation with the reference that no reconstruction has by chance, only one of the wrong sign."""
 
@@ -67,18 +74,40 @@ def to_attenuation(values: NDArray[Any], unit: Unit, water: float | None) -> NDA
     return (water * (1 + np.asarray(values, np.float64) / 1000)).astype(np.float32)
 
 
-def check(name: str, values: NDArray[Any], truth: Truth, unit: Unit, water: float | None, option: str = "") -> None:
+def reference_of(stored: StoredScan) -> NDArray[np.float32]:
+    """Return what volumes of a scan are compared with, [z, y, x] in 1/mm."""
+    if stored.has_truth:
+        return tissue_of(truth_of(stored))
+    values = np.nan_to_num(fdk(stored.scan).values.numpy())
+    return np.clip(values, 0, np.percentile(values, METAL_FROM))
+
+
+def tissue_of(truth: Truth) -> NDArray[np.float32]:
+    """Return a truth without its metal, [z, y, x] in 1/mm."""
+    return np.minimum(truth.references["effective"], np.float32(tissue_range(truth, "effective")))
+
+
+def check(
+    name: str,
+    values: NDArray[Any],
+    reference: NDArray[np.float32],
+    unit: Unit,
+    water: float | None,
+    option: str = "",
+) -> None:
     """Raise InputError, a sentence that begins with `name`, for a volume of another shape, unit or orientation.
 
     `values` are as stored, in `unit`. A unit is refused where another one brings both mean and standard deviation
-    nearer to the reference's; `option` names the flag that states it. Numbers that are not finite are refused.
+    nearer to those of the `reference`, in 1/mm; `option` names the flag that states it. HU are refused whose air has
+    none. So are numbers that are not finite, and a volume of one value.
     """
-    shape = truth.metal.shape
+    shape = reference.shape
     if sorted(values.shape) != sorted(shape):
         raise InputError(f"{name} has shape {values.shape}, expected {shape} (z, y, x)")
     if not (finite := np.isfinite(values)).all():
         raise InputError(f"{name} has {int((~finite).sum())} of {values.size} voxels that are not finite")
-    reference = np.minimum(truth.references["effective"], np.float32(tissue_range(truth, "effective")))
+    if (low := values.min()) == values.max():
+        raise InputError(f"{name} holds {float(low):g} in every voxel, expected a reconstruction")
     if (better := _better_unit(values, reference, unit, water)) is not None:
         mean, own = float(reference.mean()), float(values.mean())
         instead = f", or {option} {better}" if option else ""
@@ -87,6 +116,8 @@ def check(name: str, values: NDArray[Any], truth: Truth, unit: Unit, water: floa
             f"expected {NAMES[unit]}{instead}"
         )
     found = to_attenuation(values, unit, water)
+    if unit == "hu" and water is not None:
+        _check_air(name, values, reference, water)
     _check_sign(name, found, reference)
     _check_turn(name, found, reference)
 
@@ -113,6 +144,13 @@ def _distance(one: float, other: float) -> float:
     return abs(math.log(one / other)) if one > 0 and other > 0 else math.inf
 
 
+def _check_air(name: str, values: NDArray[Any], reference: NDArray[np.float32], water: float) -> None:
+    """Refuse HU whose darkest voxels, as many as the reference has of air, are nowhere near −1000."""
+    share = float(np.mean(reference < water / 10))
+    if share and (air := float(np.quantile(values, share / 2))) > LEAST_AIR:
+        raise InputError(f"{name} is not in HU: the air in it has {air:.4g}, expected -1000, or another unit")
+
+
 def _check_sign(name: str, values: NDArray[np.float32], reference: NDArray[np.float32]) -> None:
     """Refuse the negative of a volume."""
     top, few = float(reference.max()), _few(reference)
@@ -126,10 +164,10 @@ def _check_sign(name: str, values: NDArray[np.float32], reference: NDArray[np.fl
 def _check_turn(name: str, values: NDArray[np.float32], reference: NDArray[np.float32]) -> None:
     """Refuse a volume that fits better when it is turned.
 
-    With r the reference, d its difference from its own turned copy and ρ their correlation, a volume r + t·d + e has
-    correlations that differ by (1 − ρ)·c·(2t − 1) for small d: −(1 − ρ)·c where it is right (t = 0), +(1 − ρ)·c where
-    it is turned (t = 1). It is refused from t = ¾ on. A copy that differs from the reference by less than a tenth of
-    the volume's own error says nothing, since errors look like it by chance.
+    Only what a body differs by from its own turned copy tells how it lies; what both share, and errors that a turn
+    leaves as they are, must not count. For a volume v and the reference r, both of mean 0 and norm 1, and their turned
+    copies Tv and Tr, ⟨Tv − v, r⟩ / √((1 − ⟨Tv, v⟩)(1 − ⟨Tr, r⟩)) is −1 for v = r and +1 for Tv = r. It is near 0 where
+    noise, or a body that has no orientation, decides.
     """
     clipped = np.clip(values, 0, float(reference.max()))
     few = _few(reference)
@@ -142,15 +180,13 @@ def _check_turn(name: str, values: NDArray[np.float32], reference: NDArray[np.fl
     own, other = found.get(TURNS[0]), found[best]
     if own is None:  # only turned does it have the shape
         raise InputError(f"{name} has shape {values.shape}, expected {reference.shape} (z, y, x): it is {best.text}")
-    if best == TURNS[0] or other <= 0:
+    copy = _standard(clipped[few])
+    if best == TURNS[0] or other <= 0 or copy is None:
         return
-    back = best.apply(reference)
-    alike = _correlation(back[few], target)
-    error = 1 / other**2 - 1  # square of the volume's error, in units of the reference's variance
-    if 2 * (1 - alike) < UNRELATED**2 * error:
-        return
-    if other - own > other * (1 - alike) / 2:
-        raise InputError(f"{name} looks {best.text}: correlation with the reference {own:.2f}, turned back {other:.2f}")
+    alike = _correlation(best.apply(clipped)[few], copy), _correlation(best.apply(reference)[few], target)
+    turned = (other - own) / math.sqrt(max((1 - alike[0]) * (1 - alike[1]), 1e-12))
+    if turned > TURNED:
+        raise InputError(f"{name} looks {best.text}: correlation with the reference {own:.3f}, turned back {other:.3f}")
 
 
 def _few(reference: NDArray[Any]) -> tuple[slice, ...]:

@@ -33,6 +33,7 @@ COARSE = 1.5  # voxels: standard deviation of the filter that leaves streaks and
 BIN, MOST_BINS = 20.0, 2000  # HU of a bin of the histogram of air; what is beyond ± 20 000 HU counts as that
 MIN_VOXELS = 64
 TRACE_MARGIN = 2  # pixels
+SUSPECT = 2.0  # times water: what is brighter may be metal, also where its mask cannot be relied on
 REGION = (
     "air at least 3 voxels outside the body, the body within 5 mm or 6 voxels (the greater) of the metal and beyond, "
     "and rays of views held out; body and metal are those of FDK without correction"
@@ -67,7 +68,7 @@ class Unreferenced:
     def of(cls, stored: StoredScan, views: object = None) -> "Unreferenced":
         """Find body, metal and air of a measured scan, and read its views held out."""
         scan = stored.scan
-        body, metal, scale, said = _regions(scan)
+        body, metal, suspect, scale, said = _regions(scan)
         field = field_of_view(stored.geometry)
         near_metal = dilate(metal, METAL_MARGIN) if metal.any() else metal
         inside = body & ~near_metal & field
@@ -76,7 +77,7 @@ class Unreferenced:
             distance = np.asarray(ndimage.distance_transform_edt(~metal, sampling=stored.geometry.d_voxel))
             near = inside & (is_near(distance, stored.geometry.d_voxel))
         water = effective_attenuation(stored) or scale
-        found = views if isinstance(views, HeldViews | str) else held_views(stored, metal)
+        found = views if isinstance(views, HeldViews | str) else held_views(stored, metal, suspect)
         notes = [
             f"without a truth these protocols are skipped: {', '.join(NEED_TRUTH)}",
             said,
@@ -137,24 +138,32 @@ class Unreferenced:
         return math.sqrt(max(near - far, 0.0)) * 1000 / self.water
 
 
-def _regions(scan: Scan) -> tuple[Mask, Mask, float, str]:
-    """Return the body and the metal of FDK's volume, water's value in it, and what is to be said of them."""
+def _regions(scan: Scan) -> tuple[Mask, Mask, Mask, float, str]:
+    """Return body, metal, and what may be metal of FDK's volume, water's value in it, and what is to be said of it."""
     try:
         values = np.nan_to_num(fdk(scan).values.numpy())
     except InputError as error:
         nothing = np.zeros(scan.geometry.n_voxel, np.bool_)
-        return nothing, nothing, 0.0, f"body and metal were not found: {error}"
+        return nothing, nothing, nothing, 0.0, f"body and metal were not found: {error}"
     metal = auto_mask(values)
     water = water_value(values)
     dense = values > BODY * water if water > 0 else np.zeros(values.shape, np.bool_)
     body: Mask = np.asarray(ndimage.binary_opening(dense), np.bool_)
-    if not metal.mask.any() or metal.doubt:
-        return body, np.zeros_like(body), water, f"no metal was found: {metal.doubt or 'nothing stands out'}"
-    return body, metal.mask, water, f"{int(metal.mask.sum())} voxels of metal were found"
+    if metal.found:
+        return body, metal.mask, metal.mask, water, f"{int(metal.mask.sum())} voxels of metal were found"
+    nothing = np.zeros_like(body)
+    suspect = metal.mask if (metal.level or 0.0) > SUSPECT * water else nothing
+    said = f"no metal was found: {metal.doubt or 'nothing stands out'}"
+    if suspect.any():
+        said += "; rays through what is bright count neither as outside the trace nor as in it"
+    return body, nothing, suspect, water, said
 
 
-def held_views(stored: StoredScan, metal: Mask) -> HeldViews | str:
-    """Read the views that were held out when the scan was imported, or say why there are none."""
+def held_views(stored: StoredScan, metal: Mask, suspect: Mask) -> HeldViews | str:
+    """Read the views that were held out when the scan was imported, or say why there are none.
+
+    Rays outside the trace are those that pass by all that may be metal, `suspect`.
+    """
     geometry = stored.info.held
     if geometry is None or "held.tif" not in stored.files:
         return "no views were held out"
@@ -171,10 +180,12 @@ def held_views(stored: StoredScan, metal: Mask) -> HeldViews | str:
         e_max=scan.e_max,
     )
     p, unseen = LineIntegrals(views).of(slice(0, geometry.n_views))
-    columns = np.ascontiguousarray(metal.transpose(1, 2, 0), np.float32)
-    trace = forward_columns(columns, geometry) > 0
+    trace, shadow = (
+        forward_columns(np.ascontiguousarray(mask.transpose(1, 2, 0), np.float32), geometry) > 0
+        for mask in (metal, suspect)
+    )
     size = (1, 2 * TRACE_MARGIN + 1, 2 * TRACE_MARGIN + 1)
-    near = ndimage.maximum_filter(trace.astype(np.uint8), size, mode="constant", cval=0) > 0
+    near = ndimage.maximum_filter(shadow.astype(np.uint8), size, mode="constant", cval=0) > 0
     return HeldViews(geometry=geometry, p=p, regions={"outside": ~near & ~unseen, "trace": trace & ~unseen})
 
 

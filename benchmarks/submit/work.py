@@ -15,7 +15,6 @@ from ctsim.benchmarks.engine.study import record_of
 from ctsim.benchmarks.methods import EXTERNAL, TABLE, Method
 from ctsim.benchmarks.scores import placement
 from ctsim.benchmarks.scores.artefact import effective_attenuation
-from ctsim.benchmarks.scores.protocol import truth_of
 from ctsim.benchmarks.studies.methods import study
 from ctsim.benchmarks.studies.methods.attempt import Outcome
 from ctsim.benchmarks.studies.methods.plan import Job, jobs_on
@@ -52,8 +51,6 @@ def submit(given: Flags) -> list[RunRecord]:
     """
     _check(given)
     place, stored = _scan(given)
-    if not stored.has_truth:
-        raise InputError(f"--scene {given.scene!r}: is a measured scan, it has no truth to score a volume with")
     paths = {METAL: given.volume} | ({} if given.twin is None else {TWIN: given.twin})
     if given.twin is not None and stored.metal_free is None:
         raise InputError(f"--twin: the scan {stored.name!r} has no metal-free twin")
@@ -95,7 +92,7 @@ def _scan(given: Flags) -> tuple[int, StoredScan]:
 
 def _checked(files: dict[str, VolumeFile], stored: StoredScan, given: Flags) -> dict[str, NDArray[np.float32]]:
     """Return the volumes in 1/mm, float32 [z, y, x]; refuse what does not fit the scan."""
-    truth, water = truth_of(stored), effective_attenuation(stored)
+    reference, water = placement.reference_of(stored), effective_attenuation(stored)
     found = {}
     for variant, file in files.items():
         stated, grid = file.spacing, stored.geometry.d_voxel
@@ -104,7 +101,7 @@ def _checked(files: dict[str, VolumeFile], stored: StoredScan, given: Flags) -> 
         values = file.values()
         if file.rescale is not None:
             values = values * np.float64(file.rescale[0]) + file.rescale[1]
-        placement.check(str(file.path), values, truth, given.unit, water, "--unit")
+        placement.check(str(file.path), values, reference, given.unit, water, "--unit")
         found[variant] = placement.to_attenuation(values, given.unit, water)
     return found
 

@@ -4,7 +4,9 @@ A compressed file of a megabyte can hold a gigabyte of zeros, and a header can d
 """
 
 import contextlib
+import logging
 import math
+import threading
 import warnings
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -21,6 +23,7 @@ MOST = 2**31  # values: a volume of 1290³, 8.6 GB as float32
 PLAIN, TIMES = 2**28, 100  # bytes, and times the file's own: no CT beyond both decodes to so much
 HEADER = 10_000  # bytes of a .npy header; NumPy makes room for what one declares, up to 4 GB
 LONGEST = 200  # characters of what a decoder says
+LENGTHS = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "µm": 1e-3, "\\u00b5m": 1e-3, "micron": 1e-3, "nm": 1e-6}
 
 
 def read_array(path: Path, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
@@ -30,18 +33,35 @@ def read_array(path: Path, shape: tuple[int, ...] | None = None) -> NDArray[Any]
     numbers of that shape, three-dimensional where none is said, or would decode to more than is plausible.
     """
     with decoding(path, "TIFF stack or .npy array"):
-        return _npy(path, shape) if path.suffix == ".npy" else _tiff(path, shape)
+        return _npy(path, shape) if path.suffix.lower() == ".npy" else _tiff(path, shape)
 
 
 def describe_array(path: Path) -> tuple[tuple[int, int, int], np.dtype[Any]]:
     """Return shape and type of the volume in a TIFF stack or .npy array, decoding nothing; raises as `read_array`."""
     with decoding(path, "TIFF stack or .npy array"):
-        if path.suffix == ".npy":
+        if path.suffix.lower() == ".npy":
             (nz, ny, nx), dtype = _checked_npy(path, None)
         else:
             with _opened_tiff(path) as file:
                 (nz, ny, nx), dtype = _checked_series(path, file.series[0], None)
     return (nz, ny, nx), dtype
+
+
+def stated_spacing(path: Path) -> tuple[float, float, float] | None:
+    """Return the size of the voxels (z, y, x) in mm that an ImageJ TIFF states, None where it states none.
+
+    Raises as `read_array`, and where a size is no length.
+    """
+    with decoding(path, "TIFF stack"), _opened_tiff(path) as file:
+        told, tags = file.imagej_metadata or {}, file.pages[0].tags
+        scale = LENGTHS.get(str(told.get("unit", "")).strip().lower())
+        if scale is None or "XResolution" not in tags or "YResolution" not in tags:
+            return None
+        per_x, per_y = (float(np.divide(*tags[name].value)) for name in ("XResolution", "YResolution"))
+        sizes = float(told.get("spacing", 1.0)), 1 / per_y, 1 / per_x  # ImageJ leaves a spacing of 1 out
+        if not all(math.isfinite(size) and size > 0 for size in sizes):
+            raise InputError(f"{path} states voxels of {sizes} {told['unit']} (z, y, x), expected lengths")
+    return sizes[0] * scale, sizes[1] * scale, sizes[2] * scale
 
 
 def read_image(path: Path, shape: tuple[int, int]) -> NDArray[Any]:
@@ -104,11 +124,36 @@ def _tiff(path: Path, shape: tuple[int, ...] | None) -> NDArray[Any]:
         return np.asarray(series.asarray())
 
 
-def _opened_tiff(path: Path) -> Any:
-    """Open a TIFF file as itself alone: some flavours name other files, which tifffile would open wherever they lie."""
+@contextlib.contextmanager
+def _opened_tiff(path: Path) -> Iterator[Any]:
+    """Open a TIFF file as itself alone: some flavours name other files, which tifffile would open wherever they lie.
+
+    Raises InputError for a file that is cut off between two pages, of which tifffile gives those that are left.
+    """
     import tifffile
 
-    return tifffile.TiffFile(path, is_ome=False, is_mmstack=False, is_ndtiff=False)
+    logger, heard = logging.getLogger("tifffile"), _Heard()
+    logger.addHandler(heard)
+    try:
+        with tifffile.TiffFile(path, is_ome=False, is_mmstack=False, is_ndtiff=False) as file:
+            yield file
+        if any("invalid page offset" in said for said in heard.said):
+            raise InputError(f"{path} ends before its pages do")
+    finally:
+        logger.removeHandler(heard)
+
+
+class _Heard(logging.Handler):
+    """Keeps what is logged in its thread; without a handler logging would print it before our own sentence."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.said: list[str] = []
+        self._thread = threading.get_ident()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.thread == self._thread:
+            self.said.append(record.getMessage())
 
 
 def _checked_series(path: Path, series: Any, shape: tuple[int, ...] | None) -> tuple[tuple[int, ...], np.dtype[Any]]:

@@ -14,7 +14,7 @@ from ctsim.dataset.arrayfile import MOST
 from ctsim.errors import InputError
 from ctsim.geometry import Triple
 from ctsim.materials import attenuation
-from ctsim.phantoms.ct_file import Ct, digest_of, read_hu, settle, without_metal
+from ctsim.phantoms.ct_file import Ct, cut_off, digest_of, read_hu, settle, without_metal
 from ctsim.phantoms.fields import LabelGrid, Shape
 from ctsim.phantoms.inserts import count, diameter, inserts
 from ctsim.phantoms.recipe import REACH, Millimetres, Recipe, assemble
@@ -52,8 +52,9 @@ class CtVolume(Recipe, frozen=True, kw_only=True, tag="ct_volume"):
     """Centres of the inserts (x, y, z) in mm from the middle; without, places in bone are drawn."""
     sha256: str = ""
     """The file's SHA-256, filled in where it is empty; another file is refused."""
-    existing_metal: Literal["refuse", "mask"] = "refuse"
-    """What becomes of metal in the CT itself: the CT is refused, or tissue near the metal takes its place."""
+    existing_metal: Literal["refuse", "mask", "none"] = "refuse"
+    """What becomes of metal in the CT itself: the CT is refused, or tissue near the metal takes its place.
+    "none" says that there is none: whatever is bright is bone."""
     metal_hu: float = 3000.0
     """A voxel above this many HU is metal of the CT; 1000 to 100000. A CT of 12 bits ends at 3071 HU."""
 
@@ -64,8 +65,8 @@ class CtVolume(Recipe, frozen=True, kw_only=True, tag="ct_volume"):
         if self.texture:
             raise InputError("texture: expected none, for a CT volume has a density of its own in every voxel")
         self.within("metal_hu", 1000, 100_000)
-        if self.existing_metal not in ("refuse", "mask"):
-            raise InputError(f'existing_metal must be "refuse" or "mask", got {self.existing_metal!r}')
+        if self.existing_metal not in ("refuse", "mask", "none"):
+            raise InputError(f'existing_metal must be "refuse", "mask" or "none", got {self.existing_metal!r}')
         if self.rescale is not None and not (np.isfinite(self.rescale).all() and self.rescale[0] > 0):
             raise InputError(f"rescale must be a positive slope and an intercept in HU, got {self.rescale}")
         if self.at and self.n_inserts not in (None, len(self.at)):
@@ -99,9 +100,18 @@ def _read(params: CtVolume) -> Ct:
     if (found := digest_of(settled.file)) != params.sha256:
         raise InputError(f"path: {params.path} has the SHA-256 {found}, the scene was made of {params.sha256}")
     ct = Ct(hu=read_hu(settled), spacing=settled.spacing)
+    if params.existing_metal == "none":
+        return ct
+    number = int(np.count_nonzero(ct.hu > params.metal_hu))
+    if not number and (cut := cut_off(ct.hu)):
+        top = float(ct.hu.max())
+        raise InputError(
+            f"path: {params.path} ends at {top:g} HU, with {cut} voxels of that value in one piece, so metal may be "
+            f'cut off there; expected existing_metal = "none" if it is bone, or metal_hu below {top:g} if it is metal'
+        )
     if params.existing_metal == "mask":
         return without_metal(ct, params.metal_hu)
-    if number := int(np.count_nonzero(ct.hu > params.metal_hu)):
+    if number:
         raise InputError(
             f"path: {params.path} holds metal, {number} voxels above metal_hu = {params.metal_hu:g} HU (up to "
             f'{ct.hu.max():.0f}); expected a CT without, existing_metal = "mask", or a higher metal_hu'

@@ -32,7 +32,7 @@ from ctsim.benchmarks.studies.methods.records import METAL, Cost
 from ctsim.benchmarks.studies.methods.volumes import Intermediates, attached, recordable
 from ctsim.dataset.store import StoredScan
 from ctsim.dataset.truth import ScanWithTruth
-from ctsim.errors import InputError
+from ctsim.errors import InputError, Unsuited
 from ctsim.reconstruct.watch import resumed
 from ctsim.simulate import REFERENCE_KEV
 from ctsim.types import Scan, Status, Volume
@@ -193,6 +193,8 @@ def _read_at_50kev(outcome: Outcome, volume: Volume) -> None:
 
 def _failure(error: BaseException) -> Outcome:
     """Return the outcome of a run that raised `error`."""
+    if isinstance(error, Unsuited):
+        return Outcome(status="skipped", reason=str(error))
     # torch has its own error for devices
     out_of_memory = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
     reason = str(error) if isinstance(error, _NoVolume | ProgramError) else describe(error)

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from ctsim.benchmarks.engine.record import OK
 from ctsim.benchmarks.scores.score import (
     AS_RETURNED,
+    LEAST_LOSS,
     MAIN,
     MAIN_ACROSS,
     MAIN_MEASURED,
@@ -132,7 +133,7 @@ def caption(records: Sequence[RunRecord], protocol: str) -> str:
             "Anchored scores s = (e − e_ref)/(e_FDK − e_ref), e_ref from the metal-free scan reconstructed by FDK: "
             "0 as if the metal had never been there, 1 uncorrected. Harm rate: share of scenes with s > 1, "
             "and how many of how many scenes that have a score. There is no score where the metal raises FDK's "
-            "error by less than a tenth."
+            f"error by less than {LEAST_LOSS:.0%}."
         )
     found = [(r, r.scores[protocol]) for r in records if protocol in r.scores and r.run.variant == METAL]
     if not found:

@@ -68,9 +68,11 @@ MOST_FAILURES = 10
 def text(records: Sequence[RunRecord], results: Path, data: Path) -> str:
     """Return the table, what its numbers are, where the rest is, and what to try next."""
     shown = latest(records)
+    told = dict.fromkeys(number for part in _parts(shown) for number in _numbers(part))
     lines = [
-        *textwrap.wrap(". ".join(f"{number.title}: {number.about}" for number in _numbers(shown)) + ".", WIDEST),
+        *textwrap.wrap(". ".join(f"{number.title}: {number.about}" for number in told) + ".", WIDEST),
         *_failures(shown),
+        *_uncorrected(shown),
         *_skipped(shown),
         *remarks(records),
         f"All protocols: {results}/table.md, .csv, .tex; records: {results}/records.jsonl",
@@ -82,7 +84,15 @@ def text(records: Sequence[RunRecord], results: Path, data: Path) -> str:
         f"Next: run-benchmark report {folders}   (a page with the slices of every volume)",
         "      run-benchmark methods   (all methods and their parameters, for --method and --set)",
     ]
-    return overview(shown) + "\n" + "\n".join(map(one_line, lines)) + "\n"
+    tables = "\n".join(overview(part) for part in _parts(shown))
+    return tables + "\n" + "\n".join(map(one_line, lines)) + "\n"
+
+
+def _parts(shown: Sequence[RunRecord]) -> list[list[RunRecord]]:
+    """Split records into those of scans with a truth and those of measured ones, whose numbers are others."""
+    scans = {r.run.scene for r in shown if NO_REFERENCE in r.scores}
+    both = [[r for r in shown if (r.run.scene in scans) == known] for known in (False, True)]
+    return [part for part in both if part] or [[]]
 
 
 def _skipped(shown: Sequence[RunRecord]) -> list[str]:
@@ -97,6 +107,17 @@ def _failures(shown: Sequence[RunRecord]) -> list[str]:
     bad = [f"{r.run.scene} ({r.run.variant}), {r.label}: {r.status} – {r.reason}" for r in shown if r.status != OK]
     more = len(bad) - MOST_FAILURES
     return [*bad[:MOST_FAILURES], *([f"{more} more runs failed or were skipped, see table.md"] if more > 0 else [])]
+
+
+def _uncorrected(shown: Sequence[RunRecord]) -> list[str]:
+    """Name the first runs that corrected nothing, since they found no metal mask to rely on."""
+    said = [
+        f"{r.run.scene}, {r.label}: nothing was corrected, for its mask is doubtful: {reason}"
+        for r in shown
+        if r.run.variant == METAL and (reason := r.details.get("mask_reason"))
+    ]
+    more = len(said) - MOST_FAILURES
+    return [*said[:MOST_FAILURES], *([f"{more} more runs corrected nothing, see records.jsonl"] if more > 0 else [])]
 
 
 def overview(shown: Sequence[RunRecord]) -> str:

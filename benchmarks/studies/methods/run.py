@@ -150,7 +150,7 @@ class Runner:
     def _scored(self, job: Job, outcome: Outcome, judge: Judge | Unreferenced, pair: Twin) -> Result:
         """Score an outcome and write its volume."""
         scores, files, task = {}, {}, job.task
-        if isinstance(judge, Judge) and job.method.program:
+        if job.method.program:
             _refuse_misplaced(outcome, judge, job.stored)
         if outcome.values is not None and outcome.status in SCORED:
             try:
@@ -178,12 +178,14 @@ class Runner:
         )
 
 
-def _refuse_misplaced(outcome: Outcome, judge: Judge, stored: StoredScan) -> None:
+def _refuse_misplaced(outcome: Outcome, judge: Judge | Unreferenced, stored: StoredScan) -> None:
     """Let a program's run fail whose volume has another unit or is turned."""
     if outcome.values is not None and outcome.status in SCORED:
         try:
             water = effective_attenuation(stored)
-            placement.check("the program's volume", outcome.values, judge.truth, "1/mm", water)
+            known = isinstance(judge, Judge)
+            reference = placement.tissue_of(judge.truth) if known else placement.reference_of(stored)
+            placement.check("the program's volume", outcome.values, reference, "1/mm", water)
         except InputError as error:
             outcome.fail("error", str(error))
 

@@ -21,6 +21,7 @@ from ctsim.io.h5file import writing
 from ctsim.io.payload import quoted
 from ctsim.io.scans.scanfile import ScanFile, Stated, grid_of
 
+RADIANS = 2.2 * math.pi  # a turn and what overlaps
 PIECE = 2**28  # bytes of a chunk that is decoded at once
 UNITS = {"mm": 1.0, "m": 1e3, "cm": 10.0, "um": 1e-3, "µm": 1e-3, "nm": 1e-6, "micron": 1e-3, "microns": 1e-3}
 PROJECTION, FLAT, DARK = 0, 1, 2  # NXtomo's image_key
@@ -58,7 +59,7 @@ def open_scan(path: Path, stated: Stated) -> ScanFile:
 def write_scan(path: Path, geometry: Geometry, counts: NDArray[Any], flat: NDArray[np.float32], dark: float) -> None:
     """Write counts [view, v, u], the open field [v, u] and the level `dark` that both include, in Data Exchange.
 
-    The format has no place for a grid, nor for an offset of the detector. Lengths are mm, angles degrees.
+    The format has no place for a grid, nor for the axis, which its readers search. Lengths are mm, angles degrees.
     """
     levels = {"data_white": flat, "data_dark": np.full(flat.shape, dark, np.float32)}
     lengths = {
@@ -168,7 +169,13 @@ def _angles(path: Path, file: h5py.File, name: str, count: int) -> NDArray[np.fl
     values = _values(path, file, name, count)
     if values is None:
         raise InputError(f"{path} has no angles in {quoted(name)}, which such a scan needs")
-    return np.degrees(values) if _unit(file, name).lower().startswith("rad") else values
+    unit, span = _unit(file, name).lower(), float(np.ptp(values))
+    if not unit and math.pi <= span <= RADIANS:
+        raise InputError(
+            f"{path}: {quoted(name)} has no attribute units and spans {span:.4g}, as radians of a turn do; "
+            "expected units of deg or rad"
+        )
+    return np.degrees(values) if unit.startswith("rad") else values
 
 
 def _dxchange(path: Path, file: h5py.File) -> _Found:

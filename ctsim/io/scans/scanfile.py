@@ -28,6 +28,7 @@ class ScanFile:
     `geometry` has a grid that fits the field of view. Views are readings above a pedestal `dark`, to be compared with
     the open field `flat` [v, u]; without one the air next to the object is measured. With `integrals` views are −ln of
     transmissions. `axis_known` says that the file states where the axis is; `filters` is None where they are unknown.
+    `stored` decodes a view as it was read out, where `read` turns or moves it; it may have another order of pixels.
     `held` numbers the views that the format sets apart for testing. `files` is all that is read, with `path`.
     """
 
@@ -42,6 +43,7 @@ class ScanFile:
     axis_known: bool = True
     kvp: float | None = None
     filters: tuple[Filter, ...] | None = None
+    stored: Callable[[int], NDArray[Any]] | None = None
     held: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -84,7 +86,11 @@ def read_text(path: Path) -> str:
     """Read a file of settings. Raises InputError for one too large to be that."""
     if path.stat().st_size > TEXT:
         raise InputError(f"{path} has more than {TEXT} bytes, expected a file of settings")
-    return path.read_bytes().decode("latin-1")
+    content = path.read_bytes()
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
 
 
 def filters_of(text: str) -> tuple[Filter, ...] | None:

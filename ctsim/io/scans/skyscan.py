@@ -23,6 +23,7 @@ from ctsim.io.scans.scanfile import ScanFile, Stated, filters_of, grid_of, numbe
 
 STEP = 0.0005  # degrees by which a log's Rotation Step is rounded
 TURN = 0.005  # degrees of the camera whose correction moves no pixel of 5000 columns by half of it
+MICRONS = tuple(f"image pixel size ({mu}m)" for mu in "µμ")  # a micro sign, and a Greek letter as lower case has it
 DIRECTIONS = {"CC": -1.0, "CCW": -1.0, "CW": 1.0}
 Fields = dict[str, str]
 
@@ -54,6 +55,7 @@ def open_scan(path: Path, stated: Stated) -> ScanFile:
         files=(log, *images, *([] if table is None else [table])),
         geometry=geometry,
         read=_reader(images, (n_v, n_u), angle if abs(angle) > TURN else 0.0, shifts),
+        stored=_reader(images, (n_v, n_u), 0.0, None) if resample else None,
         dtype="float32" if resample else "uint16",
         axis_known=False,
         kvp=kvp or None,
@@ -109,7 +111,7 @@ def _geometry(log: Path, found: Fields, n_detector: tuple[int, int], n_views: in
     dsd = stated.dsd or number(log, found, "camera to source (mm)", "camera to source")
     if not 0 < dso < dsd:
         raise InputError(f"{log} has the source {dso:g} mm from the object and {dsd:g} mm from the camera")
-    pixel = stated.pixel or number(log, found, "image pixel size (um)") / 1000 * dsd / dso
+    pixel = stated.pixel or number(log, found, "image pixel size (um)", *MICRONS) / 1000 * dsd / dso
     if not 0 < pixel < dsd:
         raise InputError(f"{log} has pixels of {pixel:g} mm, expected a positive size")
     word = found.get("rotation direction", "CC").upper()
