@@ -23,6 +23,8 @@ BLOOM = 2.0
 NO_CHANGE = (1.0, 0.0)
 PLATEAU = 8
 """Voxels of the greatest value in one piece from which a CT may be cut off there."""
+LEVELS = 32
+"""Different values from which a volume is a CT that may be cut off, rather than a drawn one."""
 AIR = -200.0
 """HU below which a CT has some voxel, of the air around the body; grey values and attenuations have none."""
 
@@ -127,7 +129,7 @@ def cut_off(hu: NDArray[np.float32]) -> int:
     if number < PLATEAU or number == hu.size:
         return 0
     below = np.max(hu, initial=-np.inf, where=~at_top)
-    if number <= 2 * int(np.count_nonzero(hu == below)):
+    if number <= 2 * int(np.count_nonzero(hu == below)) or np.unique(hu).size < LEVELS:
         return 0
     names: Any = ndimage.label(at_top, np.ones((3, 3, 3)))[0]
     size = int(np.bincount(names.ravel())[1:].max())
