@@ -16,7 +16,7 @@ from torch.utils.data import Dataset
 
 from ctsim.errors import InputError
 from ctsim.human import human_choice
-from ctsim.io.shards import ITEMS, STACKS, Entry, contents, read, shards_of
+from ctsim.io.shards import ITEMS, STACKS, Entry, read, shards_of
 
 AXES = {"z": 0, "y": 1, "x": 2}
 
@@ -27,7 +27,8 @@ class Scans(Dataset[dict[str, torch.Tensor]]):
     Items are "p" (line integrals of the scan), "twin_p" (those of the twin without metal), "trace" (1 where a ray meets
     metal), each [view, v, u]; and "fdk", "twin" (FDK of scan and twin), "reference" (true attenuation, 1/mm), "metal"
     (1 in metal), each [z, y, x]. With `plane`, "z", "y" or "x", a sample is one slice across that axis: volumes become
-    images, and stacks, which go with "z" only, those of a scan of one row, [view, u].
+    images, and stacks, which go with "z" only, those of a scan of one row, [view, u]. Files are compressed by slices
+    across z, so a slice across y or x takes as long as its whole volume.
 
     Nothing is held in memory but the list of scans. Each process opens the files for itself at its first sample, so
     instances can be pickled, and workers of a DataLoader may be forked or spawned.
@@ -35,7 +36,7 @@ class Scans(Dataset[dict[str, torch.Tensor]]):
     Raises
     ------
     InputError
-        When there is no shard, no scan in the split, or a scan lacks an item.
+        When there is no shard, one of a split is missing, no scan is in the split, or a scan lacks an item.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class Scans(Dataset[dict[str, torch.Tensor]]):
             raise InputError(f"items: {unknown[0]!r} is unknown, expected some of {human_choice(ITEMS, unknown[0])}")
         if plane is not None and plane not in AXES:
             raise InputError(f"plane must be 'z', 'y', 'x' or None, got {plane!r}")
-        listed = [(path, entry) for path in shards_of(self.root) for entry in contents(path).scans]
+        listed = [(path, entry) for path, found in shards_of(self.root).items() for entry in found.scans]
         first: dict[str, Path] = {}
         for path, entry in listed:
             if (other := first.setdefault(entry.name, path)) != path:

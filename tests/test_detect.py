@@ -12,7 +12,7 @@ from ctsim.benchmarks.engine.record import latest
 from ctsim.benchmarks.methods import find
 from ctsim.benchmarks.oracles import central_rays
 from ctsim.benchmarks.studies.detect import Flags, measure, suite, tables
-from ctsim.benchmarks.studies.detect.records import Pair
+from ctsim.benchmarks.studies.detect.records import Pair, Seen, Site
 from ctsim.benchmarks.studies.detect.study import Detect
 from ctsim.errors import InputError
 
@@ -57,6 +57,30 @@ def small(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def setup(small) -> measure.Setup:
     return measure.setup(small, "small-hip")
+
+
+def test_the_contrast_to_noise_of_lesions_counts_noise_and_artefacts():
+    """Noise of 0.3 and artefacts of 0.4 that differ between locations, of a contrast of 0.8: 0.8 / 0.5."""
+    rng, n, sites = np.random.default_rng(0), 200, 100
+    at = [Site(at=(k, 0.0, 0.0), group="near", distance_mm=1.0, contrast_hu=20.0) for k in range(sites)]
+    anatomy, artefact = rng.normal(3, 1, sites), rng.normal(0.7, 0.4, sites)
+    artefact = 0.7 + 0.4 * (artefact - artefact.mean()) / artefact.std()
+
+    def seen(values):
+        return Seen(ball=(), slice=(), lesion=tuple(values.tolist()))
+
+    pairs = tuple(
+        Pair(
+            anatomy=seen(anatomy),
+            absent=seen(anatomy + artefact + rng.normal(0, 0.3, sites)),
+            present=seen(anatomy + artefact + 0.8 + rng.normal(0, 0.3, sites)),
+        )
+        for _ in range(n)
+    )
+    told = {"scene": "a", "method": "fdk", "inputs": "", "lost": 0, "reason": "", "sites": tuple(at)}
+    one = tables.Series(**told, pairs=tuple(range(n)), found=pairs)
+    assert one.cnr(range(sites)) == pytest.approx(0.8 / 0.5, rel=0.02)  # 20 000 numbers: 0.5 %, and their mean 0.4 %
+    assert one.cnr([0]) == pytest.approx(0.8 / 0.3, rel=0.25)
 
 
 def test_lesions_change_only_the_rays_through_them(setup, small):

@@ -60,7 +60,8 @@ def folder(tmp_path_factory) -> Path:
 
 def test_every_scan_is_in_one_shard_of_its_split(folder):
     index = read_index(folder / "data")
-    found = {path.name: [e.name for e in shards.contents(path).scans] for path in shards.shards_of(folder / "out")}
+    of = shards.shards_of(folder / "out")
+    found = {path.name: [e.name for e in one.scans] for path, one in of.items()}
     assert sorted(name for names in found.values() for name in names) == sorted(index)
     for path, names in found.items():
         assert len(names) <= 2
@@ -182,6 +183,22 @@ def test_shards_that_are_there_are_kept_and_damaged_ones_made_again(folder, caps
     assert len(shards.contents(first).scans) == 2
 
 
+def test_a_folder_that_lacks_a_shard_is_no_training_set(folder, tmp_path):
+    """An interrupted run leaves some of the shards; scans that come later make more, unknown to the first ones."""
+    shutil.copytree(folder / "out", tmp_path / "out")
+    (lost := next((tmp_path / "out").glob("train-00000.h5"))).rename(tmp_path / "lost.h5")
+    with pytest.raises(InputError, match=r"holds 1 of 2 shards of train; make-dataset shards writes the others"):
+        Scans(tmp_path / "out")
+    (tmp_path / "lost.h5").rename(lost)
+    data, out = str(folder / "data"), str(tmp_path / "out")
+    for path in (tmp_path / "out").glob("train-*.h5"):
+        with h5py.File(path, "r+") as file:  # as if there had been one, or three
+            file.attrs["contents"] = file.attrs["contents"].replace('"of":2', f'"of":{1 if path == lost else 3}')
+    assert main([data, out, "--scans-per-shard", "2"]) == 0
+    assert [shards.contents(p).of for p in sorted((tmp_path / "out").glob("train-*.h5"))] == [1, 2]
+    assert len(Scans(tmp_path / "out")) == 8
+
+
 def test_a_shard_of_other_scans_or_items_is_not_taken_for_one_of_these(folder, tmp_path):
     data, out = str(folder / "data"), tmp_path / "out"
     assert main([data, str(out), "--items", "metal"]) == 0
@@ -198,7 +215,7 @@ def test_a_shard_of_other_scans_or_items_is_not_taken_for_one_of_these(folder, t
 
 def test_a_damaged_array_is_named(folder, tmp_path):
     shutil.copytree(folder / "out", tmp_path / "out")
-    path = next(shards.shards_of(tmp_path / "out"))
+    path = next(iter(shards.shards_of(tmp_path / "out")))
     with h5py.File(path) as file:
         name = shards.contents(path).scans[0].name
         chunk = file[name]["fdk"].id.get_chunk_info(2)
@@ -215,7 +232,7 @@ def test_a_measured_scan_has_what_is_known_of_it(tmp_path):
     few = msgspec.structs.replace(GEOMETRY, n_views=6)
     bring(Flags(scan=scan_files.skyscan(tmp_path / "scan", counts_of(integrals_of(few)), few), out=tmp_path / "data"))
     assert main([str(tmp_path / "data"), str(tmp_path / "out")]) == 0
-    (entry,) = shards.contents(next(shards.shards_of(tmp_path / "out"))).scans
+    (entry,) = shards.contents(next(iter(shards.shards_of(tmp_path / "out")))).scans
     assert {*entry.shapes} == {"p", "fdk"}
     with pytest.raises(InputError, match=r"--items reference: .*data/rods is a measured scan without it"):
         main([str(tmp_path / "data"), str(tmp_path / "none"), "--items", "p", "reference"])

@@ -142,6 +142,28 @@ def test_the_contrast_of_a_vessel_is_the_share_that_is_left(vessel, left):
     assert values["fine_cnr"] == pytest.approx(abs(expected), rel=0.02 + 4 / math.sqrt(2 * n))
 
 
+def test_fine_structures_that_noise_would_decide_have_no_share(vessel):
+    """The vessel at a tenth of its contrast, 16 HU: noise of 100 HU would change the share left by 0.5."""
+    layout = vessel[2]
+    faint = layout.reference.copy()
+    faint[VESSEL] = layout.reference[16, 28, 22] + 0.1 * (faint[VESSEL] - layout.reference[16, 28, 22])
+    less = dataclasses.replace(layout, reference=faint)
+    values = soft_score((faint + 1000) / 1000 * WATER, less).values
+    assert values["fine_contrast"] is None and values["fine_cnr"] is None
+    assert scored(vessel)["fine_contrast"] == pytest.approx(1)
+
+
+def test_edges_of_large_voxels_are_near_metal_too():
+    """Of voxels of 3 mm the centre of a cube of 12 is 18 mm or more from the metal, unless metal is in it."""
+    labels = bodies(rods=((24, 28, 44),))
+    truth = dataclasses.replace(truth_of(labels), d_voxel=(3.0, 3.0, 3.0))
+    edges = soft_layout(labels, truth, NAMES, WATER).edges
+    assert len(edges["near"].corners) and len(edges["far"].corners)
+    centres = edges["near"].corners + 6
+    away = ndimage.distance_transform_edt(labels != 4)[tuple(centres.T)]
+    assert away.min() > 6 and 10 / 3 < away.max() <= 12
+
+
 def test_smooth_noise_has_grain(scan):
     noise = ndimage.gaussian_filter(np.random.default_rng(2).standard_normal(SHAPE), 0.8)
     # neighbours of white noise behind a Gaussian of σ correlate by exp(−1/(4σ²)) = 0.68; without the local mean, less

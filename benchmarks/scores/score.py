@@ -11,7 +11,7 @@ import msgspec
 
 from ctsim.benchmarks.engine.record import OK
 
-VERSION = 9
+VERSION = 10
 """Part of every run's identity; raised when a protocol changes its meaning.
 
 1: tissue, aligned, paper, metal, cost. 2: every method runs on the metal-free twin too, for `artefact`.
@@ -105,8 +105,8 @@ COLUMNS: dict[str, dict[str, Metric]] = {
         "noise_far": Metric("noise far (HU)", 1),
         "grain_near": Metric("noise correlation near", 2),
         "grain_far": Metric("noise correlation far", 2),
-        "mtf50_near": Metric("MTF50 ≤ 10 mm (1/mm)", 3, "max"),
-        "mtf50_far": Metric("MTF50 > 10 mm (1/mm)", 3, "max"),
+        "mtf50_near": Metric("MTF50 near metal (1/mm)", 3, "max"),
+        "mtf50_far": Metric("MTF50 far from it (1/mm)", 3, "max"),
     },
     "structure": {
         "false_bone": Metric("false bone (%)", 2, "min", 100),

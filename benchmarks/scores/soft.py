@@ -24,8 +24,9 @@ RANGE_HU = 1000.0
 """Data range: from −500 to 500 HU."""
 LEAST_CONTRAST = 50.0
 NEAR_EDGE = 10.0
-"""A cube whose centre is at most this far from metal (mm) is near it."""
 CUBE, STRIDE = 12, 6
+"""A cube whose centre is at most `NEAR_EDGE` mm or `CUBE` voxels, the greater, from metal is near it: of large voxels
+hardly a cube of tissue fits in between."""
 MOST_CUBES = 400
 LEAST_CUBES = 8
 LEAST_LIKENESS = 0.05
@@ -34,6 +35,8 @@ SIGMAS = np.array([0.37, 0.45, 0.525, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.3, 1.5, 1
 """Blurs that are tried (σ in voxels); half of the modulation is left by the first at the grid's highest frequency."""
 FINE = 5
 """What a cube of this edge (voxels) does not fit into is a fine structure, such as a vessel."""
+LEAST_POWER = 1e6
+"""HU², summed over fine structures: white noise of 100 HU changes the share that is left by 100/√power, here 0.1."""
 AROUND = 9
 """The contrast of a fine structure is against the mean over a cube of this edge."""
 HIGH_PASS = 5
@@ -125,9 +128,13 @@ def soft_layout(
         pair=pair,
         fine=_fine(reference, truth, classes),
         edges=_edges(reference, truth, distance),
-        pitch=float(np.prod(truth.d_voxel) ** (1 / 3)),
+        pitch=_pitch(truth),
         note=f"soft tissue: {', '.join(classes)}; {told}; water {water:.5g} 1/mm",
     )
+
+
+def _pitch(truth: Truth) -> float:
+    return float(np.prod(truth.d_voxel) ** (1 / 3))
 
 
 def _within(labels: NDArray[Any], mask: Mask, reach: int) -> Mask:
@@ -170,7 +177,7 @@ def _edges(reference: NDArray[np.float64], truth: Truth, distance: NDArray[np.fl
     boxes = (tuple(slice(int(c), int(c) + CUBE) for c in corner) for corner in corners)
     kept = [truth.tissue[box].all() and np.ptp(reference[box]) >= LEAST_CONTRAST for box in boxes]
     found = corners[np.array(kept, np.bool_)]
-    near = distance[tuple((found + CUBE // 2).T)] <= NEAR_EDGE
+    near = distance[tuple((found + CUBE // 2).T)] <= max(NEAR_EDGE, CUBE * _pitch(truth))
     return {
         where: Edges.of(reference, part[:: max(1, -(-len(part) // MOST_CUBES))])
         for where, part in (("near", found[near]), ("far", found[~near]))
@@ -232,8 +239,8 @@ def _fine_structures(hu: NDArray[np.float64], layout: SoftLayout) -> dict[str, f
     Contrast is the deviation from the mean over 9³ voxels, of those in `layout.fine`. The share left is its regression
     on the reference's; 0 is nothing, 1 is all. The RMS of the contrast left over that of the residual is the CNR.
     """
-    none = {"fine_contrast": None, "fine_cnr": None}
-    if int(layout.fine.sum()) < MIN_VOXELS:
+    none: dict[str, float | None] = {"fine_contrast": None, "fine_cnr": None}
+    if not layout.fine.any():
         return {**none}
     weight = ndimage.uniform_filter(layout.fine.astype(np.float64), AROUND)[layout.fine]
     found, true = (
@@ -241,7 +248,7 @@ def _fine_structures(hu: NDArray[np.float64], layout: SoftLayout) -> dict[str, f
         for image in (hu, layout.reference)
     )
     power = float(true @ true)
-    if not power:
+    if power < LEAST_POWER:
         return {**none}
     left = float(found @ true) / power
     residual = float(np.sum((found - left * true) ** 2))

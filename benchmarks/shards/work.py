@@ -35,6 +35,7 @@ class Shard:
     data: Path
     scans: tuple[IndexLine, ...]
     items: tuple[str, ...]
+    of: int
 
 
 def main(argv: list[str]) -> int:
@@ -87,10 +88,11 @@ def _divided(given: Flags) -> Iterator[Shard]:
         by_split.setdefault(line.about.split if line.about and line.about.split else REST, []).append(line)
     data = given.data.resolve()
     for split, lines in by_split.items():
-        for number, first in enumerate(range(0, len(lines), given.scans_per_shard)):
+        starts = range(0, len(lines), given.scans_per_shard)
+        for number, first in enumerate(starts):
             chosen = tuple(lines[first : first + given.scans_per_shard])
             path = given.out.resolve() / f"{split}-{number:05d}.h5"
-            yield Shard(path=path, data=data, scans=chosen, items=given.items)
+            yield Shard(path=path, data=data, scans=chosen, items=given.items, of=len(starts))
 
 
 def _is_there(shard: Shard, form: ModuleType) -> bool:
@@ -102,13 +104,13 @@ def _is_there(shard: Shard, form: ModuleType) -> bool:
     except InputError:
         return False
     same = [(e.name, e.content_hash) for e in found.scans] == [(s.name, s.content_hash) for s in shard.scans]
-    return same and {*found.items} == {*shard.items}
+    return same and {*found.items} == {*shard.items} and found.of <= shard.of  # more scans may have come
 
 
 def write(shard: Shard) -> None:
     """Be the worker: reconstruct a shard's scans and write them."""
     form = load(FORMAT, shard.path)
-    form.write(shard.path, (_scan(shard, line, form) for line in shard.scans), shard.items)
+    form.write(shard.path, (_scan(shard, line, form) for line in shard.scans), shard.items, shard.of)
 
 
 def _scan(shard: Shard, line: IndexLine, form: ModuleType) -> tuple[Any, dict[str, NDArray[Any]], str]:

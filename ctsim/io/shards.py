@@ -38,19 +38,26 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Contents(msgspec.Struct, frozen=True, kw_only=True):
-    """What a shard says of itself; `items` are those that were asked for, none where it was to hold all there are."""
+    """What a shard says of itself; `items` are those that were asked for, none where it was to hold all there are.
+
+    It is one of `of` shards of its split, 0 where that is unknown.
+    """
 
     format: int
     scans: tuple[Entry, ...]
     items: tuple[str, ...] = ()
+    of: int = 0
 
 
 def write(
-    path: Path, scans: Iterable[tuple[Entry, Mapping[str, NDArray[Any]], str]], items: tuple[str, ...] = ()
+    path: Path,
+    scans: Iterable[tuple[Entry, Mapping[str, NDArray[Any]], str]],
+    items: tuple[str, ...] = (),
+    of: int = 0,
 ) -> None:
     """Write a shard of (entry without shapes, arrays by item, scene.toml); it appears whole or not at all.
 
-    `items` are those that were asked for.
+    `items` are those that were asked for, `of` is the number of shards of its split.
     """
     entries = []
     with _folder(path.parent), replacing(path) as new, writing(new) as (file, check):
@@ -64,7 +71,8 @@ def write(
             shapes = {item: array.shape for item, array in arrays.items()}
             entries.append(msgspec.structs.replace(entry, shapes=shapes))
             check()  # before the next scan is reconstructed
-        file.attrs[_CONTENTS] = msgspec.json.encode(Contents(format=FORMAT, scans=tuple(entries), items=items)).decode()
+        found = Contents(format=FORMAT, scans=tuple(entries), items=items, of=of)
+        file.attrs[_CONTENTS] = msgspec.json.encode(found).decode()
 
 
 @contextlib.contextmanager
@@ -100,12 +108,23 @@ def contents(path: Path) -> Contents:
     return found
 
 
-def shards_of(root: Path) -> Iterator[Path]:
-    """Yield the shards of a folder by name. Raises InputError where there are none."""
-    found = sorted(root.glob("*.h5"))
+def shards_of(root: Path) -> dict[Path, Contents]:
+    """Return the shards of a folder by name, and what they hold.
+
+    Raises InputError where there are none, or fewer of a split than there were to be.
+    """
+    found = {path: contents(path) for path in sorted(root.glob("*.h5"))}
     if not found:
         raise InputError(f"{root}: holds no shards (*.h5); make-dataset shards writes them")
-    yield from found
+    splits: dict[str, list[Contents]] = {}
+    for path, one in found.items():
+        splits.setdefault(path.stem.rpartition("-")[0], []).append(one)
+    for split, there in splits.items():
+        if len(there) < (of := max(one.of for one in there)):
+            raise InputError(
+                f"{root}: holds {len(there)} of {of} shards of {split}; make-dataset shards writes the others"
+            )
+    return found
 
 
 def read(file: h5py.File, name: str, item: str, place: tuple[slice | int, ...]) -> NDArray[np.float32]:

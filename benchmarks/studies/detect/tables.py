@@ -35,7 +35,8 @@ TEXT = (
     "artefacts varying it is trained at the other locations and knows the anatomy from the method's volume "
     "without metal: what is left of artefacts hides a lesion, too. In brackets are 95 % intervals over scans, for "
     "these bodies and locations; Δ is the difference from fdk on the same scans. Recovered is the lesion's mean "
-    "contrast over the true one. limar and nmar are told the true metal."
+    "contrast over the true one; CNR is that contrast over the deviation of the same mean without a lesion, over scans "
+    "and locations, so that noise and artefacts both lower it. limar and nmar are told the true metal."
 )
 
 
@@ -65,6 +66,17 @@ class Series:
     def recovered(self, locations: Sequence[int]) -> float:
         """Return the mean contrast of lesions over the true one."""
         return fmean(_mean(self.found, "present", k) - _mean(self.found, "absent", k) for k in locations)
+
+    def cnr(self, locations: Sequence[int]) -> float | None:
+        """Return that contrast over the deviation, over scans and locations, of what is there without a lesion.
+
+        Both are means weighted by the lesion's image, less that of the anatomy, as a share of the true contrast.
+        """
+        where = list(locations)
+        empty = np.stack([np.array(_seen(pair, "absent").lesion)[where] for pair in self.found])
+        empty -= np.stack([np.array(_seen(pair, "anatomy").lesion)[where] for pair in self.found])
+        deviation = float(empty.std())
+        return self.recovered(where) / deviation if deviation else None
 
     def _of(self, name: str, shape: str, *, less_anatomy: bool) -> np.ndarray:
         rows = [np.array(getattr(_seen(pair, name), shape)) for pair in self.found]
@@ -158,7 +170,7 @@ def summary(listed: Sequence[Series]) -> list[Table]:
     """Return the table of all scenes and methods, near metal and far from it."""
     titles = [
         "scene", "lesions", "method", "inputs", "AUC, artefacts varying", "Δ, artefacts varying",
-        "AUC, artefacts known", "Δ, artefacts known", "recovered", "s",
+        "AUC, artefacts known", "Δ, artefacts known", "recovered", "CNR", "s",
     ]  # fmt: skip
     bases, rows = _bases(listed), []
     for scene in dict.fromkeys(one.scene for one in listed):
@@ -174,7 +186,9 @@ def _row(one: Series, group: Group, base: Series | None) -> list[str]:
     varying = _Measure(observer=varying_background, group=group, less_anatomy=True).cells(one, base)
     known = _Measure(observer=known_background, group=group).cells(one, base)
     where = one.locations(group)
-    share = f"{one.recovered(where):.2f}" if one.found and where else "–"
+    known_lesions = bool(one.found and where)
+    share = f"{one.recovered(where):.2f}" if known_lesions else "–"
+    cnr = one.cnr(where) if known_lesions else None
     seconds = [s for pair in one.found for s in sum(pair.seconds.values(), ())]
     return [
         one.scene,
@@ -184,6 +198,7 @@ def _row(one: Series, group: Group, base: Series | None) -> list[str]:
         *varying,
         *known,
         share,
+        "–" if cnr is None else f"{cnr:.2f}",
         f"{median(seconds):.2f}" if seconds else "–",
     ]
 
