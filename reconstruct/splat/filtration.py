@@ -58,9 +58,9 @@ class Filtration:
 
     @property
     def sentence(self) -> str:
-        """Say that the scan does not tell its beam, or that the softest one explains it best, or nothing.
+        """Say that the scan does not tell its beam, or that its beam may lie beyond those tried, or nothing.
 
-        The hardest is no such limit: hard beams differ little.
+        Hard beams differ little, so the hardest are often plausible; a nearly round body may yet be behind a soft one.
         """
         if not self.misfits:
             return ""
@@ -68,6 +68,12 @@ class Filtration:
             return (
                 f"the scan does not tell its beam (round bodies do not): {self.low:g} to {self.high:g} mm Al explain "
                 'it alike; `filtration` or the response "known" tells it'
+            )
+        if self.high >= TRIED[-1]:
+            return (
+                f"the scan tells no upper limit of its filtration: {self.low:g} to {self.high:g} mm Al explain it alike, "
+                "and no more was tried; a nearly round body may be behind less; `filtration` or the response "
+                '"known" tells it'
             )
         if min(self.misfits, key=lambda t: self.misfits[t]) != FILTER[0]:
             return ""
