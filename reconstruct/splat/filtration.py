@@ -71,8 +71,8 @@ class Filtration:
             )
         if self.high >= TRIED[-1]:
             return (
-                f"the scan tells no upper limit of its filtration: {self.low:g} to {self.high:g} mm Al explain it alike, "
-                "and no more was tried; a nearly round body may be behind less; `filtration` or the response "
+                f"the scan tells no upper limit of its filtration: {self.low:g} to {self.high:g} mm Al explain it "
+                "alike, and no more was tried; a nearly round body may be behind less; `filtration` or the response "
                 '"known" tells it'
             )
         if min(self.misfits, key=lambda t: self.misfits[t]) != FILTER[0]:
