@@ -20,8 +20,8 @@ from ctsim.tracer.project import Tracer
 from ctsim.types import Phantom, Scan
 
 PEAK, HALF, SMALLEST = 0.25, 0.5, 8  # of the maximum; of the metal's value; voxels
-FACTORS = (8.0, 1.5)  # metal must exceed this many times water, and this many times the body's 99.9th percentile
-SHARE, PLAIN = 0.5, 0.75  # at most this share of the mask may lie below three quarters of the metal's value
+TISSUE, METAL = 5.0, 7.0  # times water: what no tissue exceeds over 3³ voxels, and what metal reaches somewhere
+APART = 1.5  # times the body's 99.9th percentile, which metal must exceed
 THINNEST = 0.05  # length in metal, in voxels, from which a pixel belongs to the trace
 
 Mask = Annotated[str, about("where the metal is: oracle (the scan's own), auto (found), a TIFF or a .npy file")]
@@ -96,33 +96,43 @@ def _read(path: Path, shape: tuple[int, ...]) -> NDArray[np.bool_]:
 def auto_mask(volume: NDArray[np.float32]) -> Metal:
     """Find metal in an uncorrected reconstruction [z, y, x] in 1/mm.
 
-    The metal's value is the 90th percentile of what exceeds a quarter of the maximum; half of it is the threshold.
-    Components of fewer than 8 voxels are dropped, holes filled. A fixed multiple of water does not serve: the
-    best was 20 for Fe, 10 for Ti and 4 for Al. Where the metal does not stand out from the densest of the body
-    the mask is doubted, since correcting next to bone does more harm than leaving it; so it is where most of it is
-    far from the metal's value (0.64 of the mask where enamel was in it, 0.08 and 0.17 with Fe and Al alone).
+    The metal's value is the 90th percentile of what exceeds a quarter of the maximum. Half of it is the threshold, for
+    the best multiple of water was 20 for Fe and 10 for Ti, but at least 5 times water, since enamel is nearly that.
+    Pieces that nowhere reach 7 times water, averaged over 3³ voxels, are tissue (a jaw without metal has 6.4 in single
+    voxels), those of fewer than 8 voxels noise; holes are filled. Where nothing is left, or the metal does not stand
+    out from the densest of the body, the mask is doubted, since correcting next to bone does more harm than leaving
+    it: then it holds what exceeds half of the value. Aluminium, of 2 to 5 times water, is not found.
     """
     top = float(volume.max(initial=0.0))
     if not np.isfinite(volume).all() or top <= 0:
         return Metal(mask=np.zeros(volume.shape, bool), source="auto", doubt="the reconstruction has no finite maximum")
     level = float(np.percentile(volume[volume > PEAK * top], 90))
-    mask = volume > HALF * level
-    names, n = pieces(mask)
-    sizes = np.bincount(names.ravel(), minlength=n + 1)
-    sizes[0] = 0
-    mask = filled(sizes[names] >= SMALLEST)
     water = water_value(volume)
+    mask = _pieces_above(volume, max(HALF * level, TISSUE * water), METAL * water)
+    if not mask.any():
+        doubt = (
+            f"nothing reaches {METAL:g} times water (single voxels {top / water:.1f})" if water else "there is no water"
+        )
+        return Metal(mask=_pieces_above(volume, HALF * level, 0.0), source="auto", doubt=doubt, level=level)
     body = volume[(volume > 0.5 * water) & ~dilate(mask, 2, corners=True)]
     dense = float(np.percentile(body, 99.9)) if body.size else 0.0
-    below = float(np.mean(volume[mask] < PLAIN * level)) if mask.any() else 0.0
+    found = float(np.percentile(volume[mask], 90))
     doubt = ""
-    if below > SHARE:
-        doubt = f"{below:.0%} of the mask lie below {PLAIN:g} of the metal's value: dense tissue is in it"
-    elif level < FACTORS[0] * water:
-        doubt = f"the metal's value is {level / water:.1f} times water, expected {FACTORS[0]:g} times or more"
-    elif level < FACTORS[1] * dense:
-        doubt = f"the metal's value is {level / dense:.2f} times the body's densest, expected {FACTORS[1]:g} or more"
-    return Metal(mask=mask, source="auto", doubt=doubt, level=level)
+    if found < APART * dense:
+        doubt = f"the metal's value is {found / dense:.2f} times the body's densest, expected {APART:g} or more"
+    return Metal(mask=mask, source="auto", doubt=doubt, level=found)
+
+
+def _pieces_above(volume: NDArray[np.float32], threshold: float, peak: float) -> NDArray[np.bool_]:
+    """Return what exceeds a threshold in pieces of 8 voxels or more that somewhere reach a peak over 3³ voxels."""
+    names, n = pieces(volume > threshold)
+    sizes = np.bincount(names.ravel(), minlength=n + 1)
+    kept = sizes >= SMALLEST
+    kept[0] = False
+    if peak > 0 and n:
+        highest = scipy.ndimage.maximum(scipy.ndimage.uniform_filter(volume, 3), names, np.arange(n + 1))
+        kept &= np.asarray(highest) >= peak
+    return filled(kept[names])
 
 
 def water_value(volume: NDArray[np.float32]) -> float:

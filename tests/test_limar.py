@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
 from ctsim.baselines import bhc, limar, nmar, prior
 from ctsim.baselines.inpaint import Filled, fill, harmonic
@@ -167,7 +168,30 @@ def test_the_guard_fires_on_aluminium_beside_bone():
     assert metal.doubt and not metal.found
     volume = limar.reconstruct(scan, mask="auto")
     assert torch.equal(volume.values, first.values)
-    assert volume.status is Status.OK and not volume.reason and "times" in volume.details["mask_reason"]
+    assert volume.status is Status.OK and not volume.reason and "times water" in volume.details["mask_reason"]
+
+
+def toothed(*rods):
+    """Return a smooth body of water with enamel of 4.8 times water and rods of given multiples of it; and the rods."""
+    z, y, x = np.meshgrid(*[np.arange(48) - 23.5] * 3, indexing="ij")
+    values, metal = np.where(np.hypot(x, y) < 20, 0.02, 0.0), np.zeros(x.shape, bool)
+    values[np.abs(z) < 10] *= np.where(np.hypot(x + 10, y) < 5, 4.8, 1)[np.abs(z) < 10]
+    for (at_x, at_y), times in rods:
+        inside = (np.hypot(x - at_x, y - at_y) < 3) & (np.abs(z) < 8)
+        values[inside], metal = 0.02 * times, metal | inside
+    noise = np.random.default_rng(0).normal(0, 0.002, x.shape)
+    return (ndimage.gaussian_filter(values, 0.7) + noise).astype(np.float32), metal
+
+
+def test_the_automatic_mask_finds_two_metals_and_no_enamel():
+    """Titanium next to enamel, and a metal of nearly twice its value: half of the latter is below the former."""
+    values, metal = toothed(((8, 6), 16.0), ((8, -8), 9.5), ((-10, 6), 9.5))
+    found = auto_mask(values)
+    assert not found.doubt
+    # half a voxel around rods of six voxels across: (3.5 / 3)² of their volume
+    assert 2 * (found.mask & metal).sum() / (found.mask.sum() + metal.sum()) > 0.85
+    alone, _ = toothed()
+    assert auto_mask(alone).doubt.startswith("nothing reaches 7 times water")
 
 
 def test_the_automatic_mask_finds_iron(iron):

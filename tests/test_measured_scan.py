@@ -131,7 +131,7 @@ def test_rays_through_a_doubtful_mask_are_not_outside_the_trace(data, monkeypatc
     """What may be metal is left out of "outside", and no ray counts as in the trace; the screen says what happened."""
     stored = open_scan(data / "rods")
     sure = Unreferenced.of(stored).views.regions
-    monkeypatch.setattr(metal, "FACTORS", (1e3, 1e3))  # no metal is that bright
+    monkeypatch.setattr(metal, "METAL", 1e3)  # no metal is that bright
     found = Unreferenced.of(stored)
     assert "rays through what is bright" in found.note
     assert np.array_equal(found.views.regions["outside"], sure["outside"])
