@@ -24,7 +24,7 @@ from ctsim.benchmarks.studies.methods.study import main
 from ctsim.benchmarks.studies.methods.volumes import map_volume
 from ctsim.benchmarks.submit import Flags as Submitted
 from ctsim.benchmarks.submit.work import submit
-from ctsim.dataset.store import open_scan
+from ctsim.dataset.store import list_scans, open_scan
 from ctsim.errors import InputError
 from ctsim.reconstruct.fdk import reconstruct as fdk
 from ctsim.reports import report
@@ -125,6 +125,10 @@ def test_a_method_that_is_not_made_for_the_orbit_is_skipped(data, tmp_path):
         "fdk": "skipped", "limar": "skipped", "nmar": "skipped", "cgls": "ok"
     }  # fmt: skip
     assert all("needs a circular orbit" in found[name].reason for name in ("fdk", "limar", "nmar"))
+    [scene] = list_scans(tmp_path / "data")
+    np.save(tmp_path / "mine.npy", np.random.default_rng(0).normal(size=open_scan(scene).geometry.n_voxel))
+    given = {"data": tmp_path / "data", "results": tmp_path / "results", "scene": scene.name, "name": "mine"}
+    assert [*submit(Submitted(**given, volume=tmp_path / "mine.npy"))[0].scores] == [NO_REFERENCE]
 
 
 def test_rays_through_a_doubtful_mask_are_not_outside_the_trace(data, monkeypatch, tmp_path, capsys):
@@ -137,7 +141,7 @@ def test_rays_through_a_doubtful_mask_are_not_outside_the_trace(data, monkeypatc
     assert np.array_equal(found.views.regions["outside"], sure["outside"])
     assert sure["trace"].any() and not found.views.regions["trace"].any()
     assert main([str(data), str(tmp_path / "results"), "--method", "nmar"]) == 0
-    assert "rods, nmar[mask=auto]: nothing was corrected, for its mask is doubtful" in capsys.readouterr().out
+    assert "rods, nmar[mask=auto]: its metal mask is doubtful and was not used" in capsys.readouterr().out
     monkeypatch.setattr(unreferenced, "SUSPECT", 1e3)
     assert Unreferenced.of(stored).views.regions["outside"].sum() > sure["outside"].sum()
 

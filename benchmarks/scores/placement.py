@@ -75,9 +75,14 @@ def to_attenuation(values: NDArray[Any], unit: Unit, water: float | None) -> NDA
 
 
 def reference_of(stored: StoredScan) -> NDArray[np.float32]:
-    """Return what volumes of a scan are compared with, [z, y, x] in 1/mm."""
+    """Return what volumes of a scan are compared with, [z, y, x] in 1/mm.
+
+    It is a constant, with which nothing but the shape compares, where a measured scan has no FDK.
+    """
     if stored.has_truth:
         return tissue_of(truth_of(stored))
+    if stored.geometry.poses is not None:
+        return np.ones(stored.geometry.n_voxel, np.float32)
     values = np.nan_to_num(fdk(stored.scan).values.numpy())
     return np.clip(values, 0, np.percentile(values, METAL_FROM))
 

@@ -72,7 +72,7 @@ def text(records: Sequence[RunRecord], results: Path, data: Path) -> str:
     lines = [
         *textwrap.wrap(". ".join(f"{number.title}: {number.about}" for number in told) + ".", WIDEST),
         *_failures(shown),
-        *_uncorrected(shown),
+        *_unmasked(shown),
         *_skipped(shown),
         *remarks(records),
         f"All protocols: {results}/table.md, .csv, .tex; records: {results}/records.jsonl",
@@ -109,15 +109,15 @@ def _failures(shown: Sequence[RunRecord]) -> list[str]:
     return [*bad[:MOST_FAILURES], *([f"{more} more runs failed or were skipped, see table.md"] if more > 0 else [])]
 
 
-def _uncorrected(shown: Sequence[RunRecord]) -> list[str]:
-    """Name the first runs that corrected nothing, since they found no metal mask to rely on."""
+def _unmasked(shown: Sequence[RunRecord]) -> list[str]:
+    """Name the first runs that found no metal mask to rely on."""
     said = [
-        f"{r.run.scene}, {r.label}: nothing was corrected, for its mask is doubtful: {reason}"
+        f"{r.run.scene}, {r.label}: its metal mask is doubtful and was not used: {reason}"
         for r in shown
         if r.run.variant == METAL and (reason := r.details.get("mask_reason"))
     ]
     more = len(said) - MOST_FAILURES
-    return [*said[:MOST_FAILURES], *([f"{more} more runs corrected nothing, see records.jsonl"] if more > 0 else [])]
+    return [*said[:MOST_FAILURES], *([f"{more} more runs used no mask, see records.jsonl"] if more > 0 else [])]
 
 
 def overview(shown: Sequence[RunRecord]) -> str:
