@@ -1,7 +1,8 @@
 """What each thing that a simulation shares with a method gave whom, as a table.
 
     make-dataset assumptions data/
-    run-benchmark data/ results/ --method fdk --method nmar --method ibhc --method fista-tv --method splat
+    run-benchmark data/ results/ --method hull --method twin-fdk --method fdk --method nmar
+    run-benchmark data/ results/ --method ibhc --method fista-tv --method splat
     python -m ctsim.benchmarks.tools.assumptions results/ docs/measured
 
 The scenes of the suite `assumptions` are "OBJECT-FAVOUR"; "OBJECT-strict" grants no method anything. A cell is what a
