@@ -20,7 +20,7 @@ from ctsim.tracer.project import Tracer
 from ctsim.types import Phantom, Scan
 
 PEAK, HALF, SMALLEST = 0.25, 0.5, 8  # of the maximum; of the metal's value; voxels
-TISSUE, METAL = 5.0, 7.0  # times water: what no tissue exceeds over 3³ voxels, and what metal reaches somewhere
+TISSUE, METAL = 5.0, 7.0  # times water: the least threshold, and what a piece of metal reaches over 3³ voxels
 APART = 1.5  # times the body's 99.9th percentile, which metal must exceed
 THINNEST = 0.05  # length in metal, in voxels, from which a pixel belongs to the trace
 

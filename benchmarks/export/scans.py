@@ -62,7 +62,7 @@ def write_scan(out: Path, to: str, scan: Measured) -> None:
         raise InputError(
             f"--to {to}: its rays know no offset of the detector, but off_detector is {geometry.off_detector} mm"
         )
-    if not layout.off_origin and not layout.axis_told and any(geometry.off_origin):
+    if not layout.off_origin and any(geometry.off_origin):
         raise InputError(f"--to {to}: its volume is centred on the axis, but off_origin is {geometry.off_origin} mm")
     if layout.square and geometry.d_voxel[1] != geometry.d_voxel[2]:
         raise InputError(f"--to {to}: its voxels are square in x and y, but d_voxel is {geometry.d_voxel} mm (z, y, x)")
@@ -284,7 +284,7 @@ class Layout:
     """A library's layout: how it is written, and which geometries it can hold.
 
     `file` is how its name ends where it is one file, "" for a folder. `content` are its readings. `truth` says that it
-    holds the true volume. With `axis_told` it has no place for the axis and the grid, which its readers ask for.
+    holds the true volume. With `axis_told` it has no place for the axis, which its readers ask for, nor for a grid.
     """
 
     write: Callable[[Path, Measured], None]
@@ -305,7 +305,5 @@ LAYOUTS = {
     "leap": Layout(write=_leap, square=True),
     "r2": Layout(write=_r2, off_detector=False, truth=True),
     "naf": Layout(write=_naf, file=".pickle", off_origin=False, truth=True),
-    "dxchange": Layout(
-        write=_dxchange, file=".h5", content="counts", off_detector=False, off_origin=False, axis_told=True
-    ),
+    "dxchange": Layout(write=_dxchange, file=".h5", content="counts", off_detector=False, axis_told=True),
 }

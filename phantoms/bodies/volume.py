@@ -27,6 +27,7 @@ FROM_HU = (-900.0, -250.0, -20.0, 200.0)
 WIDEST = 4.0  # mm: in a cube of 60 mm and above an insert's diameter, for implants do not grow with the body
 FEW, EACH = 2**24, 64
 """Places to interpolate at: always allowed, and of each of the file's voxels, 4³ where it is as large as a label."""
+LEAST_METAL = 1000  # HU: the least metal_hu, for bone lies below
 LENGTH = 3.0  # of an insert, in its diameters
 
 
@@ -64,7 +65,7 @@ class CtVolume(Recipe, frozen=True, kw_only=True, tag="ct_volume"):
         self.within("kev", 20, 200)
         if self.texture:
             raise InputError("texture: expected none, for a CT volume has a density of its own in every voxel")
-        self.within("metal_hu", 1000, 100_000)
+        self.within("metal_hu", LEAST_METAL, 100_000)
         if self.existing_metal not in ("refuse", "mask", "none"):
             raise InputError(f'existing_metal must be "refuse", "mask" or "none", got {self.existing_metal!r}')
         if self.rescale is not None and not (np.isfinite(self.rescale).all() and self.rescale[0] > 0):
@@ -105,9 +106,10 @@ def _read(params: CtVolume) -> Ct:
     number = int(np.count_nonzero(ct.hu > params.metal_hu))
     if not number and (cut := cut_off(ct.hu)):
         top = float(ct.hu.max())
+        masked = f"metal_hu below {top:g} if it is metal" if top > LEAST_METAL else "a CT that is not cut off"
         raise InputError(
             f"path: {params.path} ends at {top:g} HU, with {cut} voxels of that value in one piece, so metal may be "
-            f'cut off there; expected existing_metal = "none" if it is bone, or metal_hu below {top:g} if it is metal'
+            f'cut off there; expected existing_metal = "none" if it is bone, or {masked}'
         )
     if params.existing_metal == "mask":
         return without_metal(ct, params.metal_hu)
