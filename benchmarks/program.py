@@ -7,6 +7,7 @@ is a copy, apart from the data. The words of the command are passed as they are;
 
 import hashlib
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -29,6 +30,7 @@ from ctsim.types import Scan, Volume
 COMMAND, USAGE = "command", "usage"
 SAID = "said"  # file of what a program prints
 SCAN, OUT, MASK = "{scan}", "{out}", "{mask}"
+NAMED = re.compile(r"\{[a-z_]+\}")  # what looks like one of them
 LONGEST = 200  # characters of what a program says that a reason repeats
 KNOWN = tuple(end for format in FORMATS.values() for end in format.suffixes)
 
@@ -51,7 +53,8 @@ class ProgramError(InputError):
 def words_of(command: str) -> list[str]:
     """Split a command into its words, by the rules of a shell for quotes and backslashes.
 
-    Raises InputError for a command without {scan} or {out}, with open quotes, or with a program that is not there.
+    Raises InputError for a command without {scan} or {out}, with another name in braces, with open quotes, or with a
+    program that is not there.
     """
     try:
         words = shlex.split(command)
@@ -60,6 +63,9 @@ def words_of(command: str) -> list[str]:
     for place, what in ((SCAN, "the scan's folder"), (OUT, "the volume to be written")):
         if not any(place in word for word in words[1:]):
             raise InputError(f"--method cmd:{command}: expected {place} among its arguments, which stands for {what}")
+    for unknown in NAMED.findall(" ".join(words)):
+        if unknown not in (SCAN, OUT, MASK):
+            raise InputError(f"--method cmd:{command}: expected {SCAN}, {OUT} or {MASK}, got {unknown}")
     if shutil.which(words[0]) is None:
         raise InputError(f"--method cmd:{command}: there is no program {words[0]!r} that can be run")
     return words
