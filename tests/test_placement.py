@@ -18,6 +18,18 @@ seed = 1
 phantom = { recipe = "hip", metal = "Ti", head = "CoCr", size = 180.0, n_voxel = [85, 85, 85] }
 scanner = { preset = "c-arm", arc_deg = 360.0, n_voxel = [48, 48, 48], n_detector = [72, 72], n_views = 45 }
 """
+CUP = """
+name = "cup"
+seed = 1
+phantom = { recipe = "metal_rods", metal = "Al6061", n_voxel = [113, 113, 113], size = 120.0, insert_mm = 28.0 }
+
+[scanner]
+preset = "dental"
+tube = { kvp = 50.0, filters = [{ material = "Al", thickness = 2.5 }] }
+n_voxel = [48, 48, 48]
+n_detector = [72, 72]
+n_views = 45
+"""
 
 
 def body(shape=(12, 14, 16)):
@@ -114,6 +126,54 @@ def test_what_is_stated_to_be_hu_has_air(values):
         check(values(noisy(reference, 0.05)), reference, "hu")
 
 
+@pytest.mark.parametrize("factor", [1000, 255 / 0.04])
+def test_what_is_in_no_known_unit_is_offered_none(factor):
+    """1/m and grey values of 8 bits: stated as 1/mm they are nearer to HU, which they are not."""
+    reference = body()
+    with pytest.raises(InputError, match=r"^mine is in none of 1/mm, 1/cm, HU: .* expected 1/mm$"):
+        check(factor * noisy(reference, 0.05), reference)
+
+
+def test_hu_without_an_attenuation_of_water_are_refused_in_one_sentence():
+    with pytest.raises(InputError, match=r"^--unit hu needs the attenuation of water.*expected 1/mm or 1/cm"):
+        placement.check("mine", in_hu(body()), body(), "hu", None)
+
+
+def test_hu_that_are_cut_off_are_refused_by_name():
+    reference = body()
+    with pytest.raises(InputError, match=r"^mine is cut off at -400 HU, where air has -1000"):
+        check(np.clip(in_hu(noisy(reference, 0.05)), -400, 400), reference, "hu")
+
+
+def test_air_may_be_off_by_streaks_and_not_by_a_scale():
+    reference = body()
+    check(np.where(reference == 0, -501, in_hu(reference)), reference, "hu")
+    with pytest.raises(InputError, match=r"^mine is not in HU: the air in it has -49\d"):
+        check(np.where(reference == 0, -499, in_hu(reference)) + 50 * noisy(0 * reference), reference, "hu")
+
+
+@pytest.mark.parametrize("blur", [0.0, 1.0, 1.5])
+def test_a_cavity_and_what_lies_outside_the_circle_are_no_air_to_judge_by(blur):
+    reference = np.full((32, 32, 32), WATER, np.float32)
+    reference[14:18, 14:18, 14:18], reference[4:9, 20:28, 6:12] = 0, 2 * WATER
+    check(in_hu(ndimage.gaussian_filter(reference, blur)), reference, "hu")
+    y, x = np.ogrid[-1:1:64j, -1:1:64j]
+    head = np.zeros((40, 64, 64), np.float32)
+    head[:, np.hypot(y, x) < 0.8], head[10:14, 20:30, 20:24] = WATER, 2 * WATER
+    outside = np.broadcast_to(np.hypot(y, x) > 1, head.shape)
+    check(np.where(outside, 0, in_hu(ndimage.gaussian_filter(head, blur))), head, "hu")
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("voxels", [-2, -1, 1, 2])
+def test_a_shift_is_not_called_a_flip(axis, voxels):
+    """A ball off the middle: its image along an axis is the ball shifted along it."""
+    z, y, x = np.meshgrid(*(np.arange(24) - 11.5 for _ in range(3)), indexing="ij")
+    distance = np.sqrt((z - 0.5) ** 2 + (y - 0.5) ** 2 + (x - 0.5) ** 2)
+    reference = WATER * np.clip(8.5 - distance, 0, 1).astype(np.float32)
+    check(np.roll(reference, voxels, axis), reference)
+
+
 def nearly_alike(seed):
     """Return a body that its mirror image differs from by little, with smooth errors that are larger than that."""
     reference = np.maximum(body(), 0.999 * body()[:, :, ::-1])
@@ -170,3 +230,16 @@ def test_an_uncorrected_hip_is_accepted_as_it_is_and_refused_mirrored(hips, twin
     for turn in (turn for turn in placement.TURNS[1:] if turn.order == (0, 1, 2)):
         with pytest.raises(InputError, match=f"^mine looks {turn.text}:"):
             placement.check("mine", turn.apply(values), reference, "1/mm", None)
+    for axis in range(3):
+        placement.check("mine", np.roll(values, 2, axis), reference, "1/mm", None)
+
+
+@pytest.mark.slow
+def test_a_blur_of_a_nearly_round_body_is_no_turn(tmp_path):
+    """Three rods without metal are a cup of water, which little tells from its image."""
+    (tmp_path / "scene.toml").write_text(CUP, encoding="utf-8")
+    assert make_dataset([str(tmp_path / "scene.toml"), str(tmp_path / "data")]) == 0
+    stored = open_scan(tmp_path / "data" / "cup")
+    values, reference = fdk(stored.metal_free.scan).values.numpy(), placement.reference_of(stored)
+    for blur in (0.7, 1.0, 2.0):
+        placement.check("mine", ndimage.gaussian_filter(values, blur), reference, "1/mm", None)

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from ctsim.benchmarks.scores.protocol import Truth, tissue_range, truth_of
 from ctsim.dataset.store import StoredScan
@@ -26,8 +27,22 @@ METAL_FROM = 99.5
 TURNED = 0.1
 """What a volume differs by from its own turned copy agrees to −1 with the reference's where the volume lies right, to
 +1 where it is turned; from this value on it is refused."""
+GAINED = 0.003
+"""Share of what is missing to a correlation of 1 that turning must win back: a blur of a nearly round body wins 0.0004
+of it by chance, turning back mirrored hips 0.09."""
+MOVED = (-2, -1, 1, 2)
+"""Voxels along an axis by which a volume may be shifted that looks turned: a ball off the middle, for one."""
 LEAST_AIR = -500.0
 """HU: the median of what is air lies below in any reconstruction, whatever its streaks and its noise."""
+DEEP, ENOUGH = 2, 0.01
+"""Air counts that is this many voxels from the body, where that is this share of all voxels: a blur reaches no farther,
+and a cavity tells nothing."""
+FAR = math.log(3)
+"""A spread off by this much, as a logarithm, is in no unit that is known."""
+NO_WATER = (
+    "--unit hu needs the attenuation of water, which a scan without spectrum.csv does not tell: expected 1/mm or 1/cm, "
+    "or a scan that was imported with --kv"
+)
 NEGATIVE = -0.5
 """Correlation with the reference that no reconstruction has by chance, only one of the wrong sign."""
 
@@ -70,7 +85,7 @@ def to_attenuation(values: NDArray[Any], unit: Unit, water: float | None) -> NDA
     if unit == "1/cm":
         return np.asarray(values, np.float64).astype(np.float32) / np.float32(10)
     if water is None:
-        raise InputError("--unit hu needs the attenuation of water, and the scan has no spectrum.csv: expected 1/mm")
+        raise InputError(NO_WATER)
     return (water * (1 + np.asarray(values, np.float64) / 1000)).astype(np.float32)
 
 
@@ -103,8 +118,8 @@ def check(
     """Raise InputError, a sentence that begins with `name`, for a volume of another shape, unit or orientation.
 
     `values` are as stored, in `unit`. A unit is refused where another one brings both mean and standard deviation
-    nearer to those of the `reference`, in 1/mm; `option` names the flag that states it. HU are refused whose air has
-    none. So are numbers that are not finite, and a volume of one value.
+    nearer to those of the `reference`, in 1/mm; `option` names the flag that states it. HU are refused whose air is
+    not that of HU, and without `water`. So are numbers that are not finite, and a volume of one value.
     """
     shape = reference.shape
     if sorted(values.shape) != sorted(shape):
@@ -113,13 +128,9 @@ def check(
         raise InputError(f"{name} has {int((~finite).sum())} of {values.size} voxels that are not finite")
     if (low := values.min()) == values.max():
         raise InputError(f"{name} holds {float(low):g} in every voxel, expected a reconstruction")
-    if (better := _better_unit(values, reference, unit, water)) is not None:
-        mean, own = float(reference.mean()), float(values.mean())
-        instead = f", or {option} {better}" if option else ""
-        raise InputError(
-            f"{name} looks like {NAMES[better]}: its mean is {own:.3g}, the reference's {mean:.3g} 1/mm; "
-            f"expected {NAMES[unit]}{instead}"
-        )
+    if unit == "hu" and water is None:
+        raise InputError(NO_WATER)
+    _check_unit(name, values, reference, unit, water, option)
     found = to_attenuation(values, unit, water)
     if unit == "hu" and water is not None:
         _check_air(name, values, reference, water)
@@ -127,12 +138,14 @@ def check(
     _check_turn(name, found, reference)
 
 
-def _better_unit(values: NDArray[Any], reference: NDArray[np.float32], unit: Unit, water: float | None) -> Unit | None:
-    """Return a unit in which mean and spread, which no turn changes, are nearer to the reference's; None without."""
+def _check_unit(
+    name: str, values: NDArray[Any], reference: NDArray[np.float32], unit: Unit, water: float | None, option: str
+) -> None:
+    """Refuse values whose mean and spread, which no turn changes, are nearer to the reference's in another unit."""
     mean, spread = float(reference.mean(dtype=np.float64)), float(reference.std(dtype=np.float64))
     own_mean, own_spread = float(values.mean(dtype=np.float64)), float(values.std(dtype=np.float64))
     if own_spread == 0 or spread == 0:
-        return None  # a constant has no scale
+        return  # a constant has no scale
     off: dict[Unit, tuple[float, float]] = {}
     for other in NAMES:
         if other == "hu" and water is None:
@@ -140,8 +153,16 @@ def _better_unit(values: NDArray[Any], reference: NDArray[np.float32], unit: Uni
         scale = {"1/mm": 1.0, "1/cm": 0.1, "hu": (water or 0) / 1000}[other]
         shifted = own_mean * scale + (water or 0) * (other == "hu")
         off[other] = abs(math.log(own_spread * scale / spread)), _distance(shifted, mean)
-    better: list[Unit] = [other for other in off if all(a < b for a, b in zip(off[other], off[unit], strict=True))]
-    return min(better, key=lambda other: sum(off[other]), default=None)
+    nearer: list[Unit] = [other for other in off if all(a < b for a, b in zip(off[other], off[unit], strict=True))]
+    better = min(nearer, key=lambda other: sum(off[other]), default=None)
+    if better is None:
+        return
+    found = f"its mean is {own_mean:.3g} and its standard deviation {own_spread:.3g}, the reference's {mean:.3g} and "
+    found += f"{spread:.3g} 1/mm; expected {NAMES[unit]}"
+    if off[better][0] > FAR:
+        raise InputError(f"{name} is in none of {', '.join(NAMES.values())}: {found}")
+    instead = f", or {option} {better}" if option else ""
+    raise InputError(f"{name} looks like {NAMES[better]}: {found}{instead}")
 
 
 def _distance(one: float, other: float) -> float:
@@ -150,10 +171,16 @@ def _distance(one: float, other: float) -> float:
 
 
 def _check_air(name: str, values: NDArray[Any], reference: NDArray[np.float32], water: float) -> None:
-    """Refuse HU whose darkest voxels, as many as the reference has of air, are nowhere near −1000."""
-    share = float(np.mean(reference < water / 10))
-    if share and (air := float(np.quantile(values, share / 2))) > LEAST_AIR:
-        raise InputError(f"{name} is not in HU: the air in it has {air:.4g}, expected -1000, or another unit")
+    """Refuse HU whose darkest voxels, as many as the reference has of air within the circle, are nowhere near −1000."""
+    _, n_y, n_x = reference.shape
+    y, x = np.ogrid[-1 : 1 : n_y * 1j, -1 : 1 : n_x * 1j]
+    air = ndimage.binary_erosion(reference < water / 10, iterations=DEEP, border_value=1) & (np.hypot(y, x) <= 1)
+    share = float(np.mean(air))
+    if share < ENOUGH or (dark := float(np.quantile(values, share / 2))) <= LEAST_AIR:
+        return
+    if dark == values.min():
+        raise InputError(f"{name} is cut off at {dark:.4g} HU, where air has -1000; expected all values")
+    raise InputError(f"{name} is not in HU: the air in it has {dark:.4g}, expected -1000, or another unit")
 
 
 def _check_sign(name: str, values: NDArray[np.float32], reference: NDArray[np.float32]) -> None:
@@ -190,8 +217,12 @@ def _check_turn(name: str, values: NDArray[np.float32], reference: NDArray[np.fl
         return
     alike = _correlation(best.apply(clipped)[few], copy), _correlation(best.apply(reference)[few], target)
     turned = (other - own) / math.sqrt(max((1 - alike[0]) * (1 - alike[1]), 1e-12))
-    if turned > TURNED:
-        raise InputError(f"{name} looks {best.text}: correlation with the reference {own:.3f}, turned back {other:.3f}")
+    if turned <= TURNED or other - own <= GAINED * (1 - own):
+        return
+    shifts = itertools.product(range(3), MOVED)
+    if max(_correlation(np.roll(clipped[few], by, axis), target) for axis, by in shifts) >= other:
+        return  # a shift is an error to be scored
+    raise InputError(f"{name} looks {best.text}: correlation with the reference {own:.3f}, turned back {other:.3f}")
 
 
 def _few(reference: NDArray[Any]) -> tuple[slice, ...]:
