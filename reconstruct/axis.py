@@ -20,9 +20,11 @@ from ctsim.types import Scan
 SMOOTH = (
     1.5  # pixels: standard deviation of the filter along u, so that interpolation smooths no shift more than others
 )
-REACH = 0.25  # of the columns: how far off the middle the axis is sought
+REACH = 0.42  # of the columns: how far off the middle the axis is sought, so that a half-fan scan is within
 COARSE, FINE = 1.0, 0.01  # pixels
-FLAT = 0.5  # of the median cost: with an object the least one is below a tenth, with noise alone above eight tenths
+UNLIKE = (
+    0.15  # cost of opposite rays: up to 0.11 at the axis, of 300 photons, and 0.21 or more where that is out of reach
+)
 UNEVEN = 1.5  # ratio of the largest to the smallest step of views above which a turn has a gap
 MOST_ROWS = 32
 
@@ -32,7 +34,7 @@ def axis_shift(scan: Scan) -> float:
 
     The squared differences of opposite rays are weighted with the transmission, so that rays through metal, whose
     logarithm is all noise, count little. Raises InputError for a scan that is no full turn on a circle, and where
-    opposite rays tell no axis: without an object in view, or with an axis beyond a quarter of the columns.
+    opposite rays agree nowhere: without an object in view, or with an axis beyond `REACH`.
     """
     geometry = scan.geometry
     order, angles = _turn(geometry)
@@ -42,14 +44,10 @@ def axis_shift(scan: Scan) -> float:
     shifts = np.arange(-math.floor(reach), math.floor(reach) + 1) * COARSE
     costs = np.array([model.cost(float(shift)) for shift in shifts])
     least = int(np.argmin(costs))
-    if not costs[least] < FLAT * np.median(costs):
+    if not costs[least] < UNLIKE or least in (0, len(shifts) - 1):
         raise InputError(
-            "--center auto finds no axis: opposite rays agree as well at any other, as without an object in view; "
-            "expected --center PIXELS"
-        )
-    if least in (0, len(shifts) - 1):
-        raise InputError(
-            f"--center auto finds no axis within {reach:.4g} columns of the detector's middle; expected --center PIXELS"
+            f"--center auto finds no axis within {reach:.4g} columns of the detector's middle where opposite rays "
+            "agree; expected --center PIXELS"
         )
     best = float(shifts[least])
     found: Any = optimize.minimize_scalar(
@@ -105,7 +103,11 @@ class _Opposite:
         self._places = np.concatenate([angles, [angles[0] + 2 * np.pi]])
 
     def cost(self, shift: float) -> float:
-        """Return the weighted mean square of the differences with the axis at this shift."""
+        """Return how unlike opposite rays are with the axis at this shift: 0 where they agree, 1 if they are unrelated.
+
+        It is the mean square of their differences over that of what they differ by from their common mean, so that
+        where only air is compared it is not small.
+        """
         middle = (self.n_u - 1) / 2 + shift
         half = int(min(middle, self.n_u - 1 - middle))
         t = np.arange(1, half + 1, dtype=np.float64)
@@ -117,7 +119,9 @@ class _Opposite:
         one, w_one = self._at(own, np.broadcast_to(right, there.shape))
         other, w_other = self._at(rows, np.broadcast_to(left, there.shape))
         w = w_one * w_other / (w_one + w_other)
-        return float((w * (one - other) ** 2).sum() / w.sum())
+        mean = (w * (one + other)).sum() / (2 * w.sum())
+        spread = (w * ((one - mean) ** 2 + (other - mean) ** 2)).sum()
+        return float((w * (one - other) ** 2).sum() / spread) if spread > 0 else 1.0
 
     def _at(self, rows: NDArray[np.float64], columns: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         at = np.stack([rows, columns])

@@ -62,6 +62,19 @@ def test_photons_are_told_by_two_different_views(n_views):
     assert open_field(lambda view: images[view], 1, 0.0).photons is None
 
 
+@pytest.mark.parametrize("photons", [1e5, 1e4, 300.0])
+@pytest.mark.parametrize("transmission", [0.3, 0.6])
+def test_the_level_of_a_narrow_open_edge_is_found(photons, transmission):
+    """An object that covers all columns leaves three rows open at either end: their level is found, not that of the brightest.
+
+    Choosing the pixels by their noise misleads the median by less than half the noise of one.
+    """
+    image = np.full((64, 64), transmission)
+    image[:3] = image[-3:] = 1.0
+    found = open_field(lambda view: np.random.default_rng(view).poisson(photons * image) / photons, 24, 0.0)
+    assert abs(found.level - 1) < 0.4 / photons**0.5 and found.photons is None and "brightest pixels" in found.note
+
+
 @pytest.mark.parametrize("write", [scan_files.dxchange, scan_files.nxtomo])
 def test_hdf5(tmp_path, write):
     centred = msgspec.structs.replace(GEOMETRY, off_detector=(0.0, 0.0))  # the formats have no place for it

@@ -87,7 +87,7 @@ def _export_scan(given: Flags, stored: StoredScan) -> None:
         axis = -grid.off_detector[1] / grid.d_detector[1]
         sys.stdout.write(
             f"The format does not say where the axis is: {axis:+.4g} columns from the detector's middle. "
-            f"make-dataset import needs --center {axis:.4g}, or finds it\n"
+            f"make-dataset import needs --center {axis:.4g}, or --center auto\n"
         )
 
 

@@ -15,7 +15,8 @@ SAMPLED = 24  # views that are looked at
 STRIP = 0.02  # of the columns at either side, and at least 2
 OPEN = 0.97  # of the brightest strip's level: a strip above it sees no object
 BRIGHT = 99.0  # percentile of a whole view that an open strip must reach, to `OPEN`
-AVERAGED = 9  # pixels, squared: of single ones the percentile is noise, 13 % too high for 300 photons
+AVERAGED = 3  # pixels, squared: of single ones the percentile is noise, and more of them miss a narrow open edge
+LIKELY = 4.0  # standard deviations of such a mean below the percentile within which pixels pass for open
 _MAD = 1.4826  # standard deviations in a median of absolute deviations from the median of normal numbers
 
 
@@ -34,7 +35,7 @@ def open_field(read: Callable[[int], NDArray[Any]], n_views: int, dark: float, l
     A column is open where it is as bright as the brightest. The noise is that of differences of successive views, so
     that a pattern of the pixels does not count; `read` must return pixels as they were read out, for interpolation
     takes noise away. With `level`, of a flat field, only the noise is measured. Where no
-    side is open in any view, the level is the brightest percentile of all and the note says so.
+    side is open in any view, the level is that of the brightest pixels of all and the note says so.
     """
     strips, brightest = [], 0.0
     for view in few_views(n_views, SAMPLED):
@@ -42,8 +43,7 @@ def open_field(read: Callable[[int], NDArray[Any]], n_views: int, dark: float, l
         beside = view + 1 if view + 1 < n_views else max(view - 1, 0)
         pair = [_strips(read(k)) - dark for k in (view, beside)]
         strips.append((pair, [float(np.median(side)) for side in pair[0]]))
-        smooth = ndimage.uniform_filter(np.asarray(read(view), np.float64), AVERAGED, mode="nearest")
-        brightest = max(brightest, float(np.percentile(smooth, BRIGHT)) - dark)
+        brightest = max(brightest, _brightest(*(np.asarray(read(k), np.float64) - dark for k in (view, beside))))
     levels = np.array([found for _, found in strips])
     bar = OPEN * max(float(levels.max()), brightest) if level is None else OPEN * level
     is_open = levels >= bar
@@ -51,7 +51,7 @@ def open_field(read: Callable[[int], NDArray[Any]], n_views: int, dark: float, l
     if level is None:
         level = float(np.median(levels[is_open])) if is_open.any() else brightest
     if not is_open.any():
-        note = "no column next to the object is open in every row: the open field is the brightest percentile"
+        note = "no column next to the object is open in every row: the open field is that of the brightest pixels"
     noise = [
         _MAD * float(np.median(np.abs(pair[1][side] - pair[0][side]))) / math.sqrt(2)
         for (pair, _), sides in zip(strips, is_open, strict=True)
@@ -60,6 +60,18 @@ def open_field(read: Callable[[int], NDArray[Any]], n_views: int, dark: float, l
     ]
     spread = float(np.median(noise)) if noise else 0.0
     return OpenField(level=level, photons=(level / spread) ** 2 if spread > 0 and level > 0 else None, note=note)
+
+
+def _brightest(image: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Return the median of a view's brightest pixels, by their noise: that of its differences from another view.
+
+    The percentile of means picks those that noise has raised; all within their noise of it are taken instead.
+    """
+    smooth = ndimage.uniform_filter(image, AVERAGED, mode="nearest")
+    top = float(np.percentile(smooth, BRIGHT))
+    bright = smooth >= OPEN * top
+    noise = _MAD * float(np.median(np.abs(image - other)[bright])) / math.sqrt(2) / AVERAGED
+    return float(np.median(image[smooth >= min(OPEN * top, top - LIKELY * noise)]))
 
 
 def _strips(image: NDArray[Any]) -> NDArray[np.float64]:
