@@ -65,7 +65,7 @@ def test_photons_are_told_by_two_different_views(n_views):
 @pytest.mark.parametrize("photons", [1e5, 1e4, 300.0])
 @pytest.mark.parametrize("transmission", [0.3, 0.6])
 def test_the_level_of_a_narrow_open_edge_is_found(photons, transmission):
-    """An object that covers all columns leaves three rows open at either end: their level is found, not that of the brightest.
+    """An object that covers all columns leaves three rows open at either end: their level is found, not a brighter one.
 
     Choosing the pixels by their noise misleads the median by less than half the noise of one.
     """

@@ -171,15 +171,15 @@ def test_the_guard_fires_on_aluminium_beside_bone():
     assert volume.status is Status.OK and not volume.reason and "times water" in volume.details["mask_reason"]
 
 
-def toothed(*rods):
-    """Return a smooth body of water with enamel of 4.8 times water and rods of given multiples of it; and the rods."""
+def toothed(*rods, enamel=4.8, water=0.02):
+    """Return a smooth body of water with enamel and rods of given multiples of it; and the rods."""
     z, y, x = np.meshgrid(*[np.arange(48) - 23.5] * 3, indexing="ij")
-    values, metal = np.where(np.hypot(x, y) < 20, 0.02, 0.0), np.zeros(x.shape, bool)
-    values[np.abs(z) < 10] *= np.where(np.hypot(x + 10, y) < 5, 4.8, 1)[np.abs(z) < 10]
+    values, metal = np.where(np.hypot(x, y) < 20, water, 0.0), np.zeros(x.shape, bool)
+    values[np.abs(z) < 10] *= np.where(np.hypot(x + 10, y) < 5, enamel, 1)[np.abs(z) < 10]
     for (at_x, at_y), times in rods:
         inside = (np.hypot(x - at_x, y - at_y) < 3) & (np.abs(z) < 8)
-        values[inside], metal = 0.02 * times, metal | inside
-    noise = np.random.default_rng(0).normal(0, 0.002, x.shape)
+        values[inside], metal = water * times, metal | inside
+    noise = np.random.default_rng(0).normal(0, 0.1 * water, x.shape)
     return (ndimage.gaussian_filter(values, 0.7) + noise).astype(np.float32), metal
 
 
@@ -192,6 +192,34 @@ def test_the_automatic_mask_finds_two_metals_and_no_enamel():
     assert 2 * (found.mask & metal).sum() / (found.mask.sum() + metal.sum()) > 0.85
     alone, _ = toothed()
     assert auto_mask(alone).doubt.startswith("nothing reaches 7 times water")
+
+
+@pytest.mark.parametrize(
+    ("rod", "times", "enamel", "least"),
+    [((8, 6), 12.0, 6.5, 0.8), ((-10, 0), 9.0, 4.7, 0.6)],  # a crown's edge towards enamel lies farther out
+    ids=["apart", "crown"],
+)
+def test_the_automatic_mask_holds_no_enamel_of_half_the_metals_value(rod, times, enamel, least):
+    values, metal = toothed((rod, times), enamel=enamel)
+    found = auto_mask(values)
+    assert not found.doubt
+    assert 2 * (found.mask & metal).sum() / (found.mask.sum() + metal.sum()) > least
+
+
+def test_the_automatic_mask_is_doubted_where_enamel_is_nearly_as_dense():
+    values, _ = toothed(((8, 6), 8.0), enamel=5.8)
+    assert auto_mask(values).doubt.endswith("times the body's densest, expected 1.5 or more")
+
+
+@pytest.mark.parametrize(("water", "enamel"), [(0.044, 6.6), (0.055, 7.2), (0.083, 8.7)])
+def test_the_automatic_mask_takes_no_enamel_for_metal_in_a_soft_beam(water, enamel):
+    """Of a jaw of 10 mm at 90, 70 and 40 kV."""
+    values, _ = toothed(enamel=enamel, water=water)
+    assert auto_mask(values).doubt.startswith("nothing reaches")
+    values, metal = toothed(((8, 6), 16.0), enamel=enamel, water=water)
+    found = auto_mask(values)
+    assert not found.doubt
+    assert 2 * (found.mask & metal).sum() / (found.mask.sum() + metal.sum()) > 0.8
 
 
 def test_the_automatic_mask_finds_iron(iron):
