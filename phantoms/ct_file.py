@@ -23,6 +23,10 @@ BLOOM = 2.0
 NO_CHANGE = (1.0, 0.0)
 PLATEAU = 8
 """Voxels of the greatest value in one piece from which a CT may be cut off there."""
+TIMES = 10
+"""So many times the next lower value's voxels, and all brighter ones', has a value at which a CT is cut off."""
+ABOVE = 300.0
+"""HU above which a CT may be cut off: what is cut off below has lost all bone."""
 LEVELS = 32
 """Different values from which a volume is a CT that may be cut off, rather than a drawn one."""
 AIR = -200.0
@@ -117,23 +121,25 @@ def read_hu(settled: Settled) -> NDArray[np.float32]:
     return hu
 
 
-def cut_off(hu: NDArray[np.float32]) -> int:
-    """Return the size of the largest piece of voxels that have the greatest value, 0 unless a CT is cut off there.
+def cut_off(hu: NDArray[np.float32]) -> tuple[float, int] | None:
+    """Return the value at which a CT is cut off and the size of the largest piece of it; None where it is not.
 
     The brightest of a CT that is not cut off are few, and fewer than those of the next value: a histogram ends with
-    its thinnest bin. One that is cut off ends with all that lay above it.
+    its thinnest bin. One that is cut off ends with all that lay above it, but for a few hot voxels or letters. Noise
+    that was added, or interpolation, hides it.
     """
-    top = float(hu.max())
-    at_top = hu == top
-    number = int(np.count_nonzero(at_top))
-    if number < PLATEAU or number == hu.size:
-        return 0
-    below = np.max(hu, initial=-np.inf, where=~at_top)
-    if number <= 2 * int(np.count_nonzero(hu == below)) or np.unique(hu).size < LEVELS:
-        return 0
-    names: Any = ndimage.label(at_top, np.ones((3, 3, 3)))[0]
+    values, numbers = np.unique(hu[hu > ABOVE], return_counts=True)
+    if not values.size:
+        return None
+    above, below = np.cumsum(numbers[::-1])[::-1] - numbers, np.concatenate([[0], numbers[:-1]])
+    last = above == 0
+    many = (numbers >= PLATEAU) & np.where(last, numbers > 2 * below, numbers > TIMES * np.maximum(above, below))
+    if not many.any() or np.unique(hu).size < LEVELS:
+        return None
+    at = float(values[np.flatnonzero(many)[-1]])
+    names: Any = ndimage.label(hu == at, np.ones((3, 3, 3)))[0]
     size = int(np.bincount(names.ravel())[1:].max())
-    return size if size >= PLATEAU else 0
+    return (at, size) if size >= PLATEAU else None
 
 
 def without_metal(ct: Ct, metal_hu: float) -> Ct:

@@ -364,8 +364,29 @@ def test_metal_that_is_cut_off_below_the_limit_is_not_kept(tmp_path, to, metal):
     np.save(tmp_path / "ct.npy", np.minimum(hu, to).astype(np.int16))
     instead = f"or metal_hu below {to} if" if to > 1000 else "or a CT that is not cut off"  # metal_hu is at least 1000
     refused(tmp_path / "ct.npy", rf"ends at {to} HU, with \d+ voxels of that value in one piece.*{instead}", **given)
+    hot = np.minimum(hu, to).astype(np.int16)
+    hot[0, 0, :9] = to + 600  # letters
+    np.save(tmp_path / "ct.npy", hot)
+    refused(tmp_path / "ct.npy", rf"ends at {to} HU, with \d+ voxels of that value", **given)
     np.save(tmp_path / "bone.npy", bone.astype(np.int16))  # 12 bits end above it, and its brightest voxels are few
     body(tmp_path / "bone.npy", **given)
+
+
+def test_metal_of_a_ct_that_is_cut_off_is_offered_what_is_taken(tmp_path):
+    """A CT of 12 bits: no higher metal_hu is taken, since what is above its end is lost."""
+    hu = ndimage.gaussian_filter(np.where(np.indices((24, 24, 24)).sum(0) > 40, 9000.0, -900.0), 1)
+    hu += np.random.default_rng(0).normal(0, 20, hu.shape)
+    np.save(tmp_path / "ct.npy", np.minimum(hu, 3071).astype(np.int16))
+    given = {"spacing": (1.0, 1.0, 1.0)}
+    refused(tmp_path / "ct.npy", 'holds metal.*"mask", or existing_metal = "none" if it is bone$', **given)
+    body(tmp_path / "ct.npy", existing_metal="none", **given)
+
+
+def test_a_drawn_volume_of_few_levels_is_not_cut_off(tmp_path):
+    hu = np.full((12, 12, 12), -1000, np.int16)
+    hu[3:9, 3:9, 3:9] = 1500
+    np.save(tmp_path / "ct.npy", hu)
+    body(tmp_path / "ct.npy", spacing=(1.0, 1.0, 1.0))
 
 
 def test_grey_values_of_a_few_levels_end_without_being_cut_off(tmp_path):

@@ -103,20 +103,21 @@ def _read(params: CtVolume) -> Ct:
     ct = Ct(hu=read_hu(settled), spacing=settled.spacing)
     if params.existing_metal == "none":
         return ct
-    number = int(np.count_nonzero(ct.hu > params.metal_hu))
-    if not number and (cut := cut_off(ct.hu)):
-        top = float(ct.hu.max())
-        masked = f"metal_hu below {top:g} if it is metal" if top > LEAST_METAL else "a CT that is not cut off"
+    cut = cut_off(ct.hu)
+    if cut and cut[0] <= params.metal_hu:
+        masked = f"metal_hu below {cut[0]:g} if it is metal" if cut[0] > LEAST_METAL else "a CT that is not cut off"
         raise InputError(
-            f"path: {params.path} ends at {top:g} HU, with {cut} voxels of that value in one piece, so metal may be "
-            f'cut off there; expected existing_metal = "none" if it is bone, or {masked}'
+            f"path: {params.path} ends at {cut[0]:g} HU, with {cut[1]} voxels of that value in one piece, so metal may "
+            f'be cut off there; expected existing_metal = "none" if it is bone, or {masked}'
         )
+    number = int(np.count_nonzero(ct.hu > params.metal_hu))
     if params.existing_metal == "mask":
         return without_metal(ct, params.metal_hu)
     if number:
         raise InputError(
             f"path: {params.path} holds metal, {number} voxels above metal_hu = {params.metal_hu:g} HU (up to "
-            f'{ct.hu.max():.0f}); expected a CT without, existing_metal = "mask", or a higher metal_hu'
+            f'{ct.hu.max():.0f}); expected a CT without, existing_metal = "mask", '
+            + ('or existing_metal = "none" if it is bone' if cut else "or a higher metal_hu")
         )
     return ct
 
