@@ -5,6 +5,7 @@ stored, and scan.json. A program that names {mask} is told the metal, too: metal
 is a copy, apart from the data. The words of the command are passed as they are; no shell reads them.
 """
 
+import difflib
 import hashlib
 import os
 import re
@@ -63,9 +64,10 @@ def words_of(command: str) -> list[str]:
     for place, what in ((SCAN, "the scan's folder"), (OUT, "the volume to be written")):
         if not any(place in word for word in words[1:]):
             raise InputError(f"--method cmd:{command}: expected {place} among its arguments, which stands for {what}")
-    for unknown in NAMED.findall(" ".join(words)):
-        if unknown not in (SCAN, OUT, MASK):
-            raise InputError(f"--method cmd:{command}: expected {SCAN}, {OUT} or {MASK}, got {unknown}")
+    for found in NAMED.findall(" ".join(words)):
+        meant = difflib.get_close_matches(found, (SCAN, OUT, MASK), 1)
+        if meant and meant[0] != found:
+            raise InputError(f"--method cmd:{command}: expected {meant[0]}, got {found}")
     if shutil.which(words[0]) is None:
         raise InputError(f"--method cmd:{command}: there is no program {words[0]!r} that can be run")
     return words

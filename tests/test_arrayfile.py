@@ -1,5 +1,6 @@
 """Files from elsewhere: what they declare is judged before it is decoded, and is one sentence where it cannot be."""
 
+import logging
 import zipfile
 
 import numpy as np
@@ -39,6 +40,19 @@ def test_what_is_plausible_is_read_as_it_is(tmp_path, compression):
     for name in ("a.tif", "a.npy"):
         for shape in (None, BLOCK.shape):
             np.testing.assert_array_equal(read_array(tmp_path / name, shape), BLOCK)
+
+
+@pytest.mark.parametrize("level", [logging.NOTSET, logging.CRITICAL + 1])
+def test_a_tiff_that_is_cut_off_between_pages_is_refused_whatever_is_logged(tmp_path, level, monkeypatch):
+    path, logger = tmp_path / "a.tif", logging.getLogger("tifffile")
+    tifffile.imwrite(path, np.zeros((6, 32, 32), np.int16), photometric="minisblack", metadata=None)
+    with tifffile.TiffFile(path) as file:
+        offset = file.pages[3].offset
+    path.write_bytes(path.read_bytes()[:offset])
+    monkeypatch.setattr(logger, "level", level)
+    with pytest.raises(InputError, match="ends before its pages do"):
+        read_array(path)
+    assert logger.level == level
 
 
 def test_a_small_file_that_decodes_to_much_is_refused_before(tmp_path, never_decoded):

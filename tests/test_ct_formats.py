@@ -399,7 +399,16 @@ def test_grey_values_of_a_few_levels_end_without_being_cut_off(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("unit", "scale"), [("mm", 1.0), ("\\u00B5m", 1e-3), ("cm", 10.0), ("pixel", None), ("", None)]
+    ("unit", "scale"),
+    [
+        ("mm", 1.0),
+        ("\\u00B5m", 1e-3),
+        ("microns", 1e-3),
+        ("cm", 10.0),
+        ("millimeter", 1.0),
+        ("pixel", None),
+        ("", None),
+    ],
 )
 def test_the_spacing_of_an_imagej_stack_is_the_files(tmp_path, unit, scale, expected):
     """ImageJ states pixels a unit along x and y, and the unit along z; without one it states nothing."""
@@ -414,6 +423,16 @@ def test_the_spacing_of_an_imagej_stack_is_the_files(tmp_path, unit, scale, expe
     assert np.array_equal(body(path).labels, expected.labels)
     assert np.array_equal(body(path, spacing=SPACING).labels, expected.labels)
     refused(path, "expected the same or none", spacing=(3.0, 3.0, 3.0))
+
+
+def test_an_imagej_stack_may_have_a_unit_for_each_axis_and_pixels_of_no_size(tmp_path, expected):
+    path, (z, y, x) = tmp_path / "ct.tif", SPACING
+    told = {"spacing": z, "unit": "mm", "yunit": "um", "axes": "ZYX"}
+    tifffile.imwrite(path, corner(), imagej=True, resolution=(1 / x, 1 / (1000 * y)), metadata=told)
+    assert np.array_equal(body(path).labels, expected.labels)
+    tifffile.imwrite(path, corner(), imagej=True, resolution=((0, 1), (0, 1)), metadata=told)
+    refused(path, "states none")
+    assert np.array_equal(body(path, spacing=SPACING).labels, expected.labels)
 
 
 def test_a_name_in_capitals_is_the_same_format(tmp_path, expected):

@@ -219,17 +219,41 @@ def test_a_view_for_testing_is_not_reconstructed_from(tmp_path, write):
     assert every.held == () and every.geometry.n_views == len(P)  # nothing else to reconstruct from
 
 
-@pytest.mark.parametrize(("unit", "angles"), [("", False), ("rad", True), ("", True)])
-def test_angles_without_a_unit_that_span_a_turn_in_radians_are_refused(tmp_path, unit, angles):
+def in_units(tmp_path, angles, unit=None):
     path = scan_files.dxchange(tmp_path / "a.h5", COUNTS, GEOMETRY, FLAT, DARK)
     with h5py.File(path, "r+") as file:
         theta = file["exchange/theta"]
-        theta[...] = -GEOMETRY.angles if angles else -np.degrees(GEOMETRY.angles)
+        theta[...] = angles
         del theta.attrs["units"]
-        if unit:
+        if unit is not None:
             theta.attrs["units"] = unit
-    if angles and not unit:
-        with pytest.raises(InputError, match=r"'exchange/theta' has no attribute units and spans 6\.02"):
-            scans.open_scan(path)
-        return
-    assert np.allclose(scans.open_scan(path).geometry.angles, GEOMETRY.angles)
+    return path
+
+
+@pytest.mark.parametrize("unit", ["rad", "Radians", np.array([b"rad"], object), None, "degree", "°"])
+def test_angles_are_in_the_unit_that_is_stated(tmp_path, unit):
+    """Some writers store a list of one; without a unit a turn of degrees is one."""
+    angles = -GEOMETRY.angles if "rad" in str(unit).lower() else -np.degrees(GEOMETRY.angles)
+    assert np.allclose(scans.open_scan(in_units(tmp_path, angles, unit)).geometry.angles, GEOMETRY.angles)
+
+
+@pytest.mark.parametrize("turns", [0.5, 1.0, 2.0])
+def test_angles_without_a_unit_that_may_be_radians_are_refused(tmp_path, turns):
+    path = in_units(tmp_path, np.linspace(0, turns * 2 * np.pi, len(GEOMETRY.angles), endpoint=False))
+    with pytest.raises(
+        InputError, match=r"'exchange/theta' has no attribute units and spans \d+\.\d+, which may be rad"
+    ):
+        scans.open_scan(path)
+
+
+def test_angles_in_another_unit_are_refused(tmp_path):
+    with pytest.raises(InputError, match="'exchange/theta' is in 'gon', expected deg or rad"):
+        scans.open_scan(in_units(tmp_path, np.degrees(GEOMETRY.angles), "gon"))
+
+
+def test_an_entry_of_nxtomo_may_lie_one_group_deeper(tmp_path):
+    path = scan_files.nxtomo(tmp_path / "a.h5", COUNTS, GEOMETRY, FLAT, DARK)
+    with h5py.File(path, "r+") as file:
+        (name,) = (name for name in file if "instrument" in file[name])
+        file.move(name, "entry1/tomo_entry")
+    assert scans.open_scan(path).geometry.n_views == len(GEOMETRY.angles)

@@ -23,7 +23,15 @@ MOST = 2**31  # values: a volume of 1290³, 8.6 GB as float32
 PLAIN, TIMES = 2**28, 100  # bytes, and times the file's own: no CT beyond both decodes to so much
 HEADER = 10_000  # bytes of a .npy header; NumPy makes room for what one declares, up to 4 GB
 LONGEST = 200  # characters of what a decoder says
-LENGTHS = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "µm": 1e-3, "\\u00b5m": 1e-3, "micron": 1e-3, "nm": 1e-6}
+# the micro sign, the Greek letter, and how ImageJ escapes the former
+_PREFIXES = {"": 1e3, "c": 10.0, "m": 1.0, "u": 1e-3, "\u00b5": 1e-3, "\u03bc": 1e-3, "\\u00b5": 1e-3, "n": 1e-6}
+_WORDS = {"": 1e3, "centi": 10.0, "milli": 1.0, "micro": 1e-3, "nano": 1e-6}
+LENGTHS = {
+    **{prefix + "m": scale for prefix, scale in _PREFIXES.items()},
+    **{prefix + end: scale for prefix, scale in _WORDS.items() for end in ("meter", "metre", "meters", "metres")},
+    **{"micron": 1e-3, "microns": 1e-3},
+}
+"""Millimetres of what files call a length, in lower case."""
 
 
 def read_array(path: Path, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
@@ -54,14 +62,18 @@ def stated_spacing(path: Path) -> tuple[float, float, float] | None:
     """
     with decoding(path, "TIFF stack"), _opened_tiff(path) as file:
         told, tags = file.imagej_metadata or {}, file.pages[0].tags
-        scale = LENGTHS.get(str(told.get("unit", "")).strip().lower())
-        if scale is None or "XResolution" not in tags or "YResolution" not in tags:
+        units = [str(told.get(axis + "unit", told.get("unit", ""))).strip().lower() for axis in ("z", "y", "")]
+        if not all(unit in LENGTHS for unit in units) or "XResolution" not in tags or "YResolution" not in tags:
             return None
-        per_x, per_y = (float(np.divide(*tags[name].value)) for name in ("XResolution", "YResolution"))
-        sizes = float(told.get("spacing", 1.0)), 1 / per_y, 1 / per_x  # ImageJ leaves a spacing of 1 out
+        per = [tags[name].value for name in ("YResolution", "XResolution")]
+        if not all(above and below for above, below in per):
+            return None  # pixels of no size
+        # ImageJ leaves a spacing of 1 out
+        sizes = float(told.get("spacing", 1.0)), *(below / above for above, below in per)
         if not all(math.isfinite(size) and size > 0 for size in sizes):
             raise InputError(f"{path} states voxels of {sizes} {told['unit']} (z, y, x), expected lengths")
-    return sizes[0] * scale, sizes[1] * scale, sizes[2] * scale
+    z, y, x = (size * LENGTHS[unit] for size, unit in zip(sizes, units, strict=True))
+    return z, y, x
 
 
 def read_image(path: Path, shape: tuple[int, int]) -> NDArray[Any]:
@@ -134,12 +146,15 @@ def _opened_tiff(path: Path) -> Iterator[Any]:
 
     logger, heard = logging.getLogger("tifffile"), _Heard()
     logger.addHandler(heard)
+    level = logger.level
+    logger.setLevel(logging.WARNING)  # somebody may have silenced it
     try:
         with tifffile.TiffFile(path, is_ome=False, is_mmstack=False, is_ndtiff=False) as file:
             yield file
         if any("invalid page offset" in said for said in heard.said):
             raise InputError(f"{path} ends before its pages do")
     finally:
+        logger.setLevel(level)
         logger.removeHandler(heard)
 
 

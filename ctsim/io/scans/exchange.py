@@ -14,16 +14,16 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ctsim.dataset.arrayfile import check_size, check_volume
+from ctsim.dataset.arrayfile import LENGTHS, check_size, check_volume
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.io.h5file import writing
 from ctsim.io.payload import quoted
 from ctsim.io.scans.scanfile import ScanFile, Stated, grid_of
 
-RADIANS = 2.2 * math.pi  # a turn and what overlaps
+RADIANS = 4.4 * math.pi  # two turns and what overlaps: no scan of a body spans so few degrees
 PIECE = 2**28  # bytes of a chunk that is decoded at once
-UNITS = {"mm": 1.0, "m": 1e3, "cm": 10.0, "um": 1e-3, "µm": 1e-3, "nm": 1e-6, "micron": 1e-3, "microns": 1e-3}
+ANGLES = ("deg", "rad", "°")
 PROJECTION, FLAT, DARK = 0, 1, 2  # NXtomo's image_key
 SOURCE, DETECTOR = "measurement/instrument/source", "measurement/instrument/detector"
 
@@ -84,7 +84,9 @@ def _entry(file: h5py.File) -> str | None:
     """Return the name of the NXtomo entry; None where the file is of Data Exchange."""
     if "exchange" in file:
         return None
-    for name in file:
+    outer = [name for name in file if isinstance(file.get(name, getlink=True), h5py.HardLink)]
+    inner = [f"{name}/{group}" for name in outer if isinstance(file[name], h5py.Group) for group in file[name]]
+    for name in (*file, *inner):
         if _get(file, f"{name}/instrument/detector/image_key") is not None:
             return name
     raise InputError(f"{file.filename} holds neither a group exchange nor an entry of NXtomo")
@@ -154,14 +156,18 @@ def _length(path: Path, file: h5py.File, name: str) -> float | None:
     if values is None:
         return None
     unit = _unit(file, name) or "mm"
-    if unit not in UNITS:
-        raise InputError(f"{path}: {quoted(name)} is in {quoted(unit)}, expected one of {', '.join(UNITS)}")
-    return abs(float(values[0])) * UNITS[unit]
+    if unit not in LENGTHS:
+        raise InputError(f"{path}: {quoted(name)} is in {quoted(unit)}, expected mm, m, cm, um or another length")
+    return abs(float(values[0])) * LENGTHS[unit]
 
 
 def _unit(file: h5py.File, name: str) -> str:
+    """Return the attribute `units` in lower case, which some writers store as a list of one."""
     unit = _get(file, name).attrs.get("units", "")
-    return unit.decode("latin-1") if isinstance(unit, bytes) else str(unit)
+    if isinstance(unit, np.ndarray) and unit.size == 1:
+        unit = unit.item()
+    text = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
+    return text.strip().lower()
 
 
 def _angles(path: Path, file: h5py.File, name: str, count: int) -> NDArray[np.float64]:
@@ -169,12 +175,14 @@ def _angles(path: Path, file: h5py.File, name: str, count: int) -> NDArray[np.fl
     values = _values(path, file, name, count)
     if values is None:
         raise InputError(f"{path} has no angles in {quoted(name)}, which such a scan needs")
-    unit, span = _unit(file, name).lower(), float(np.ptp(values))
-    if not unit and math.pi <= span <= RADIANS:
+    unit, span = _unit(file, name), float(np.ptp(values))
+    if not unit and 0 < span <= RADIANS:
         raise InputError(
-            f"{path}: {quoted(name)} has no attribute units and spans {span:.4g}, as radians of a turn do; "
+            f"{path}: {quoted(name)} has no attribute units and spans {span:.4g}, which may be radians; "
             "expected units of deg or rad"
         )
+    if unit and not unit.startswith(ANGLES):
+        raise InputError(f"{path}: {quoted(name)} is in {quoted(unit)}, expected deg or rad")
     return np.degrees(values) if unit.startswith("rad") else values
 
 
