@@ -17,14 +17,10 @@ from ctsim.geometry import Geometry
 from ctsim.reconstruct.log import LineIntegrals
 from ctsim.types import Scan
 
-SMOOTH = (
-    1.5  # pixels: standard deviation of the filter along u, so that interpolation smooths no shift more than others
-)
+SMOOTH = 1.5  # pixels along u: standard deviation of a filter, so that no shift is smoothed more by interpolation
 REACH = 0.42  # of the columns: how far off the middle the axis is sought, so that a half-fan scan is within
 COARSE, FINE = 1.0, 0.01  # pixels
-UNLIKE = (
-    0.15  # cost of opposite rays: up to 0.11 at the axis, of 300 photons, and 0.21 or more where that is out of reach
-)
+UNLIKE = 0.15  # cost: up to 0.11 at the axis, of 300 photons, and 0.21 or more where the axis is beyond reach
 UNEVEN = 1.5  # ratio of the largest to the smallest step of views above which a turn has a gap
 MOST_ROWS = 32
 
