@@ -54,8 +54,8 @@ class ProgramError(InputError):
 def words_of(command: str) -> list[str]:
     """Split a command into its words, by the rules of a shell for quotes and backslashes.
 
-    Raises InputError for a command without {scan} or {out}, with another name in braces, with open quotes, or with a
-    program that is not there.
+    Raises InputError for a command without {scan} or {out}, with a name in braces that is nearly one of ours, with
+    open quotes, or with a program that is not there.
     """
     try:
         words = shlex.split(command)

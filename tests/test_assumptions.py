@@ -60,7 +60,10 @@ def test_a_scene_shares_the_grid_that_its_name_says(scene):
 @pytest.mark.parametrize(
     ("suite", "of_splats", "of_volume"),
     [(name, True, False) for name in ("core", "core-scatter", "lookalike")]
-    + [(name, False, False) for name in ("quick", "ablation", "neural", "beams", "scatter", "headline", "systems")]
+    + [
+        (name, False, False)
+        for name in ("quick", "ablation", "neural", "beams", "scatter", "headline", "systems", "tune", "patient")
+    ]
     + [("paper", False, True)],
 )
 def test_a_suite_shares_the_grid_that_its_description_says(suite, of_splats, of_volume):

@@ -21,7 +21,7 @@ from ctsim.io.h5file import writing
 from ctsim.io.payload import quoted
 from ctsim.io.scans.scanfile import ScanFile, Stated, grid_of
 
-RADIANS = 4.4 * math.pi  # two turns and what overlaps: no scan of a body spans so few degrees
+RADIANS = 4.4 * math.pi  # two turns and what overlaps; a scan over so few degrees must state its unit
 PIECE = 2**28  # bytes of a chunk that is decoded at once
 ANGLES = ("deg", "rad", "°")
 PROJECTION, FLAT, DARK = 0, 1, 2  # NXtomo's image_key
