@@ -17,6 +17,17 @@ def photon_weights(p: Image, valid: NDArray[np.bool_]) -> Image:
     return weights
 
 
+def even_out(weights: Image, error: float) -> None:
+    """Make weights w > 0 of readings (1 + error)·w/(1 + error·w), in place.
+
+    Weights exp(−p) are inverse variances by the noise of photons, over that of an open ray. These are inverse variances
+    with an error of the model added, whose variance is `error` times that of an open ray.
+    """
+    more = np.float32(error)
+    for weight in weights:  # a view at a time stays in the cache
+        weight *= np.where(weight > 0, (1 + more) / (1 + more * np.maximum(weight, 0)), np.float32(1))
+
+
 def doubt_edges(p: Image, weights: Image, edges: float, scatter: float = 0.0) -> None:
     """Lower weights w > 0, in place, to 1/(1/w + (b/edges)²), where b says how sharply line integrals `p` bend.
 
@@ -32,11 +43,16 @@ def doubt_edges(p: Image, weights: Image, edges: float, scatter: float = 0.0) ->
     for reading, weight in zip(p, weights, strict=True):
         if scatter:
             reading = np.where(weight < 0, -np.log(np.exp(-reading) + np.float32(scatter)), reading)
-        bend = np.maximum(_bend(reading, weight != 0, 0), _bend(reading, weight != 0, 1)) / np.float32(edges)
+        bend = bends(reading, weight != 0) / np.float32(edges)
         dark = (reading > DARK) & (weight != 0)
         if dark.any():
             bend = np.where(ndimage.maximum_filter(dark, 3), ndimage.maximum_filter(bend, 3), bend)
         weight /= 1 + np.maximum(weight, 0) * bend * bend
+
+
+def bends(image: Image, says: NDArray[np.bool_]) -> Image:
+    """Return the greater of the absolute second differences along v and u of an image [v, u], as of `doubt_edges`."""
+    return np.maximum(_bend(image, says, 0), _bend(image, says, 1))
 
 
 def _bend(image: Image, says: NDArray[np.bool_], axis: int) -> Image:

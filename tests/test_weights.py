@@ -1,11 +1,23 @@
 """How much readings count: fewer photons less, and edges less than a grid can explain."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from ctsim import new_scene, reconstruct_scan, score_volume, simulate_scene
-from ctsim.reconstruct.splat import fast
-from ctsim.reconstruct.weights import DARK, doubt_edges, photon_weights
+from ctsim.dataset.store import list_scans, open_scan
+from ctsim.geometry import Geometry
+from ctsim.reconstruct.log import line_integrals
+from ctsim.reconstruct.scatter import Scatter
+from ctsim.reconstruct.splat import fast, level
+from ctsim.reconstruct.splat.course import levels_of
+from ctsim.reconstruct.splat.curve import MaterialCurve
+from ctsim.reconstruct.splat.lattice import Lattice
+from ctsim.reconstruct.splat.level import unevenness, weighted
+from ctsim.reconstruct.splat.ordered import Fit
+from ctsim.reconstruct.splat.part import Part
+from ctsim.reconstruct.weights import DARK, doubt_edges, even_out, photon_weights
 
 EDGES = fast.Settings().edges
 
@@ -41,6 +53,116 @@ def test_edges_count_less_and_what_says_nothing_makes_none(shape, edges, scatter
     np.testing.assert_allclose(weights, expected, rtol=1e-4, atol=0)
 
 
+@pytest.mark.parametrize("error", [0.0, 7.0, 250.0])
+def test_evened_weights_are_inverse_variances_over_that_of_an_open_ray(error):
+    p = np.linspace(0, 12, 48, dtype=np.float32).reshape(2, 4, 6)
+    weights = photon_weights(p, np.arange(48).reshape(p.shape) % 5 > 0)
+    weights[1, 2] = -0.002
+    variance = np.exp(p.astype(np.float64)) + error  # of photons, and of all else
+    expected = np.where(weights > 0, (1 + error) / variance, weights)
+    even_out(weights, error)
+    np.testing.assert_allclose(weights, expected, rtol=1e-5)
+
+
+def smooth_data(dark, scatter):
+    """A fifth of the rays that met something has p = `dark`, the others have 2.5; three fifths are open."""
+    geometry = Geometry(
+        dso=200.0, dsd=400.0, n_voxel=(8, 8, 8), d_voxel=(1, 1, 1), n_detector=(20, 20), d_detector=(1, 1), n_views=30
+    )
+    p = np.full(geometry.shape, 2.5, np.float32)
+    p[:, :4] = dark
+    p[..., :12] = -np.log1p(scatter) + np.random.default_rng(5).normal(0, 0.003, (30, 20, 12))
+    return weighted(geometry, p, np.ones(p.shape, np.bool_), scatter)
+
+
+@pytest.mark.parametrize("scatter", [0.0, 2e-4])
+@pytest.mark.parametrize("dark", [3.1, 5.0, 7.5])
+def test_dark_rays_come_to_weigh_half_as_much_as_usual_ones(dark, scatter):
+    data = smooth_data(dark, scatter)
+    found = unevenness(data)
+    assert found == pytest.approx(max(np.exp(dark) - 2 * np.exp(2.5), 0), rel=1e-5)
+    even_out(data.weights, found)
+    share = data.weights[0, 0, 15] / data.weights[0, 9, 15]
+    assert share == pytest.approx(max(np.exp(2.5 - dark), 0.5), rel=1e-5)
+
+
+@pytest.mark.parametrize("scatter, more", [(0.0033, True), (0.0034, False)])
+def test_rays_that_read_mostly_scatter_do_not_come_to_weigh_more(scatter, more):
+    """Behind p of 5 a share of 0.0067 is read; half of it is scatter in between."""
+    assert (unevenness(smooth_data(5.0, scatter)) > 0) == more
+
+
+@pytest.mark.parametrize(
+    "dark, error, said", [(3.8, 0.0, False), (4.0, 0.0, True), (7.5, 200.0, True), (7.5, 600.0, False)]
+)
+def test_it_is_said_where_dark_rays_hardly_count(dark, error, said):
+    """Weights of 1/(exp(p) + error): a share of 0.27, 0.22, 0.11 and 0.25 of those of p = 2.5."""
+    sentence = fast._uneven(dataclasses.replace(smooth_data(dark, 0.0), error=error))
+    assert ("smeared" in sentence) == said
+
+
+def test_wire_all_over_an_object_makes_no_thick_body(monkeypatch):
+    """A third of the rays that meet this drumstick meet wire, up to p of 4; what is smooth has p of 1.5 at most."""
+    scan = simulate_scene(wire(n=36)).scan
+    p = line_integrals(scan, slice(None))[0].numpy()
+    data = weighted(scan.geometry, p, np.ones(p.shape, np.bool_))
+    assert unevenness(data) == 0
+    monkeypatch.setattr(level, "SMOOTH", np.inf)
+    assert unevenness(data) > 10
+
+
+def test_weights_are_evened_out_no_further_than_noise_allows(monkeypatch, smallest):
+    """At a tenth of the photons the same error of the model is a tenth of noise's variance; 0 leaves exp(−p)."""
+    scan = open_scan(list_scans(smallest)[0]).scan
+    given = []
+    monkeypatch.setattr(fast, "unevenness", lambda data: 12.0)
+    monkeypatch.setattr(fast, "even_out", lambda weights, error: given.append(error))
+    for model_error, i0 in ((0.02, 1e5), (0.02, 1e4), (0.01, 1e4), (0.0, 1e5)):
+        few = dataclasses.replace(scan, i0=i0)
+        settings = fast.Settings(model_error=model_error)
+        fast._weighted(few, settings, scan.geometry, Scatter(floor=0.0), 0.0)
+    assert given == pytest.approx([12.0, 4.0, 1.0, 0.0])
+
+
+def test_what_only_dark_rays_tell_is_kept():
+    """Stripes along the longer axis of a wide body: rays along them have p of 5.6, and to all others they are even.
+
+    Behind weights exp(−p) the denoiser, which knows no dark rays, smooths them away (0.00); 0.49 of them is kept.
+    """
+    n, d = 96, 340 / 96
+    geometry = Geometry(
+        dso=1000.0,
+        dsd=1500.0,
+        n_voxel=(8, n, n),
+        d_voxel=(d, d, d),
+        n_detector=(16, 153),
+        d_detector=(1.5 * d, 1.5 * d),
+        n_views=120,
+    )
+    settings = fast.Settings(filtration=8.0)
+    response = settings.make_response(120.0, 8.0)
+    curve = MaterialCurve.of(response, 150.0)
+    _, y, x = geometry.voxel_centres()
+    x, y = x[None], y[:, None]
+    inside, wave = (np.abs(x) < 100) & (np.abs(y) < 30), np.cos(2 * np.pi * y / (6 * d))
+    body = np.where(np.hypot(x / 155, y / 60) < 1, 0.85, 0) + 0.1 * inside * wave
+    truth = np.broadcast_to(curve.water * body, geometry.n_voxel).astype(np.float32)
+    lattice = Lattice(geometry=geometry, support=truth > 0)
+    part = Part(geometry=geometry, lattice=lattice, curve=curve, u=lattice.gather(truth), exact=False)
+    every = np.ones(geometry.shape, np.bool_)
+    nothing = weighted(geometry, np.zeros(geometry.shape, np.float32), every)
+    p = Fit(data=nothing, parts=[part], response=response, tv=0.0).fitted(np.arange(geometry.n_views))
+
+    def kept(error):
+        levels = levels_of(weighted(geometry, p, every), coarse=True)
+        even_out(levels[-1].weights, error)
+        found = fast._course(levels, response, settings).go(lambda *state: True).volume()
+        seen = (np.abs(x) < 60) & (np.abs(y) < 20)
+        return np.sum(found[4] * wave, where=seen) / np.sum(truth[4] * wave, where=seen)
+
+    assert kept(0.0) < 0.1 and kept(250.0) > 0.4
+
+
 def test_a_ramp_keeps_its_weights_and_an_edge_does_not():
     p = np.broadcast_to(np.linspace(0, 2.4, 9, dtype=np.float32), (1, 5, 9)).copy()
     weights = photon_weights(p, np.ones(p.shape, np.bool_))
@@ -67,9 +189,9 @@ def test_the_finest_level_is_doubted_and_the_coarser_ones_count_photons(monkeypa
     expected = np.where(finest.weights > 0, photon_weights(finest.p, finest.weights > 0), finest.weights)
     doubt_edges(finest.p, expected, EDGES, finest.scatter)
     assert np.array_equal(finest.weights, expected) and len(seen) > 1
-    for level in seen[:-1]:
-        read = level.weights > 0
-        assert np.array_equal(level.weights[read], photon_weights(level.p, read)[read])
+    for coarse in seen[:-1]:
+        read = coarse.weights > 0
+        assert np.array_equal(coarse.weights[read], photon_weights(coarse.p, read)[read])
 
 
 def wire(n):

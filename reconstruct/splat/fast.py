@@ -5,6 +5,7 @@ to a grid finer than the volume's, as fine as the detector sees. No mask, no spe
 enter.
 """
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -23,23 +24,31 @@ from ctsim.reconstruct.beyond import seen_beyond
 from ctsim.reconstruct.log import finite_or_not, how_it_ended, line_integrals
 from ctsim.reconstruct.panel import without_panel
 from ctsim.reconstruct.primary import PanelLight, Scattered, panel_in, scatter_in
+from ctsim.reconstruct.scatter import Scatter
 from ctsim.reconstruct.settings import about, keywords
 from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
 from ctsim.reconstruct.splat.common import Common, Energy
 from ctsim.reconstruct.splat.course import PASSES, Course, levels_of, passes_over
 from ctsim.reconstruct.splat.curve import DENSEST, STRONGEST, MaterialCurve
 from ctsim.reconstruct.splat.filtration import USUAL, Filtration, found
-from ctsim.reconstruct.splat.level import Data, never_read, thinned
+from ctsim.reconstruct.splat.level import (
+    VIEWS,
+    Data,
+    least_met,
+    never_read,
+    some_readings,
+    thinned,
+    unevenness,
+    usual_and_dark,
+)
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import FILTER, Response, basis_functions, evaluate, make_response, tangent
 from ctsim.reconstruct.starved import Below, weights_and_bounds
 from ctsim.reconstruct.watch import Stopwatch
-from ctsim.reconstruct.weights import DARK, doubt_edges
+from ctsim.reconstruct.weights import DARK, doubt_edges, even_out
 from ctsim.types import Scan, Status, Volume
 
-OPEN = 5.0  # standard deviations of an open pixel below which a ray met nothing
-LEAST_OPEN = 0.01
-VIEWS, SHORTEST = 12, 0.5  # views whose pixels stand for all, and the least path in voxels that counts as one
+SHORTEST = 0.5  # path in voxels that counts as one
 ROUND, OBLONG = 1.25, 1.5
 """Greatest ratio of a voxel's sides on the finest grid, where pixels are as fine, and the one from which on it is said:
 a sum of round splats then varies by 10 % and 20 % from one to the next, by 4 % on cubes."""
@@ -51,6 +60,7 @@ and the share with which a fit has diverged."""
 UNEXPLAINED, DARK_SHARE = 0.2, 1e-4
 """The root mean square that a fit misses dark readings by before it is said to, and their least share. Right metal has
 0.05 to 0.13, wire of which a third is there 0.25; but 0.05 has the hip, too, whose core no reading shows whole."""
+LEAST_SHARE = 0.25  # of a usual ray's weight that a dark one has, before it is said: a pelvis failed with 0.17
 UNREAD = 0.05  # share of the metal that no reading crosses before it is said
 Image = NDArray[np.float32]
 
@@ -80,6 +90,9 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     edges: Annotated[
         float, about("second difference of P between pixels that halves an open ray's weight", ge=1e-3, le=1e6)
     ] = 0.5
+    model_error: Annotated[
+        float, about("what a fit misses of P, up to which dark rays' weights are raised in thick bodies", ge=0, le=10)
+    ] = 0.02
     fineness: Annotated[float, about("how much finer the finest grid is than the volume's", ge=1, le=16)] = 1.5
     fine_metal: Annotated[bool, about("finer splats at the surface of metal, seen by sub-pixels")] = True
     exact: Annotated[bool, about("project splats by their exact line integrals, not by EWA")] = False
@@ -115,12 +128,8 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     as_read, panel = Below.of(scan), panel_in(scan, settings.panel)
     scan = without_panel(scan, panel)
     scatter = scatter_in(scan, settings.scatter)  # first: it takes line integrals of its own, which are then gone
-    p, clamped = line_integrals(scan, slice(None))
     finest = finer(scan.geometry, settings.fineness)
-    below = Below.of(scan) if panel else as_read
-    weights = weights_and_bounds(scan, p.numpy(), ~clamped.numpy(), scatter, below.noise)
-    doubt_edges(p.numpy(), weights, settings.edges, scatter.mean)
-    data = Data(geometry=finest, p=p.numpy(), weights=weights, scatter=scatter.mean)
+    data, clamped = _weighted(scan, settings, finest, scatter, (Below.of(scan) if panel else as_read).noise)
     levels = levels_of(data, coarse=(settings.passes or PASSES)[0] > 0)
     filtration = None if clamped.all() else find_filtration(levels, scan, settings)
     response = settings.make_response(scan.e_max, filtration.value if filtration else settings.filtration or USUAL)
@@ -132,6 +141,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         **(panel.details() if settings.panel == "found" else {}),
         **scatter.details(),
         "clamped_pixels": int(clamped.sum()),
+        "evened_out": data.error,
         "grid": [n * (1 if fit is None else fit.finer) for n in finest.n_voxel],
         "splats": 0 if fit is None else fit.n_splats,
     }
@@ -148,7 +158,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     beyond = seen_beyond(data.p, scan.geometry, scan.i0)
     found_at = "" if filtration is None else filtration.sentence
     of_metal = _unexplained(fit, missed), _bounded(unread)
-    limits = as_read.sentence, panel.sentence, *of_metal, beyond.sentence, found_at, _flat(finest)
+    limits = as_read.sentence, panel.sentence, *of_metal, beyond.sentence, found_at, _flat(finest), _uneven(data)
     details |= {
         "read-out": how,
         "dark_misfit": missed,
@@ -166,6 +176,20 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         details=details,
         at_energy=functools.partial(_at_energy, rho, response),
     )
+
+
+def _weighted(
+    scan: Scan, settings: Settings, geometry: Geometry, scatter: Scatter, noise: float
+) -> tuple[Data, NDArray[np.bool_]]:
+    """Return the scan as the finest grid sees it, and which readings [view, v, u] are clamped."""
+    readings, clamped = line_integrals(scan, slice(None))
+    p = readings.numpy()
+    weights = weights_and_bounds(scan, p, ~clamped.numpy(), scatter, noise)
+    data = Data(geometry=geometry, p=p, weights=weights, scatter=scatter.mean)
+    data = dataclasses.replace(data, error=min(settings.model_error**2 * scan.i0, unevenness(data)))
+    even_out(weights, data.error)
+    doubt_edges(p, weights, settings.edges, scatter.mean)
+    return data, clamped.numpy()
 
 
 def find_filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtration | None:
@@ -294,6 +318,17 @@ def _flat(finest: Geometry) -> str:
     return f"voxels are {ratio:.2g} times as long as wide and splats are round: values may be wrong by a fifth and more"
 
 
+def _uneven(data: Data) -> str:
+    """Say that dark rays hardly count, or nothing."""
+    usual, dark = usual_and_dark(data)
+    if (share := (usual + data.error) / (dark + data.error)) >= LEAST_SHARE:
+        return ""
+    return (
+        f"a tenth of the rays, those of the longest paths, have {share:.0%} and less of the usual weight: what they show "
+        "alone may be smeared along them"
+    )
+
+
 def finer(geometry: Geometry, fineness: float) -> Geometry:
     """Return the geometry with up to `fineness` times as many voxels along each axis, none smaller than a pixel.
 
@@ -356,27 +391,9 @@ def _course(levels: list[Data], response: Response, settings: Settings, trial: b
     )
 
 
-def least_met(data: Data) -> float:
-    """Return how far p of a ray that met something lies above that of open ones."""
-    return max(OPEN / math.sqrt(_open_photons(data)), LEAST_OPEN)
-
-
-def _open_photons(data: Data) -> float:
-    """Estimate the photons of an open pixel from how far p falls below that of open rays, as only noise does: 1/var."""
-    p = _readings(data) - data.open
-    below = p[p < 0].astype(np.float64)
-    return float(1 / max(np.mean(below**2), 1e-12)) if below.size else 1e12
-
-
-def _readings(data: Data) -> Image:
-    """Return the line integrals of a few views' pixels that count."""
-    views = few_views(data.geometry.n_views, VIEWS)
-    return data.p[views][data.weights[views] > 0]
-
-
 def rough_length(data: Data, response: Response, met: float) -> float:
     """Return the water path (mm) behind which p is the median of the rays that met something."""
-    p = _readings(data)
+    p = some_readings(data)
     seen = p[p > met + data.open]
     if not seen.size:
         return 0.0

@@ -8,11 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ctsim.geometry import Geometry
+from ctsim.geometry import Geometry, few_views
 from ctsim.reconstruct.splat.kernels import carve_cpu
 from ctsim.reconstruct.starved import WEIGHT
-from ctsim.reconstruct.weights import photon_weights
+from ctsim.reconstruct.weights import bends, photon_weights
 
+OPEN, LEAST_OPEN = 5.0, 0.01  # standard deviations of an open pixel, or p, below which a ray met nothing
+VIEWS = 12  # whose pixels stand for all
+DARKER, SHARE = 0.9, 0.5  # of the rays are brighter than a dark one, which is to have so much of a usual one's weight
+MOSTLY = 0.5  # of a reading, and it is mostly scatter
+SMOOTH = 0.5  # second difference of p from pixel to pixel that wire and the outlines of metal exceed
 LEAST_VIEWS = 60  # that tell an object from the streaks between them
 AROUND = 3  # pixels whose majority counts: noise alone makes a reading of some pixel without photons in some view
 
@@ -21,13 +26,15 @@ AROUND = 3  # pixels whose majority counts: noise alone makes a reading of some 
 class Data:
     """Line integrals `p` and their weights, float32 [view, v, u]; `scatter`, S/I0, is in p still.
 
-    Where a weight is negative, p is the least that a dark reading allows, without scatter (see `starved`).
+    Where a weight is negative, p is the least that a dark reading allows, without scatter (see `starved`). `error` is
+    that of weights which were evened out (`even_out`).
     """
 
     geometry: Geometry
     p: NDArray[np.float32]
     weights: NDArray[np.float32]
     scatter: float = 0.0
+    error: float = 0.0
 
     @property
     def open(self) -> float:
@@ -135,3 +142,50 @@ def never_read(data: Data, geometry: Geometry) -> NDArray[np.bool_]:
     state = np.zeros(geometry.n_voxel, np.int8)
     carve_cpu.carve(data.geometry.pose_array(), dark, z, y, x, state)
     return state == 1
+
+
+def least_met(data: Data) -> float:
+    """Return how far p of a ray that met something lies above that of open ones."""
+    return max(OPEN / math.sqrt(_open_photons(data)), LEAST_OPEN)
+
+
+def _open_photons(data: Data) -> float:
+    """Estimate the photons of an open pixel from how far p falls below that of open rays, as only noise does: 1/var."""
+    p = some_readings(data) - data.open
+    below = p[p < 0].astype(np.float64)
+    return float(1 / max(np.mean(below**2), 1e-12)) if below.size else 1e12
+
+
+def some_readings(data: Data) -> NDArray[np.float32]:
+    """Return the line integrals of a few views' pixels that count."""
+    views = few_views(data.geometry.n_views, VIEWS)
+    return data.p[views][data.weights[views] > 0]
+
+
+def unevenness(data: Data) -> float:
+    """Return the least error, in variances of an open ray (`even_out`), by which dark rays weigh half as much as usual.
+
+    A step's length is that of usual rays: what rays of a far smaller weight tell alone is not found in the passes of a
+    fit, and smoothed away. 0 where dark rays (`usual_and_dark`) read more scatter than primary: what they tell is then
+    as doubtful as scatter is.
+    """
+    usual, dark = usual_and_dark(data)
+    if dark * data.scatter > MOSTLY:
+        return 0.0
+    return max(dark - usual / SHARE, 0.0) / (1 / SHARE - 1)
+
+
+def usual_and_dark(data: Data) -> tuple[float, float]:
+    """Return exp(p) of a usual ray and a dark one: the median, and what nine tenths of the rays are brighter than.
+
+    Of rays that met something, away from where p bends by `SMOOTH` and more: edges have weights of their own
+    (`doubt_edges`), and wire all over an object makes no thick body. Both are 1 where there are none.
+    """
+    views = few_views(data.geometry.n_views, VIEWS)
+    least, met = least_met(data) + data.open, [np.empty(0, np.float32)]
+    for p, weights in zip(data.p[views], data.weights[views], strict=True):
+        smooth = ndimage.maximum_filter(bends(p, weights != 0), 3) < SMOOTH
+        met.append(p[(weights > 0) & smooth & (p > least)])
+    every = np.concatenate(met)
+    usual, dark = np.exp(np.quantile(every, (0.5, DARKER)).astype(np.float64)) if every.size else (1.0, 1.0)
+    return float(usual), float(dark)
