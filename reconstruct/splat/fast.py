@@ -324,8 +324,8 @@ def _uneven(data: Data) -> str:
     if (share := (usual + data.error) / (dark + data.error)) >= LEAST_SHARE:
         return ""
     return (
-        f"a tenth of the rays, those of the longest paths, have {share:.0%} and less of the usual weight: what they show "
-        "alone may be smeared along them"
+        f"a tenth of the rays, those of the longest paths, have {share:.0%} and less of the usual weight: what they "
+        "show alone may be smeared along them"
     )
 
 
