@@ -17,7 +17,7 @@ from ctsim.reconstruct import starved
 from ctsim.reconstruct.beyond import seen_beyond
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reconstruct.scatter import Scatter
-from ctsim.reconstruct.splat import fast
+from ctsim.reconstruct.splat import verdict
 from ctsim.reconstruct.splat.curve import MaterialCurve
 from ctsim.reconstruct.splat.fast import reconstruct
 from ctsim.reconstruct.splat.level import Data, coarser, never_read
@@ -186,10 +186,10 @@ def test_splats_at_the_end_of_the_curve_are_said_and_many_are_divergence(runaway
     u[:runaway] = curve.knots[-1]
     part = SimpleNamespace(u=u, curve=curve, finer=1)
     fit = Fit(data=None, parts=[part], response=None, tv=0.0)
-    found, reason = fast._verdict(fit, u)
+    found, reason = verdict.verdict(fit, u)
     assert found is status and ("18 times the attenuation of iron" in reason) == (status is Status.DIVERGED)
-    assert said in fast._unexplained(fit, 0.1) and bool(said) == bool(fast._unexplained(fit, 0.1))
-    assert "missed by 0.7" in fast._unexplained(fit, 0.7)
+    assert said in verdict.unexplained(fit, 0.1) and bool(said) == bool(verdict.unexplained(fit, 0.1))
+    assert "missed by 0.7" in verdict.unexplained(fit, 0.7)
 
 
 @pytest.mark.slow
@@ -220,4 +220,4 @@ def test_metal_that_no_view_reads_is_known_from_below_alone():
 
 @pytest.mark.parametrize("share, said", [(None, ""), (0.05, ""), (0.45, "45% of the metal")])
 def test_unread_metal_is_said(share, said):
-    assert fast._bounded(share).startswith(said) and bool(fast._bounded(share)) == bool(said)
+    assert verdict.bounded(share).startswith(said) and bool(verdict.bounded(share)) == bool(said)

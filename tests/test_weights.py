@@ -10,7 +10,7 @@ from ctsim.dataset.store import list_scans, open_scan
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reconstruct.scatter import Scatter
-from ctsim.reconstruct.splat import fast, level
+from ctsim.reconstruct.splat import fast, level, verdict
 from ctsim.reconstruct.splat.course import levels_of
 from ctsim.reconstruct.splat.curve import MaterialCurve
 from ctsim.reconstruct.splat.lattice import Lattice
@@ -97,7 +97,7 @@ def test_rays_that_read_mostly_scatter_do_not_come_to_weigh_more(scatter, more):
 )
 def test_it_is_said_where_dark_rays_hardly_count(dark, error, said):
     """Weights of 1/(exp(p) + error): a share of 0.27, 0.22, 0.11 and 0.25 of those of p = 2.5."""
-    sentence = fast._uneven(dataclasses.replace(smooth_data(dark, 0.0), error=error))
+    sentence = verdict.uneven(dataclasses.replace(smooth_data(dark, 0.0), error=error))
     assert ("smeared" in sentence) == said
 
 

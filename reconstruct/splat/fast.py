@@ -21,7 +21,7 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry, few_views
 from ctsim.reconstruct.beam import detected, refuse_beam, refuse_filtration
 from ctsim.reconstruct.beyond import seen_beyond
-from ctsim.reconstruct.log import finite_or_not, how_it_ended, line_integrals
+from ctsim.reconstruct.log import how_it_ended, line_integrals
 from ctsim.reconstruct.panel import without_panel
 from ctsim.reconstruct.primary import PanelLight, Scattered, panel_in, scatter_in
 from ctsim.reconstruct.scatter import Scatter
@@ -29,39 +29,30 @@ from ctsim.reconstruct.settings import about, keywords
 from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
 from ctsim.reconstruct.splat.common import Common, Energy
 from ctsim.reconstruct.splat.course import PASSES, Course, levels_of, passes_over
-from ctsim.reconstruct.splat.curve import DENSEST, STRONGEST, MaterialCurve
+from ctsim.reconstruct.splat.curve import DENSEST, MaterialCurve
 from ctsim.reconstruct.splat.filtration import USUAL, Filtration, found
 from ctsim.reconstruct.splat.level import (
     VIEWS,
     Data,
     least_met,
-    never_read,
     some_readings,
     thinned,
     unevenness,
-    usual_and_dark,
 )
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import FILTER, Response, basis_functions, evaluate, make_response, tangent
+from ctsim.reconstruct.splat.verdict import bounded, dark_misfit, flat, metal_unread, uneven, unexplained, verdict
 from ctsim.reconstruct.starved import Below, weights_and_bounds
 from ctsim.reconstruct.watch import Stopwatch
-from ctsim.reconstruct.weights import DARK, doubt_edges, even_out
+from ctsim.reconstruct.weights import doubt_edges, even_out
 from ctsim.types import Scan, Status, Volume
 
 SHORTEST = 0.5  # path in voxels that counts as one
-ROUND, OBLONG = 1.25, 1.5
-"""Greatest ratio of a voxel's sides on the finest grid, where pixels are as fine, and the one from which on it is said:
-a sum of round splats then varies by 10 % and 20 % from one to the next, by 4 % on cubes."""
+ROUND = 1.25
+"""Greatest ratio of a voxel's sides on the finest grid, where pixels are as fine: a sum of round splats then varies by
+10 % from one to the next, by 4 % on cubes."""
 ENOUGH, VIEWED = 32, 4  # voxels along an axis, and views, on which the filtration is found
 TRIAL = (2, 4)  # passes of a trial
-AT_THE_END, FEW, FEWEST, MANY = 0.9, 1e-4, 10, 0.01
-"""Share of the curve's last attenuation, which no metal has; the share of the splats, or how many, that may have it;
-and the share with which a fit has diverged."""
-UNEXPLAINED, DARK_SHARE = 0.2, 1e-4
-"""The root mean square that a fit misses dark readings by before it is said to, and their least share. Right metal has
-0.05 to 0.13, wire of which a third is there 0.25; but 0.05 has the hip, too, whose core no reading shows whole."""
-LEAST_SHARE = 0.25  # of a usual ray's weight that a dark one has, before it is said: a pelvis failed with 0.17
-UNREAD = 0.05  # share of the metal that no reading crosses before it is said
 Image = NDArray[np.float32]
 
 
@@ -153,12 +144,12 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
             details["limitation"] = "no ray met anything: the volume is empty"
         return Volume(values=empty, status=status, reason=reason, details=details, at_energy=at_energy)
     values, rho, how = _read(fit, settings, scan.geometry)
-    status, reason = _verdict(fit, values)
-    missed, unread = _dark_misfit(fit), _unread(fit, rho, scan.geometry)
+    status, reason = verdict(fit, values)
+    missed, unread = dark_misfit(fit), metal_unread(fit, _summed(fit.curve.tangent, rho), scan.geometry)
     beyond = seen_beyond(data.p, scan.geometry, scan.i0)
     found_at = "" if filtration is None else filtration.sentence
-    of_metal = _unexplained(fit, missed), _bounded(unread)
-    limits = as_read.sentence, panel.sentence, *of_metal, beyond.sentence, found_at, _flat(finest), _uneven(data)
+    of_metal = unexplained(fit, missed), bounded(unread)
+    limits = as_read.sentence, panel.sentence, *of_metal, beyond.sentence, found_at, flat(finest), uneven(data)
     details |= {
         "read-out": how,
         "dark_misfit": missed,
@@ -250,82 +241,6 @@ def _checkpoint(course: Course, scan: Scan, settings: Settings) -> Checkpoint:
     told = msgspec.structs.replace(settings, seconds=math.inf, readout="hardened", checkpoints="")
     return Checkpoint(
         folder=Path(settings.checkpoints), identity=identity_of(scan, (told, course.passes), "splat", __name__)
-    )
-
-
-def _verdict(fit: Fit, values: Image) -> tuple[Status, str]:
-    """Say how a fit ended, and why if not well."""
-    status, reason = finite_or_not(values)
-    if status is not Status.OK:
-        return status, reason
-    runaway, of = _runaway(fit)
-    if runaway <= max(MANY * of, FEWEST):
-        return Status.OK, ""
-    return Status.DIVERGED, (
-        f"{runaway:.0f} of {of:.0f} splats went to {AT_THE_END * STRONGEST:g} times the attenuation of iron: "
-        "readings are darker than any metal makes them; are the scan's dark and open field right?"
-    )
-
-
-def _runaway(fit: Fit) -> tuple[float, float]:
-    """Return how many splats stand where no metal does, and of how many."""
-    return fit.many_above(AT_THE_END * float(fit.curve.knots[-1]))
-
-
-def _dark_misfit(fit: Fit) -> float | None:
-    """Return the root mean square of p − P over dark readings of a few views, None where there are hardly any."""
-    views = np.asarray(few_views(fit.data.geometry.n_views, VIEWS))
-    p, weights = fit.data.p[views], fit.data.weights[views]
-    dark = (weights > 0) & (p > DARK)
-    if dark.sum() <= DARK_SHARE * dark.size:
-        return None
-    return float(np.sqrt(np.mean(np.square((p - fit.fitted(views))[dark], dtype=np.float64))))
-
-
-def _unexplained(fit: Fit, missed: float | None) -> str:
-    """Say that metal does not explain its shadow, `missed` by its dark readings, or nothing."""
-    if missed is not None and missed > UNEXPLAINED:
-        return (
-            f"readings of P > {DARK:g} are missed by {missed:.2g} (root mean square): metal is thinner than the grid "
-            "or denser than its readings show, so its values, and tissue next to it, may be wrong"
-        )
-    runaway, of = _runaway(fit)
-    if runaway > max(FEW * of, FEWEST):
-        return f"metal reaches {AT_THE_END * STRONGEST:g} times iron, where the assumed materials end"
-    return ""
-
-
-def _unread(fit: Fit, rho: Image, geometry: Geometry) -> float | None:
-    """Return the share of dense metal through which there are no readings, None where there is no such metal."""
-    metal = _summed(fit.curve.tangent, rho) > DENSEST * fit.curve.water
-    return float(never_read(fit.data, geometry)[metal].mean()) if metal.any() else None
-
-
-def _bounded(unread: float | None) -> str:
-    """Say that a share of the metal is known from below alone, or nothing."""
-    if unread is None or unread <= UNREAD:
-        return ""
-    return (
-        f"{unread:.0%} of the metal lies where rays lose all photons that noise lets count, so it is known from below "
-        "alone: it may attenuate several times as much"
-    )
-
-
-def _flat(finest: Geometry) -> str:
-    """Say that splats are too round for the voxels of the finest grid, or nothing."""
-    if (ratio := max(finest.d_voxel) / min(finest.d_voxel)) < OBLONG:
-        return ""
-    return f"voxels are {ratio:.2g} times as long as wide and splats are round: values may be wrong by a fifth and more"
-
-
-def _uneven(data: Data) -> str:
-    """Say that dark rays hardly count, or nothing."""
-    usual, dark = usual_and_dark(data)
-    if (share := (usual + data.error) / (dark + data.error)) >= LEAST_SHARE:
-        return ""
-    return (
-        f"a tenth of the rays, those of the longest paths, have {share:.0%} and less of the usual weight: what they "
-        "show alone may be smeared along them"
     )
 
 
