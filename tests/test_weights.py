@@ -101,6 +101,13 @@ def test_it_is_said_where_dark_rays_hardly_count(dark, error, said):
     assert ("smeared" in sentence) == said
 
 
+def test_a_volume_says_by_how_much_weights_were_evened_out(monkeypatch, smallest):
+    monkeypatch.setattr(fast, "unevenness", lambda data: 12.0)
+    monkeypatch.setattr(fast, "uneven", lambda data: f"{data.error:g} was not enough")
+    details = fast.reconstruct(open_scan(list_scans(smallest)[0]).scan, passes=(0, 1), model_error=10.0).details
+    assert details["evened_out"] == 12.0 and "12 was not enough" in details["limitation"]
+
+
 def test_wire_all_over_an_object_makes_no_thick_body(monkeypatch):
     """A third of the rays that meet this drumstick meet wire, up to p of 4; what is smooth has p of 1.5 at most."""
     scan = simulate_scene(wire(n=36)).scan

@@ -65,6 +65,8 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     `passes` null makes them 3 and 9, or fewer, at least one, where the passes over a level times its views times its
     voxels would be more than 6e10, minutes of two cores. `tv` is stronger in the first passes and on coarser levels.
+    With `model_error` 0 the weights are the share of photons that came through. Otherwise those of dark rays are raised
+    on the finest grid, to half of the usual weight where a body is thick (`unevenness`), as far as noise is below it.
     The finest grid is at most as fine as the detector's pixels at the isocentre. With `fine_metal` the splats within
     two voxels of the surface of metal are half as far apart in the second half of the passes over that grid.
     `response` "tube" is a tube behind `filtration`, seen by a scintillator; null has it found, on grids of at least 32
@@ -82,7 +84,7 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
         float, about("second difference of P between pixels that halves an open ray's weight", ge=1e-3, le=1e6)
     ] = 0.5
     model_error: Annotated[
-        float, about("what a fit misses of P, up to which dark rays' weights are raised in thick bodies", ge=0, le=10)
+        float, about("what a fit misses of P besides noise, which evens out weights behind thick bodies", ge=0, le=10)
     ] = 0.02
     fineness: Annotated[float, about("how much finer the finest grid is than the volume's", ge=1, le=16)] = 1.5
     fine_metal: Annotated[bool, about("finer splats at the surface of metal, seen by sub-pixels")] = True

@@ -1,7 +1,8 @@
 """Weighted least squares by ordered subsets, one unknown a splat, edges kept.
 
 Minimises ½ Σ_rays w (P(u) − p)² + TV with w = exp(−p), the share of photons that came through, so that starved rays
-count for little and no mask is needed; edges count less still (`ctsim.reconstruct.weights`). A subset's step is
+count for little and no mask is needed; behind thick bodies weights are evened out, and edges count less still
+(`ctsim.reconstruct.weights`). A subset's step is
 s·F(s·g), g the gradient, s² the inverse of a separable majoriser of the Hessian (Erdogan and Fessler, Phys. Med. Biol.
 44, 1999, doi:10.1088/0031-9155/44/11/311), and F a ramp filter of the transverse frequencies: n views of a subset
 overlap only below n/π cycles a field of view; above, one view alone answers for a frequency, and up to n times the step
