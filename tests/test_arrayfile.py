@@ -55,6 +55,21 @@ def test_a_tiff_that_is_cut_off_between_pages_is_refused_whatever_is_logged(tmp_
     assert logger.level == level
 
 
+def test_files_that_are_read_at_once_hear_of_what_they_lack(tmp_path, monkeypatch):
+    """The first one is closed while the second one is open, as threads do."""
+    logger = logging.getLogger("tifffile")
+    monkeypatch.setattr(logger, "level", logging.CRITICAL + 1)
+    for name in ("a.tif", "b.tif"):
+        tifffile.imwrite(tmp_path / name, BLOCK, photometric="minisblack")
+    first, second = (arrayfile._opened_tiff(tmp_path / name) for name in ("a.tif", "b.tif"))
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert logger.isEnabledFor(logging.WARNING)
+    second.__exit__(None, None, None)
+    assert logger.level == logging.CRITICAL + 1
+
+
 def test_a_small_file_that_decodes_to_much_is_refused_before(tmp_path, never_decoded):
     """300 MB of zeros in 0.3 MB."""
     path = tmp_path / "zeros.tif"

@@ -11,7 +11,7 @@ import warnings
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,27 +144,40 @@ def _opened_tiff(path: Path) -> Iterator[Any]:
     """
     import tifffile
 
-    logger, heard = logging.getLogger("tifffile"), _Heard()
-    logger.addHandler(heard)
-    level = logger.level
-    logger.setLevel(logging.WARNING)  # somebody may have silenced it
-    try:
-        with tifffile.TiffFile(path, is_ome=False, is_mmstack=False, is_ndtiff=False) as file:
-            yield file
-        if any("invalid page offset" in said for said in heard.said):
-            raise InputError(f"{path} ends before its pages do")
-    finally:
-        logger.setLevel(level)
-        logger.removeHandler(heard)
+    with _Heard() as heard, tifffile.TiffFile(path, is_ome=False, is_mmstack=False, is_ndtiff=False) as file:
+        yield file
+    if any("invalid page offset" in said for said in heard.said):
+        raise InputError(f"{path} ends before its pages do")
 
 
 class _Heard(logging.Handler):
-    """Keeps what is logged in its thread; without a handler logging would print it before our own sentence."""
+    """Keeps what tifffile logs in its thread; without a handler logging would print it before our own sentence.
+
+    The logger listens to warnings while any file is open, also where somebody has silenced it, and is then as before.
+    """
+
+    _logger, _lock = logging.getLogger("tifffile"), threading.Lock()
+    _before: ClassVar[list[int]] = []
+    """The logger's level when the first of the open files was opened, once for each of them."""
 
     def __init__(self) -> None:
         super().__init__()
         self.said: list[str] = []
         self._thread = threading.get_ident()
+
+    def __enter__(self) -> Self:
+        with self._lock:
+            self._before.append(self._before[0] if self._before else self._logger.level)
+            self._logger.setLevel(logging.WARNING)
+            self._logger.addHandler(self)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._logger.removeHandler(self)
+            level = self._before.pop()
+            if not self._before:
+                self._logger.setLevel(level)
 
     def emit(self, record: logging.LogRecord) -> None:
         if record.thread == self._thread:
