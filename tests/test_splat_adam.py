@@ -11,7 +11,7 @@ from test_splat_project import SMALL, splats, with_
 from ctsim import rng
 from ctsim.errors import InputError
 from ctsim.kernels.lanes import WIDTH
-from ctsim.reconstruct.splat import adam, densify, loss
+from ctsim.reconstruct.splat.descent import adam, densify, loss
 from ctsim.reconstruct.splat.kernels.splat_reference import covariances
 from ctsim.reconstruct.splat.model import Splats
 from ctsim.reconstruct.splat.project import Gradient, Projector

@@ -14,10 +14,10 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.beam import detected
 from ctsim.reconstruct.settings import parameters_of
-from ctsim.reconstruct.splat import adam, densify
-from ctsim.reconstruct.splat.learner import LEAST_VALUE, Learner, seed_splats
-from ctsim.reconstruct.splat.loss import l1_ssim
-from ctsim.reconstruct.splat.objective import Objective
+from ctsim.reconstruct.splat.descent import adam, densify
+from ctsim.reconstruct.splat.descent.learner import LEAST_VALUE, Learner, seed_splats
+from ctsim.reconstruct.splat.descent.loss import l1_ssim
+from ctsim.reconstruct.splat.descent.objective import Objective
 from ctsim.reconstruct.splat.published import fit_published, paper, r2, read_out
 from ctsim.reconstruct.splat.published_settings import Baseline, Settings
 from ctsim.reconstruct.splat.response import evaluate

@@ -29,9 +29,9 @@ from ctsim.kernels.lanes import WIDTH
 from ctsim.reconstruct import log, starved
 from ctsim.reconstruct.log import line_integrals
 from ctsim.reconstruct.splat import course, level, ordered, part
-from ctsim.reconstruct.splat.learner import seed_splats
-from ctsim.reconstruct.splat.loss import l1_ssim
-from ctsim.reconstruct.splat.objective import SSIM_RANGE, Objective
+from ctsim.reconstruct.splat.descent.learner import seed_splats
+from ctsim.reconstruct.splat.descent.loss import l1_ssim
+from ctsim.reconstruct.splat.descent.objective import SSIM_RANGE, Objective
 from ctsim.reconstruct.splat.project import Projector
 from ctsim.reconstruct.splat.published_settings import Settings
 

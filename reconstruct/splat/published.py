@@ -18,11 +18,11 @@ from ctsim.geometry import few_views
 from ctsim.reconstruct.log import NO_SIGNAL, finite_or_not, is_blind, line_integrals
 from ctsim.reconstruct.primary import primary
 from ctsim.reconstruct.settings import keywords
-from ctsim.reconstruct.splat.adam import Array
 from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
-from ctsim.reconstruct.splat.learner import LEAST_VALUE, Learner, seed_splats, splats_of
+from ctsim.reconstruct.splat.descent.adam import Array
+from ctsim.reconstruct.splat.descent.learner import LEAST_VALUE, Learner, seed_splats, splats_of
+from ctsim.reconstruct.splat.descent.objective import Objective
 from ctsim.reconstruct.splat.model import Splats
-from ctsim.reconstruct.splat.objective import Objective
 from ctsim.reconstruct.splat.published_settings import Baseline, Settings
 from ctsim.reconstruct.splat.response import Response, basis_functions, tangent
 from ctsim.reconstruct.splat.volume import voxelise

@@ -18,8 +18,8 @@ from ctsim.reconstruct.beam import detected, refuse_beam
 from ctsim.reconstruct.settings import about
 from ctsim.reconstruct.splat import response as responses
 from ctsim.reconstruct.splat.common import Common, Energy
-from ctsim.reconstruct.splat.densify import Schedule
-from ctsim.reconstruct.splat.loss import TV_SHARE
+from ctsim.reconstruct.splat.descent.densify import Schedule
+from ctsim.reconstruct.splat.descent.loss import TV_SHARE
 from ctsim.reconstruct.splat.response import MOST_NODES, SOFTEST, Response, make_response
 
 Basis = Literal["paper", "klein-nishina", "constant", "photoelectric"]

@@ -22,7 +22,7 @@ from ctsim.detector.noise import Noise
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.plan import make_plan
-from ctsim.reconstruct.splat.densify import Schedule, densify
+from ctsim.reconstruct.splat.descent.densify import Schedule, densify
 from ctsim.reconstruct.splat.kernels import response_reference, splat_reference
 from ctsim.reconstruct.splat.model import Splats
 from ctsim.reconstruct.splat.project import Projector

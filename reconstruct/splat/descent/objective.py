@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.reconstruct.log import line_integrals
-from ctsim.reconstruct.splat import adam
 from ctsim.reconstruct.splat import response as responses
-from ctsim.reconstruct.splat.adam import Activation, Array
-from ctsim.reconstruct.splat.loss import brick, l1_ssim, total_variation
+from ctsim.reconstruct.splat.descent import adam
+from ctsim.reconstruct.splat.descent.adam import Activation, Array
+from ctsim.reconstruct.splat.descent.loss import brick, l1_ssim, total_variation
 from ctsim.reconstruct.splat.model import Splats
 from ctsim.reconstruct.splat.project import Projector
 from ctsim.reconstruct.splat.published_settings import Settings

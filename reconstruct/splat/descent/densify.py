@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ctsim import rng
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.reconstruct.splat.adam import Array, Moments
+from ctsim.reconstruct.splat.descent.adam import Array, Moments
 from ctsim.reconstruct.splat.kernels.rotations_cpu import write_rotations
 from ctsim.reconstruct.splat.model import Splats
 

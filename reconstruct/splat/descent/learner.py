@@ -16,10 +16,10 @@ from scipy.spatial import KDTree
 from ctsim import rng
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.fdk import fdk
-from ctsim.reconstruct.splat import adam, densify
-from ctsim.reconstruct.splat.adam import Array, Moments
+from ctsim.reconstruct.splat.descent import adam, densify
+from ctsim.reconstruct.splat.descent.adam import Array, Moments
+from ctsim.reconstruct.splat.descent.objective import Objective, stream
 from ctsim.reconstruct.splat.model import Splats
-from ctsim.reconstruct.splat.objective import Objective, stream
 from ctsim.reconstruct.splat.published_settings import ALONE, RATES, START, Settings
 from ctsim.reconstruct.splat.response import Response
 
