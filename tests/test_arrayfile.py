@@ -1,6 +1,5 @@
 """Files from elsewhere: what they declare is judged before it is decoded, and is one sentence where it cannot be."""
 
-import logging
 import zipfile
 
 import numpy as np
@@ -42,32 +41,37 @@ def test_what_is_plausible_is_read_as_it_is(tmp_path, compression):
             np.testing.assert_array_equal(read_array(tmp_path / name, shape), BLOCK)
 
 
-@pytest.mark.parametrize("level", [logging.NOTSET, logging.CRITICAL + 1])
-def test_a_tiff_that_is_cut_off_between_pages_is_refused_whatever_is_logged(tmp_path, level, monkeypatch):
-    path, logger = tmp_path / "a.tif", logging.getLogger("tifffile")
-    tifffile.imwrite(path, np.zeros((6, 32, 32), np.int16), photometric="minisblack", metadata=None)
+@pytest.mark.parametrize("bigtiff, order", [(False, "<"), (False, ">"), (True, "<"), (True, ">")])
+def test_a_tiff_that_is_cut_off_between_pages_is_refused(tmp_path, bigtiff, order, caplog):
+    """Before tifffile opens it, which would give what is left and log the rest."""
+    path = tmp_path / "a.tif"
+    slices = np.arange(6 * 32 * 32, dtype=np.int16).reshape(6, 32, 32)
+    tifffile.imwrite(path, slices, bigtiff=bigtiff, byteorder=order, photometric="minisblack", metadata=None)
+    np.testing.assert_array_equal(read_array(path), slices)
+    whole = path.read_bytes()
     with tifffile.TiffFile(path) as file:
-        offset = file.pages[3].offset
-    path.write_bytes(path.read_bytes()[:offset])
-    monkeypatch.setattr(logger, "level", level)
-    with pytest.raises(InputError, match="ends before its pages do"):
-        read_array(path)
-    assert logger.level == level
+        offsets = [page.offset for page in file.pages]
+    for end in (offsets[3], offsets[3] + 1, offsets[-1] + 9):
+        path.write_bytes(whole[:end])
+        with pytest.raises(InputError, match=r"^\S+a\.tif ends before its pages do$"):
+            read_array(path)
+        with pytest.raises(InputError, match="ends before its pages do"):
+            arrayfile.describe_array(path)
+    assert not caplog.records
 
 
-def test_files_that_are_read_at_once_hear_of_what_they_lack(tmp_path, monkeypatch):
-    """The first one is closed while the second one is open, as threads do."""
-    logger = logging.getLogger("tifffile")
-    monkeypatch.setattr(logger, "level", logging.CRITICAL + 1)
-    for name in ("a.tif", "b.tif"):
-        tifffile.imwrite(tmp_path / name, BLOCK, photometric="minisblack")
-    first, second = (arrayfile._opened_tiff(tmp_path / name) for name in ("a.tif", "b.tif"))
-    first.__enter__()
-    second.__enter__()
-    first.__exit__(None, None, None)
-    assert logger.isEnabledFor(logging.WARNING)
-    second.__exit__(None, None, None)
-    assert logger.level == logging.CRITICAL + 1
+def test_pages_that_lead_back_to_the_first_end_somewhere(tmp_path):
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, np.zeros((2, 8, 8), np.uint8), photometric="minisblack", metadata=None)
+    with tifffile.TiffFile(path) as file:
+        first, last = (page.offset for page in file.pages)
+    data = bytearray(path.read_bytes())
+    n_tags = int.from_bytes(data[last : last + 2], "little")
+    at = last + 2 + 12 * n_tags
+    data[at : at + 4] = first.to_bytes(4, "little")
+    path.write_bytes(data)
+    with path.open("rb") as file:
+        assert arrayfile._holds_its_pages(file)
 
 
 def test_a_small_file_that_decodes_to_much_is_refused_before(tmp_path, never_decoded):
