@@ -18,10 +18,10 @@ def photon_weights(p: Image, valid: NDArray[np.bool_]) -> Image:
 
 
 def even_out(weights: Image, error: float) -> None:
-    """Make weights w > 0 of readings (1 + error)·w/(1 + error·w), in place.
+    """Make weights w > 0 of readings (1 + error)·w/(1 + error·w), in place; bounds keep theirs.
 
-    Weights exp(−p) are inverse variances by the noise of photons, over that of an open ray. These are inverse variances
-    with an error of the model added, whose variance is `error` times that of an open ray.
+    Weights exp(−p) are inverse variances by the noise of photons, that of an open ray over a ray's. Here both have an
+    error of the model added, whose variance is `error` times that of an open ray's noise.
     """
     more = np.float32(error)
     for weight in weights:  # a view at a time stays in the cache
@@ -41,13 +41,17 @@ def doubt_edges(p: Image, weights: Image, edges: float, scatter: float = 0.0) ->
     readings has.
     """
     for reading, weight in zip(p, weights, strict=True):
-        if scatter:
-            reading = np.where(weight < 0, -np.log(np.exp(-reading) + np.float32(scatter)), reading)
+        reading = as_read(reading, weight, scatter)
         bend = bends(reading, weight != 0) / np.float32(edges)
         dark = (reading > DARK) & (weight != 0)
         if dark.any():
             bend = np.where(ndimage.maximum_filter(dark, 3), ndimage.maximum_filter(bend, 3), bend)
         weight /= 1 + np.maximum(weight, 0) * bend * bend
+
+
+def as_read(p: Image, weights: Image, scatter: float) -> Image:
+    """Return line integrals with `scatter`, S/I0, in those of bounds, w < 0, too."""
+    return np.where(weights < 0, -np.log(np.exp(-p) + np.float32(scatter)), p) if scatter else p
 
 
 def bends(image: Image, says: NDArray[np.bool_]) -> Image:

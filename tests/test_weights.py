@@ -14,7 +14,7 @@ from ctsim.reconstruct.splat import fast, level, verdict
 from ctsim.reconstruct.splat.course import levels_of
 from ctsim.reconstruct.splat.curve import MaterialCurve
 from ctsim.reconstruct.splat.lattice import Lattice
-from ctsim.reconstruct.splat.level import unevenness, weighted
+from ctsim.reconstruct.splat.level import evening_error, rays_met, weighted
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.part import Part
 from ctsim.reconstruct.weights import DARK, doubt_edges, even_out, photon_weights
@@ -79,17 +79,91 @@ def smooth_data(dark, scatter):
 @pytest.mark.parametrize("dark", [3.1, 5.0, 7.5])
 def test_dark_rays_come_to_weigh_half_as_much_as_usual_ones(dark, scatter):
     data = smooth_data(dark, scatter)
-    found = unevenness(data)
+    found = evening_error(data, 1e6)
     assert found == pytest.approx(max(np.exp(dark) - 2 * np.exp(2.5), 0), rel=1e-5)
     even_out(data.weights, found)
     share = data.weights[0, 0, 15] / data.weights[0, 9, 15]
     assert share == pytest.approx(max(np.exp(2.5 - dark), 0.5), rel=1e-5)
 
 
-@pytest.mark.parametrize("scatter, more", [(0.0033, True), (0.0034, False)])
-def test_rays_that_read_mostly_scatter_do_not_come_to_weigh_more(scatter, more):
-    """Behind p of 5 a share of 0.0067 is read; half of it is scatter in between."""
-    assert (unevenness(smooth_data(5.0, scatter)) > 0) == more
+def test_rays_that_read_mostly_scatter_do_not_come_to_weigh_more():
+    """Behind p of 5 a share of 0.0067 is read. m is whole up to scatter of two fifths of that, and 0 from half on."""
+    most = 40.0
+
+    def found(share):
+        return evening_error(smooth_data(5.0, share * np.exp(-5.0)), most)
+
+    assert found(0.399) == most and found(0.501) == 0
+    steps = [found(share) for share in np.arange(0.39, 0.52, 0.002)]
+    assert max(np.abs(np.diff(steps))) < 0.03 * most
+    assert found(3 / 7) == pytest.approx(0.75 * most, rel=0.01)  # scatter is three quarters of the primary
+
+
+def test_starved_rays_count_as_darker_than_nine_tenths():
+    """A body that grows thicker turns dark readings into bounds, and is left as it is from a tenth of them on."""
+
+    def found(rows):
+        data = smooth_data(5.0, 0.0)
+        data.weights[:, -rows:, 12:] = -0.002
+        return evening_error(data, 10.0)
+
+    assert [found(rows) for rows in (1, 2)] == pytest.approx([10.0, 0.0])
+    data = smooth_data(5.0, 0.0)
+    data.weights[:, :4, 12:] = -0.002
+    assert rays_met(data).dark == pytest.approx(np.exp(2.5), rel=1e-5)
+    data = smooth_data(5.0, 0.0)
+    data.weights[:, -1:, 12:] = -0.002
+    data.weights[:15, -2:, 12:] = -0.002  # 0.075 of the rays
+    assert rays_met(data).starved == pytest.approx(0.075, abs=0.005) and evening_error(data, 10.0) == pytest.approx(
+        5, abs=1
+    )
+
+
+def test_noise_of_dark_rays_is_no_edge():
+    """Of 5000 photons 34 come through p of 5: noise alone makes second differences of 0.4."""
+    data, draws = smooth_data(5.0, 0.0), np.random.default_rng(9)
+    photons = draws.poisson(5e3 * np.exp(-data.p.astype(np.float64)))
+    noisy = weighted(data.geometry, -np.log(np.maximum(photons, 1) / 5e3).astype(np.float32), photons > 0)
+    found = rays_met(noisy)
+    assert found.dark > 3 * found.usual and evening_error(noisy, 2.0) == 2.0
+    assert "of the usual weight" in verdict.uneven(dataclasses.replace(noisy, error=2.0))
+
+
+def test_bounds_next_to_readings_are_no_edge():
+    """A bound's p lacks scatter: 4.6 and scatter of 0.01 read 3.9, which the row next to it does."""
+    data = smooth_data(3.9, 0.01)
+    data.p[:, 4, 12:] = 3.9  # three rows lie at the lower dark end, of which two are not next to its edge
+    data.p[:, 0], data.weights[:, 0] = 4.6, -0.002
+    assert rays_met(data).dark == pytest.approx(np.exp(3.9), rel=1e-3)
+
+
+def test_the_usual_ray_is_the_median_of_readings():
+    data = smooth_data(5.0, 0.0)
+    data.p[:, 4:13, 12:] = 1.5  # off the edges 2 rows have 5, 5 rows 1.5 and 5 rows 2.5
+    found = rays_met(data)
+    assert (found.usual, found.dark) == pytest.approx((np.exp(2.5), np.exp(5.0)), rel=1e-5)
+    data.weights[...] = 0
+    assert evening_error(data, 10.0) == 0 and rays_met(data).dark == 1
+
+
+def test_edges_are_doubted_in_weights_that_were_evened_out(monkeypatch, smallest):
+    scan = open_scan(list_scans(smallest)[0]).scan
+    monkeypatch.setattr(fast, "evening_error", lambda data, most: 12.0)
+    data, _ = fast._weighted(scan, fast.Settings(), scan.geometry, Scatter(floor=0.0), 0.0)
+    expected = photon_weights(data.p, data.weights > 0)
+    even_out(expected, 12.0)
+    doubt_edges(data.p, expected, EDGES)
+    read = data.weights > 0
+    assert np.array_equal(data.weights[read], expected[read]) and data.error == 12.0
+    even_out(wrong := data.weights.copy(), 12.0)
+    assert not np.allclose(wrong, data.weights)
+
+
+def test_coarser_grids_count_photons_alone():
+    data = smooth_data(5.0, 0.0)
+    even_out(data.weights, 12.0)
+    coarse = level.coarser(dataclasses.replace(data, error=12.0))
+    assert np.array_equal(coarse.weights, photon_weights(coarse.p, coarse.weights > 0)) and coarse.error == 0
 
 
 @pytest.mark.parametrize(
@@ -102,7 +176,7 @@ def test_it_is_said_where_dark_rays_hardly_count(dark, error, said):
 
 
 def test_a_volume_says_by_how_much_weights_were_evened_out(monkeypatch, smallest):
-    monkeypatch.setattr(fast, "unevenness", lambda data: 12.0)
+    monkeypatch.setattr(fast, "evening_error", lambda data, most: 12.0)
     monkeypatch.setattr(fast, "uneven", lambda data: f"{data.error:g} was not enough")
     details = fast.reconstruct(open_scan(list_scans(smallest)[0]).scan, passes=(0, 1), model_error=10.0).details
     assert details["evened_out"] == 12.0 and "12 was not enough" in details["limitation"]
@@ -113,16 +187,16 @@ def test_wire_all_over_an_object_makes_no_thick_body(monkeypatch):
     scan = simulate_scene(wire(n=36)).scan
     p = line_integrals(scan, slice(None))[0].numpy()
     data = weighted(scan.geometry, p, np.ones(p.shape, np.bool_))
-    assert unevenness(data) == 0
+    assert evening_error(data, 1e6) == 0
     monkeypatch.setattr(level, "SMOOTH", np.inf)
-    assert unevenness(data) > 10
+    assert evening_error(data, 1e6) > 10
 
 
 def test_weights_are_evened_out_no_further_than_noise_allows(monkeypatch, smallest):
     """At a tenth of the photons the same error of the model is a tenth of noise's variance; 0 leaves exp(−p)."""
     scan = open_scan(list_scans(smallest)[0]).scan
     given = []
-    monkeypatch.setattr(fast, "unevenness", lambda data: 12.0)
+    monkeypatch.setattr(level, "rays_met", lambda data: level.Rays(usual=2.0, dark=16.0, starved=0.0))
     monkeypatch.setattr(fast, "even_out", lambda weights, error: given.append(error))
     for model_error, i0 in ((0.02, 1e5), (0.02, 1e4), (0.01, 1e4), (0.0, 1e5)):
         few = dataclasses.replace(scan, i0=i0)

@@ -31,14 +31,7 @@ from ctsim.reconstruct.splat.common import Common, Energy
 from ctsim.reconstruct.splat.course import PASSES, Course, levels_of, passes_over
 from ctsim.reconstruct.splat.curve import DENSEST, MaterialCurve
 from ctsim.reconstruct.splat.filtration import USUAL, Filtration, found
-from ctsim.reconstruct.splat.level import (
-    VIEWS,
-    Data,
-    least_met,
-    some_readings,
-    thinned,
-    unevenness,
-)
+from ctsim.reconstruct.splat.level import VIEWS, Data, evening_error, least_met, some_readings, thinned
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import FILTER, Response, basis_functions, evaluate, make_response, tangent
 from ctsim.reconstruct.splat.verdict import bounded, dark_misfit, flat, metal_unread, uneven, unexplained, verdict
@@ -65,8 +58,9 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     `passes` null makes them 3 and 9, or fewer, at least one, where the passes over a level times its views times its
     voxels would be more than 6e10, minutes of two cores. `tv` is stronger in the first passes and on coarser levels.
-    With `model_error` 0 the weights are the share of photons that came through. Otherwise those of dark rays are raised
-    on the finest grid, to half of the usual weight where a body is thick (`unevenness`), as far as noise is below it.
+    Weights are the share of photons that came through. Where a body is thick those of dark rays are raised on the
+    finest grid, to half of the usual weight, but by no more than an error of P of `model_error` besides noise would; 0
+    leaves them. `edges` then lowers some.
     The finest grid is at most as fine as the detector's pixels at the isocentre. With `fine_metal` the splats within
     two voxels of the surface of metal are half as far apart in the second half of the passes over that grid.
     `response` "tube" is a tube behind `filtration`, seen by a scintillator; null has it found, on grids of at least 32
@@ -84,7 +78,7 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
         float, about("second difference of P between pixels that halves an open ray's weight", ge=1e-3, le=1e6)
     ] = 0.5
     model_error: Annotated[
-        float, about("what a fit misses of P besides noise, which evens out weights behind thick bodies", ge=0, le=10)
+        float, about("error of P besides noise by which weights behind thick bodies may be evened out", ge=0, le=10)
     ] = 0.02
     fineness: Annotated[float, about("how much finer the finest grid is than the volume's", ge=1, le=16)] = 1.5
     fine_metal: Annotated[bool, about("finer splats at the surface of metal, seen by sub-pixels")] = True
@@ -179,7 +173,7 @@ def _weighted(
     p = readings.numpy()
     weights = weights_and_bounds(scan, p, ~clamped.numpy(), scatter, noise)
     data = Data(geometry=geometry, p=p, weights=weights, scatter=scatter.mean)
-    data = dataclasses.replace(data, error=min(settings.model_error**2 * scan.i0, unevenness(data)))
+    data = dataclasses.replace(data, error=evening_error(data, settings.model_error**2 * scan.i0))
     even_out(weights, data.error)
     doubt_edges(p, weights, settings.edges, scatter.mean)
     return data, clamped.numpy()

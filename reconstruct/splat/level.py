@@ -1,7 +1,7 @@
 """A scan at one resolution: binned data on a coarser grid, fewer views of it, and back."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -11,13 +11,18 @@ from scipy import ndimage
 from ctsim.geometry import Geometry, few_views
 from ctsim.reconstruct.splat.kernels import carve_cpu
 from ctsim.reconstruct.starved import WEIGHT
-from ctsim.reconstruct.weights import bends, photon_weights
+from ctsim.reconstruct.weights import as_read, bends, photon_weights
 
 OPEN, LEAST_OPEN = 5.0, 0.01  # standard deviations of an open pixel, or p, below which a ray met nothing
 VIEWS = 12  # whose pixels stand for all
-DARKER, SHARE = 0.9, 0.5  # of the rays are brighter than a dark one, which is to have so much of a usual one's weight
-MOSTLY = 0.5  # of a reading, and it is mostly scatter
+DARKER = 0.9  # share of the rays that are brighter than the dark one
+SHARE = 0.5  # of the usual weight, that the dark ray is to have
+MOST_SCATTER = 2 / 3, 1.0
+"""Scatter over the primary of the dark ray up to which its weight is raised in full, and from which it is not."""
+MOST_STARVED = 0.05, 0.1
+"""The same of the share of the rays that are starved: from the second on a ray darker than nine tenths is starved."""
 SMOOTH = 0.5  # second difference of p from pixel to pixel that wire and the outlines of metal exceed
+LOUD = 3.0  # standard deviations of a second difference, which noise alone does not exceed
 LEAST_VIEWS = 60  # that tell an object from the streaks between them
 AROUND = 3  # pixels whose majority counts: noise alone makes a reading of some pixel without photons in some view
 
@@ -99,7 +104,7 @@ def thinned(data: Data) -> Data:
     views = np.arange(0, geometry.n_views, 2)
     poses = tuple(tuple(row) for row in geometry.pose_array()[views].tolist())
     geometry = msgspec.structs.replace(geometry, n_views=views.size, angles_deg=None, poses=poses)
-    return Data(geometry=geometry, p=data.p[views], weights=data.weights[views], scatter=data.scatter)
+    return replace(data, geometry=geometry, p=data.p[views], weights=data.weights[views])
 
 
 def refined(values: NDArray[np.float32], fine: Geometry) -> NDArray[np.float32]:
@@ -162,30 +167,55 @@ def some_readings(data: Data) -> NDArray[np.float32]:
     return data.p[views][data.weights[views] > 0]
 
 
-def unevenness(data: Data) -> float:
-    """Return the least error, in variances of an open ray (`even_out`), by which dark rays weigh half as much as usual.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rays:
+    """What rays that met something read: exp(p), 1 or more, of a usual and a dark one, and the share that is starved.
 
-    A step's length is that of usual rays: what rays of a far smaller weight tell alone is not found in the passes of a
-    fit, and smoothed away. 0 where dark rays (`usual_and_dark`) read more scatter than primary: what they tell is then
-    as doubtful as scatter is.
+    The usual one is the median, and nine tenths are brighter than the dark one.
     """
-    usual, dark = usual_and_dark(data)
-    if dark * data.scatter > MOSTLY:
-        return 0.0
-    return max(dark - usual / SHARE, 0.0) / (1 / SHARE - 1)
+
+    usual: float
+    dark: float
+    starved: float
 
 
-def usual_and_dark(data: Data) -> tuple[float, float]:
-    """Return exp(p) of a usual ray and a dark one: the median, and what nine tenths of the rays are brighter than.
+def evening_error(data: Data, most: float) -> float:
+    """Return the error to even out weights by (`even_out`), in variances of an open ray.
 
-    Of rays that met something, away from where p bends by `SMOOTH` and more: edges have weights of their own
-    (`doubt_edges`), and wire all over an object makes no thick body. Both are 1 where there are none.
+    It is the least by whose weights a dark ray counts half as much as a usual one, and no more than `most`. A step's
+    length is that of usual rays: what rays of a far smaller weight tell alone is not found in the passes of a fit, and
+    smoothed away. Where a dark ray reads as much scatter as primary, what it tells is as doubtful as scatter is, and
+    the error is 0; in between (`MOST_SCATTER`, `MOST_STARVED`) it falls evenly.
+    """
+    rays = rays_met(data)
+    error = min(max(rays.dark - rays.usual / SHARE, 0.0) / (1 / SHARE - 1), most)
+    scattered = rays.dark * data.scatter
+    told = _falling(scattered / (1 - scattered), *MOST_SCATTER) if scattered < 1 else 0.0
+    return error * min(told, _falling(rays.starved, *MOST_STARVED))
+
+
+def _falling(x: float, full: float, none: float) -> float:
+    """Return 1 up to `full`, 0 from `none` on, and a straight line in between."""
+    return min(max((none - x) / (none - full), 0.0), 1.0)
+
+
+def rays_met(data: Data) -> Rays:
+    """Look at the rays of a few views that met something.
+
+    `usual` and `dark` are of readings where p bends by less than `SMOOTH`, or than noise makes it bend: edges have
+    weights of their own (`doubt_edges`), and wire all over an object makes no thick body. Both are 1 where there are
+    none. p is that of mean scatter, while weights are by what was read: they may differ by some per cent.
     """
     views = few_views(data.geometry.n_views, VIEWS)
-    least, met = least_met(data) + data.open, [np.empty(0, np.float32)]
+    least, photons = least_met(data) + data.open, _open_photons(data)
+    seen, starved, met = [np.empty(0, np.float32)], 0, 0
     for p, weights in zip(data.p[views], data.weights[views], strict=True):
-        smooth = ndimage.maximum_filter(bends(p, weights != 0), 3) < SMOOTH
-        met.append(p[(weights > 0) & smooth & (p > least)])
-    every = np.concatenate(met)
+        bounds, hit = weights < 0, (weights != 0) & (p > least)
+        read = as_read(p, weights, data.scatter)
+        noise = LOUD * np.sqrt(6 * np.exp(np.minimum(read, 80.0)) / photons)  # 1 + 4 + 1 variances of a reading
+        smooth = ndimage.maximum_filter(bends(read, weights != 0), 3) < np.maximum(noise, SMOOTH)
+        seen.append(read[hit & smooth & ~bounds])
+        starved, met = starved + int(np.sum(hit & bounds)), met + int(np.sum(hit))
+    every = np.concatenate(seen)
     usual, dark = np.exp(np.quantile(every, (0.5, DARKER)).astype(np.float64)) if every.size else (1.0, 1.0)
-    return float(usual), float(dark)
+    return Rays(usual=max(float(usual), 1.0), dark=max(float(dark), 1.0), starved=starved / max(met, 1))

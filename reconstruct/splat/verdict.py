@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from ctsim.geometry import Geometry, few_views
 from ctsim.reconstruct.log import finite_or_not
 from ctsim.reconstruct.splat.curve import DENSEST, STRONGEST
-from ctsim.reconstruct.splat.level import VIEWS, Data, never_read, usual_and_dark
+from ctsim.reconstruct.splat.level import VIEWS, Data, never_read, rays_met
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.weights import DARK
 from ctsim.types import Status
@@ -96,10 +96,10 @@ def flat(finest: Geometry) -> str:
 
 def uneven(data: Data) -> str:
     """Say that dark rays hardly count, or nothing."""
-    usual, dark = usual_and_dark(data)
-    if (share := (usual + data.error) / (dark + data.error)) >= LEAST_SHARE:
+    rays = rays_met(data)
+    if (share := (rays.usual + data.error) / (rays.dark + data.error)) >= LEAST_SHARE:
         return ""
     return (
-        f"a tenth of the rays, those of the longest paths, have {share:.0%} and less of the usual weight: what they "
-        "show alone may be smeared along them"
+        f"a tenth of the rays off all edges, those of the longest paths, have {max(share, 0.01):.0%} or less of the "
+        "usual weight: what they show alone may be smeared along them"
     )
