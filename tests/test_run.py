@@ -54,6 +54,7 @@ class Double:
     kerma: float | None = 1.25
     phantom: str = "box"
     has_truth: bool = True
+    split: str = ""
 
     @property
     def place(self):

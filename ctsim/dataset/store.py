@@ -29,13 +29,15 @@ class StoredScan(ScanWithTruth):
 
     It holds no open file: arrays are memory-mapped when they are asked for, each time again and copy-on-write, so that
     nothing is read before it is used and neither the files nor another one's arrays ever change. `info` is scan.json;
-    `code` hashes the code of the simulator that made it (empty: not noted); `metal_free` is the paired twin.
+    `code` hashes the code of the simulator that made it (empty: not noted); `metal_free` is the paired twin; `split` is
+    that of a scene of a table with `count` (empty: none).
     """
 
     folder: Path
     content_hash: str
     code: str
     files: dict[str, mf.FileEntry] = field(hash=False)
+    split: str = ""
 
     @property
     def place(self) -> str:
@@ -105,6 +107,7 @@ def _open(folder: Path, manifest: mf.Manifest, info: ScanInfo, prefix: str, twin
         files=manifest.files,
         prefix=prefix,
         metal_free=twin,
+        split=manifest.about.split if manifest.about else "",
     )
 
 

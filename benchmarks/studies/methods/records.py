@@ -15,6 +15,7 @@ from ctsim.benchmarks.engine.record import latest as latest_rows
 from ctsim.benchmarks.methods import FAILED, TABLE
 from ctsim.benchmarks.scores.score import VERSION, Score
 from ctsim.benchmarks.studies.methods.grids import shared_text
+from ctsim.benchmarks.studies.methods.splits import trained_text
 from ctsim.dataset.folder import mixture
 
 STUDY, FILE, WHAT = "methods", "records", "a record of run-benchmark"
@@ -213,8 +214,9 @@ def remarks(records: Sequence[RunRecord]) -> list[str]:
     shown = latest(records)
     known = {r.task.data: r.data_code for r in shown if r.data_code}
     made = {f"{r.run.scene} (seed {r.run.seed})": known.get(r.task.data, "") for r in shown}
-    grids = {f"{r.label} on {r.run.scene}": r.details for r in shown}
-    said = outdated(records), mixture(made.items()), shared_text(grids), _stated(shown), doubtful(shown), _limits(shown)
+    details = {f"{r.label} on {r.run.scene}": r.details for r in shown}
+    flattered = shared_text(details), trained_text(details)
+    said = outdated(records), mixture(made.items()), *flattered, _stated(shown), doubtful(shown), _limits(shown)
     return [text for text in said if text]
 
 

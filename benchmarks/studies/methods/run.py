@@ -29,6 +29,7 @@ from ctsim.benchmarks.studies.methods.attempt import SCORED, Outcome, describe, 
 from ctsim.benchmarks.studies.methods.grids import with_grid
 from ctsim.benchmarks.studies.methods.plan import Job, job_of
 from ctsim.benchmarks.studies.methods.records import METAL, TWIN, Result, RunTask
+from ctsim.benchmarks.studies.methods.splits import with_split
 from ctsim.benchmarks.studies.methods.study import Flags
 from ctsim.benchmarks.studies.methods.volumes import (
     intermediates_of,
@@ -171,7 +172,11 @@ class Runner:
             inputs=job.method.inputs,
             scores=scores,
             cost=outcome.cost,
-            details=with_grid(outcome.details, job.stored.geometry, job.stored.info.label_grid),
+            details=with_split(
+                with_grid(outcome.details, job.stored.geometry, job.stored.info.label_grid),
+                job.method.inputs,
+                job.stored.split,
+            ),
             data_code=job.stored.code,
             kerma=job.stored.kerma,
             phantom=job.stored.phantom,
