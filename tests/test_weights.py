@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -157,6 +158,30 @@ def test_edges_are_doubted_in_weights_that_were_evened_out(monkeypatch, smallest
     assert np.array_equal(data.weights[read], expected[read]) and data.error == 12.0
     even_out(wrong := data.weights.copy(), 12.0)
     assert not np.allclose(wrong, data.weights)
+
+
+def test_the_filtration_of_a_flat_scan_is_found_by_photons(monkeypatch, smallest):
+    """Its finest grid is the only one; weights that were evened out find twice the filtration on a pelvis."""
+    data = smooth_data(5.0, 0.0)
+    geometry = msgspec.structs.replace(data.geometry, n_voxel=(1, 32, 32), d_voxel=(1, 0.25, 0.25))
+    data.weights[:, 2] = -0.002
+    read, weights = data.weights > 0, data.weights.copy()
+    even_out(data.weights, 12.0)
+    tried = []
+
+    class Stop(Exception):
+        pass
+
+    def course(levels, *rest, **more):
+        tried.extend(levels)
+        raise Stop
+
+    monkeypatch.setattr(fast, "_course", course)
+    scan = open_scan(list_scans(smallest)[0]).scan
+    with pytest.raises(Stop):
+        fast.find_filtration([dataclasses.replace(data, geometry=geometry, error=12.0)], scan, fast.Settings())
+    (only,) = tried
+    assert np.array_equal(only.weights[read], weights[read]) and np.all(only.weights[:, 2] < 0) and only.error == 0
 
 
 def test_coarser_grids_count_photons_alone():

@@ -31,7 +31,7 @@ from ctsim.reconstruct.splat.common import Common, Energy
 from ctsim.reconstruct.splat.course import PASSES, Course, levels_of, passes_over
 from ctsim.reconstruct.splat.curve import DENSEST, MaterialCurve
 from ctsim.reconstruct.splat.filtration import USUAL, Filtration, found
-from ctsim.reconstruct.splat.level import VIEWS, Data, evening_error, least_met, some_readings, thinned
+from ctsim.reconstruct.splat.level import VIEWS, Data, by_photons, evening_error, least_met, some_readings, thinned
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import FILTER, Response, basis_functions, evaluate, make_response, tangent
 from ctsim.reconstruct.splat.verdict import bounded, dark_misfit, flat, metal_unread, uneven, unexplained, verdict
@@ -192,6 +192,8 @@ def find_filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtr
     k = next(k for k, level in enumerate(levels) if min(level.geometry.n_voxel[1:]) >= ENOUGH)
     if levels[k].geometry.n_views < VIEWED:
         return None
+    if k + 1 == len(levels):  # the finest grid of a flat scan
+        levels = [*levels[:k], by_photons(levels[k])]
     brief = msgspec.structs.replace(settings, passes=TRIAL)
 
     def fits_on(few: list[Data]) -> Callable[[float], Fit | None]:

@@ -96,6 +96,13 @@ def coarser(data: Data) -> Data:
     return coarse
 
 
+def by_photons(data: Data) -> Data:
+    """Return the data with weights as on coarser grids: by photons alone, not evened out nor lowered at edges."""
+    weights = photon_weights(data.p, data.weights > 0)
+    weights[data.weights < 0] = -WEIGHT
+    return replace(data, weights=weights, error=0.0)
+
+
 def thinned(data: Data) -> Data:
     """Return every second view where that leaves enough to tell an object, else all."""
     geometry = data.geometry
