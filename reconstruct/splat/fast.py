@@ -192,7 +192,7 @@ def find_filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtr
     k = next(k for k, level in enumerate(levels) if min(level.geometry.n_voxel[1:]) >= ENOUGH)
     if levels[k].geometry.n_views < VIEWED:
         return None
-    if k + 1 == len(levels):  # the finest grid of a flat scan
+    if k + 1 == len(levels) and levels[k].error:  # the finest grid, of a flat or a small scan
         levels = [*levels[:k], by_photons(levels[k])]
     brief = msgspec.structs.replace(settings, passes=TRIAL)
 
