@@ -54,7 +54,8 @@ SUITES = """# Bundled suites
 
 `make-dataset SUITE data/` simulates a suite. `--only NAME` takes single scenes, `--seeds 1 2 3` repeats every scene.
 The files lie in `benchmarks/suites/`. A suite of your own is a TOML file: see
-[write a scene](../tutorials/write-a-scene.md)."""
+[write a scene](../tutorials/write-a-scene.md). The object lies in the cube and fills 92 % of it at most: many bodies
+are miniatures. The metal is that of most pieces; some scenes have more."""
 PYTHON = """# Python
 
 `import ctsim` is enough for the functions and types below. It loads none of them: each is imported when it is first
@@ -278,8 +279,9 @@ def suite(name: str) -> str:
         g, tube = scanner.geometry, scanner.tube
         volume, views = " × ".join(map(str, g.n_voxel)), f"{g.n_views} of {' × '.join(map(str, g.n_detector))}"
         beam = f"{tube.kvp:g} kVp, {_filters(tube, ', ')}"
-        rows.append((f"`{scene.name}`", f"`{scene.phantom.recipe}`", scene.phantom.metal, volume, views, beam))
-    return f"## {name}\n\n{said}\n\n" + table(("scene", "recipe", "metal", "volume", "views", "tube"), rows)
+        body = f"`{scene.phantom.recipe}`", f"{scene.phantom.size:g} mm", scene.phantom.metal
+        rows.append((f"`{scene.name}`", *body, volume, views, beam))
+    return f"## {name}\n\n{said}\n\n" + table(("scene", "recipe", "cube", "metal", "volume", "views", "tube"), rows)
 
 
 def field_texts(kind: type) -> dict[str, str]:
