@@ -166,14 +166,12 @@ def test_an_installed_ctsim_simulates_and_scores_the_readmes_own_scene(project, 
     commands = re.findall(r"^```bash\n(.*?)^```", text[text.index(scene) :], re.M | re.S)[0].splitlines()
     assert [line.split()[0] for line in commands] == ["make-dataset", "run-benchmark"]
     (project / commands[0].split()[1]).write_text(scene, encoding="utf-8")
-    (project / "my_lab").mkdir()
-    (project / "my_lab" / "__init__.py").touch()
-    (project / "my_lab" / "net.py").write_text(NET, encoding="utf-8")
+    (project / "my_lab.py").write_text(NET, encoding="utf-8")
     for line in commands:
         run(project, site, COMMAND.format(words=line.split()))
     results = project / commands[1].split()[2]
     rows = [json.loads(line)["task"] for line in (results / "records.jsonl").read_text(encoding="utf-8").splitlines()]
     assert {(row["subject"], row["part"]) for row in rows} == {
-        (method, part) for method in ("fdk", "my_lab.net:reconstruct") for part in ("metal", "metal_free")
+        (method, part) for method in ("fdk", "my_lab:reconstruct") for part in ("metal", "metal_free")
     }
     assert (results / "panels" / "walnut-pins.png").stat().st_size > 10_000
