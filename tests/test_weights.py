@@ -100,7 +100,7 @@ def test_rays_that_read_mostly_scatter_do_not_come_to_weigh_more():
     assert found(3 / 7) == pytest.approx(0.75 * most, rel=0.01)  # scatter is three quarters of the primary
 
 
-def test_starved_rays_count_as_darker_than_nine_tenths():
+def test_weights_stay_where_a_tenth_of_the_rays_is_starved():
     """A body that grows thicker turns dark readings into bounds, and is left as it is from a tenth of them on."""
 
     def found(rows):
@@ -115,9 +115,8 @@ def test_starved_rays_count_as_darker_than_nine_tenths():
     data = smooth_data(5.0, 0.0)
     data.weights[:, -1:, 12:] = -0.002
     data.weights[:15, -2:, 12:] = -0.002  # 0.075 of the rays
-    assert rays_met(data).starved == pytest.approx(0.075, abs=0.005) and evening_error(data, 10.0) == pytest.approx(
-        5, abs=1
-    )
+    assert rays_met(data).starved == pytest.approx(0.075, abs=0.005)
+    assert evening_error(data, 10.0) == pytest.approx(5, abs=1)
 
 
 def test_noise_of_dark_rays_is_no_edge():
