@@ -36,7 +36,9 @@ RUNS_PROGRAM = "ctsim.benchmarks.program"
 COUNTS_ONLY, METAL_MASK, SPECTRUM = "counts only", "metal mask", "spectrum"
 MASK_AND_SPECTRUM = "metal mask and spectrum"
 ASSUMED = "assumed spectrum"
-"""Told no spectrum: a tungsten tube and 0.2 mm of GOS are assumed, and the filter is found in the scan."""
+"""Told no spectrum: a tungsten tube and 0.2 mm of GOS are assumed, and the filter is found in the scan.
+
+A filter or a detector that is told stands in the row's label."""
 MASK_AND_ASSUMED = "metal mask and assumed spectrum"
 TRAINED, TRAINED_MASK = "training", "training, metal mask"
 """Counts and weights that were trained on other scans (the suite `train`), and the same with a metal mask."""

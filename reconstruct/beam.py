@@ -24,6 +24,13 @@ TubeTable = Annotated[
 DetectorTable = Annotated[
     dict[str, Any] | None, about("detector as in a scene file; missing keys: the simulator's defaults")
 ]
+AssumedDetector = Annotated[
+    dict[str, Any] | None,
+    about(
+        'detector as in a scene file, for the responses "known" and "tube"; missing keys: the simulator\'s defaults; '
+        'null with "tube": 0.2 mm of GOS'
+    ),
+]
 Kind = TypeVar("Kind", Tube, Detector)
 
 
@@ -65,10 +72,11 @@ def detected(
 
 
 def refuse_beam(response: str | None, tube: Given | Tube, detector: Given | Detector) -> None:
-    """Raise InputError for a tube or a detector that comes with a response which does not read them."""
-    for name, table in (("tube", tube), ("detector", detector)):
-        if response != "known" and table is not None:
-            raise InputError(f"{name}: only for response 'known', got it with response {response!r}")
+    """Raise InputError for a tube or a detector that comes with a response which does not read it."""
+    for name, table, readers in (("tube", tube, ("known",)), ("detector", detector, ("known", "tube"))):
+        if response not in readers and table is not None:
+            expected = " or ".join(map(repr, readers))
+            raise InputError(f"{name}: only for response {expected}, got it with response {response!r}")
 
 
 def refuse_filtration(response: str | None, filtration: float | None) -> None:

@@ -13,7 +13,7 @@ from ctsim.errors import InputError
 from ctsim.reconstruct.splat import fast
 
 
-@pytest.mark.parametrize("thickness", [0.3, 2.0, 9.0])
+@pytest.mark.parametrize("thickness", [0.06, 0.3, 2.0, 9.0])
 def test_the_assumed_tube_is_equivalent_to_its_own_filter(thickness):
     filters = (Filter(material="Al", thickness=thickness),)
     scanner = msgspec.structs.replace(
@@ -29,7 +29,7 @@ def test_a_row_says_what_was_found_and_how_it_fares(monkeypatch):
     asked, reconstruct = [], beams.reconstruct
 
     def quick(scan, settings):
-        asked.append((settings.response, settings.filtration))
+        asked.append((settings.response, settings.filtration, settings.detector is not None))
         return reconstruct(scan, msgspec.structs.replace(settings, passes=(0, 1), fineness=1.0))
 
     monkeypatch.setattr(beams, "reconstruct", quick)
@@ -38,10 +38,10 @@ def test_a_row_says_what_was_found_and_how_it_fares(monkeypatch):
     small = {"n_voxel": (32, 32, 32), "n_detector": (48, 48), "n_views": 12, "scatter": {"level": 0}}
     scanner = msgspec.convert({**msgspec.to_builtins(scene.scanner), **small}, type(scene.scanner))
     text = beams.page([msgspec.structs.replace(scene, scanner=scanner)])
-    assert asked == [("tube", 0.5), ("tube", None), ("known", None)]
+    assert asked == [("tube", 0.5, False), ("tube", None, False), ("known", None, True), ("tube", None, True)]
     cells = [cell.strip() for cell in text.splitlines()[-1].split("|")[1:-1]]
     assert len(cells) == len(beams.HEAD) and cells[:2] == [scene.name, "1.9"]
-    numbers = [float(cell) for cell in cells[3:12]]
+    numbers = [float(cell) for cell in cells[3:15]]
     assert all(math.isfinite(number) for number in numbers)
 
 

@@ -109,13 +109,16 @@ def test_a_parameter_that_is_not_there_is_refused_and_near_ones_are_suggested(na
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
-        ("splat.filtration=abc", "expected a number within 0.1 to 20 (mm Al), or null, got 'abc'"),
-        ("splat.filtration=0.05", "expected a number within 0.1 to 20 (mm Al), or null, got 0.05"),
+        ("splat.filtration=abc", "expected a number within 0 to 20 (mm Al), or null, got 'abc'"),
+        ("splat.filtration=-0.05", "expected a number within 0 to 20 (mm Al), or null, got -0.05"),
         ("splat.passes=3", "expected a list of 2, each a whole number within 0 to 1000, or null, got 3"),
         ("splat.passes=[0,0]", "expected two counts that are not both 0, got (0, 0)"),
         ("splat.filtraton=1", "unknown parameter; did you mean filtration?"),
         ("splat.preset=paper", "--method splat-paper or --method splat-r2"),
         ("splat.tube={}", "only for response 'known', got it with response 'tube'"),
+        ("splat-paper.detector={}", "only for response 'known' or 'tube', got it with response 'paper'"),
+        ("splat.detector={\"kind\":\"film\"}", "film"),
+        ("field.filtration=-1", "expected a number within 0 to 20 (mm Al), or null, got -1"),
         ("splat-paper.response=mono", "basis: expected constant with response mono"),
         ("fdk.cutoff=NaN", "expected a number above 0, at most 1 (of the Nyquist frequency), got 'NaN'"),
         ("fdk.cutoff=1e999", "expected a number above 0, at most 1 (of the Nyquist frequency), got '1e999'"),
@@ -225,7 +228,7 @@ def test_the_list_of_methods_names_every_parameter_with_its_default_and_unit(mon
         head, *lines = block.strip().splitlines()
         assert head == f"{name}: {method.inputs}"
         assert [line.split()[0] for line in lines] == list(method.params)
-    words = "filtration null a number within 0.1 to 20 (mm Al), or null; filtration behind the assumed tube"
+    words = "filtration null a number within 0 to 20 (mm Al), or null; filtration behind the assumed tube"
     assert words in " ".join(blocks["splat"].split())
     monkeypatch.setattr(sys, "argv", ["run-benchmark", "methods", "fdk"])
     assert cli.run_benchmark() == 0 and capsys.readouterr().out == blocks["fdk"].rstrip("\n") + "\n"

@@ -53,8 +53,31 @@ def test_behind_a_slope_all_that_explain_a_scan_alike_are_plausible(monkeypatch,
 
 def test_where_all_explain_a_scan_alike_the_middle_is_taken_and_said(monkeypatch):
     got = found(Tried(monkeypatch, lambda t: 1.0))
-    assert got.value == pytest.approx(math.sqrt(0.1 * 20), abs=1e-3) and (got.low, got.high) == (0.1, 20)
-    assert "does not tell its beam" in got.sentence and "0.1 to 20 mm Al" in got.sentence
+    middle = 0.1 * math.exp((-1 + math.log(200)) / 2)  # of a scale that is linear up to 0.1 mm and logarithmic above
+    assert got.value == pytest.approx(middle, abs=1e-3) and (got.low, got.high) == (0, 20)
+    assert "does not tell its beam" in got.sentence and "0 to 20 mm Al" in got.sentence
+
+
+@pytest.mark.parametrize("at", [0.0, 0.03, 0.07])
+def test_beams_without_a_filter_are_found(monkeypatch, at):
+    """The misfit grows with the square of the difference, as thin filters harden a beam."""
+    tried = Tried(monkeypatch, lambda t: math.exp((filtration.scale(t) - filtration.scale(at)) ** 2))
+    got = found(tried)
+    assert got.value == pytest.approx(at, abs=0.015) and got.low <= at <= got.high < 0.15
+    assert ("without a filter, or softer" in got.sentence) == (at < 0.03) and min(tried.asked) == 0
+
+
+def test_a_scan_behind_a_thin_filter_tells_its_beam(monkeypatch):
+    """From nothing to a twentieth of a millimetre the ratio is endless, and the beams are nearly the same."""
+    got = found(Tried(monkeypatch, lambda t: math.exp(4 * max(t - 0.05, 0))))
+    assert got.low == 0 and 0.05 < got.high < 0.1 and "without a filter" in got.sentence
+
+
+def test_the_scale_of_filtrations_is_smooth_and_has_an_inverse():
+    t = np.array([0.0, 0.02, 0.1, 0.25, 20.0])
+    np.testing.assert_allclose(filtration.from_scale(filtration.scale(t)), t, atol=1e-15)
+    steps = np.diff(filtration.scale([0.1 - 1e-6, 0.1, 0.1 + 1e-6]))
+    np.testing.assert_allclose(steps, 1e-5, rtol=1e-4)
 
 
 def test_fine_fits_are_made_around_what_coarse_ones_find(monkeypatch):
@@ -194,7 +217,7 @@ def test_the_search_does_not_try_what_lies_beyond_the_valley(monkeypatch):
 
 def test_a_scan_that_shows_nothing_leaves_the_usual_filtration():
     got = found(lambda value: None)
-    assert got == Filtration(value=USUAL, low=0.1, high=20.0, misfits={}) and not got.sentence
+    assert got == Filtration(value=USUAL, low=0.0, high=20.0, misfits={}) and not got.sentence
 
 
 @pytest.mark.parametrize("broken", [math.nan, math.inf])
@@ -204,7 +227,7 @@ def test_a_trial_that_fails_is_left_out(monkeypatch, broken):
 
 
 def test_a_beam_softer_than_any_assumed_is_said(monkeypatch):
-    assert "as soft as" in found(Tried(monkeypatch, lambda t: t)).sentence
+    assert "as soft as" in found(Tried(monkeypatch, lambda t: 1 + t)).sentence
     assert "as soft as" not in found(Tried(monkeypatch, lambda t: 1 / t)).sentence
     assert not found(Tried(monkeypatch, valley(2.0, steepness=0.5))).sentence
 
@@ -255,6 +278,28 @@ def test_hard_beams_are_told_from_the_usual_one(hard):
 def test_the_usual_beam_is_found_to_be_one():
     value = quality(scan_behind(("Al", 0.5)))[1]["value"]
     assert 0.38 / 2 < value < 0.38 * 2
+
+
+def test_a_tube_without_a_filter_is_found_and_said():
+    """No fit that assumes 0.1 mm, the least that was tried once, comes near: those photons are in the beam."""
+    bare = scan_behind()
+    least, _ = quality(bare, filtration=0.1)
+    blind, got = quality(bare)
+    assert got["value"] < 0.03 and got["low"] == 0 and {"0", "0.05", "0.1"} <= set(got["misfits"])
+    assert blind > least + 2
+
+
+def test_a_detector_that_is_told_replaces_the_assumed_one():
+    """A counting detector sees a softer beam than a scintillator does."""
+    counted = scan_behind(("Al", 0.5), detector={"kind": "counting"})
+    known, _ = quality(
+        counted,
+        response="known",
+        detector={"kind": "counting"},
+        tube={"filters": [{"material": "Al", "thickness": 0.5}]},
+    )
+    blind, told = quality(counted)[0], quality(counted, detector={"kind": "counting"})[0]
+    assert told > blind + 0.5 and told > known - 0.3
 
 
 def test_a_fit_without_coarser_levels_finds_it_on_one(hard):

@@ -10,7 +10,7 @@ import pytest
 from by_threads import one_and_several
 
 from ctsim.beam.quadrature import full_rule
-from ctsim.beam.spectrum import Filter, Tube, spectrum
+from ctsim.beam.spectrum import Filter, Spectrum, Tube, spectrum
 from ctsim.detector.response import Detector
 from ctsim.errors import InputError
 from ctsim.materials import attenuation
@@ -275,6 +275,35 @@ def test_the_tube_follows_its_filter(kvp):
         response = start.with_theta((thickness,))
         np.testing.assert_array_equal(response.energies_kev, start.energies_kev)
         assert np.abs(exact(response, 0 * lb, lb)[0] - full)[full < 14.6].max() < 2e-4  # as the docstring says
+
+
+@pytest.mark.parametrize("kvp", [60.0, 90.0, 140.0])
+@pytest.mark.parametrize("thickness", [0.0, 0.05])
+def test_a_tube_behind_less_has_nodes_of_its_own(kvp, thickness):
+    """P behind water, bone and iron is that of the spectrum from 5 keV on, as the docstring says."""
+    filters = (Filter(material="Al", thickness=thickness),) if thickness else ()
+    beam = spectrum(Tube(kvp=kvp, model="finkelshtein-pavlova", filters=filters))
+    seen = beam.energies >= 5
+    beam = Spectrum(energies=beam.energies[seen], weights=beam.weights[seen] / beam.weights[seen].sum())
+    fine = full_rule(beam, SCINTILLATOR)
+    response = make_response("tube", e_max=kvp, theta=(thickness,))
+    assert response.energies_kev.min() > 5 and response.bounds().tolist() == [[thickness, 20]]
+    for material in ("water", "cortical_bone", "Fe"):
+        mu, few = attenuation(material, fine.energies), attenuation(material, response.energies_kev)
+        lengths = np.geomspace(1e-4, 1, 200)[:, None] * 12 / mu.min()
+        full, got = (-np.log(np.exp(-lengths * m) @ w) for m, w in ((mu, fine.w1), (few, response.eta)))
+        assert np.abs(got - full)[full < 12].max() < 0.02
+
+
+def test_a_tube_is_seen_by_the_detector_that_is_told():
+    counting = Detector(kind="counting")
+    told = make_response("tube", e_max=90.0, theta=(0.5,), detector=counting)
+    behind = Tube(kvp=90.0, model="finkelshtein-pavlova", filters=(Filter(material="Al", thickness=0.5),))
+    fine, lb = full_rule(spectrum(behind), counting), np.geomspace(1e-3, 80, 80)
+    full = reference.evaluate(*basis_functions(fine.energies, "paper", 90.0), fine.w1, 0 * lb, lb)[0]
+    assert np.abs(exact(told, 0 * lb, lb)[0] - full)[full < 14.6].max() < 2e-4
+    with pytest.raises(InputError, match="detector: only for response 'tube', got it with response 'mono'"):
+        make_response("mono", e_max=90.0, detector=counting)
 
 
 def test_klein_nishina_is_the_cross_section():

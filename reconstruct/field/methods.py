@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from ctsim.geometry import few_views
-from ctsim.reconstruct.beam import DetectorTable, TubeTable, check_tables, refuse_beam
+from ctsim.reconstruct.beam import AssumedDetector, TubeTable, check_tables, refuse_beam, refuse_filtration
 from ctsim.reconstruct.field.data import Data
 from ctsim.reconstruct.field.fit import Common, Steps
 from ctsim.reconstruct.field.physics import Curve, Image, Mono, Park
@@ -83,7 +83,7 @@ class Field(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     response: Annotated[Literal["tube", "known"], about("beam: assumed, or known from tube and detector")] = "tube"
     filtration: Annotated[fast.Filter | None, about("filtration behind the assumed tube; null: found", "mm Al")] = None
     tube: TubeTable = None
-    detector: DetectorTable = None
+    detector: AssumedDetector = None
     readout: Annotated[Energy | Literal["hardened"], about("energy at which the volume is read")] = "hardened"
     panel: PanelLight = "found"
     scatter: Scattered = "found"
@@ -91,6 +91,7 @@ class Field(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         check_tables(self.tube, self.detector)
         refuse_beam(self.response, self.tube, self.detector)
+        refuse_filtration(self.response, self.filtration)
 
     def of_splat(self) -> fast.Settings:
         """Return the settings of `splat` that assume the same beam."""

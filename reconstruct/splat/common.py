@@ -3,7 +3,7 @@
 import math
 from typing import Annotated
 
-from ctsim.reconstruct.beam import DetectorTable, TubeTable, check_tables
+from ctsim.reconstruct.beam import AssumedDetector, TubeTable, check_tables
 from ctsim.reconstruct.primary import Readings
 from ctsim.reconstruct.settings import about
 
@@ -18,7 +18,7 @@ class Common(Readings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Scatter, what is known of the beam (for the response "known"), and how long a fit may take."""
 
     tube: TubeTable = None
-    detector: DetectorTable = None
+    detector: AssumedDetector = None
     seconds: Seconds = math.inf
     checkpoints: Annotated[
         str, about("folder for the state of an unfinished fit, saved each minute; the next run continues from it")

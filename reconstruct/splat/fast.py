@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry, few_views
-from ctsim.reconstruct.beam import detected, refuse_beam, refuse_filtration
+from ctsim.reconstruct.beam import detected, known_detector, refuse_beam, refuse_filtration
 from ctsim.reconstruct.beyond import seen_beyond
 from ctsim.reconstruct.log import how_it_ended, line_integrals
 from ctsim.reconstruct.panel import without_panel
@@ -50,7 +50,7 @@ Image = NDArray[np.float32]
 
 
 Passes = Annotated[int, msgspec.Meta(ge=0, le=1000)]
-Filter = Annotated[float, msgspec.Meta(ge=FILTER[0], le=FILTER[2])]
+Filter = Annotated[float, msgspec.Meta(ge=0, le=FILTER[2])]
 
 
 class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -63,11 +63,11 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     leaves them. `edges` then lowers some.
     The finest grid is at most as fine as the detector's pixels at the isocentre. With `fine_metal` the splats within
     two voxels of the surface of metal are half as far apart in the second half of the passes over that grid.
-    `response` "tube" is a tube behind `filtration`, seen by a scintillator; null has it found, on grids of at least 32
-    voxels along x and y. `readout` "hardened" is by the object's own water; `Volume.at_energy` gives the volume at any
-    energy. `scatter` "found" is what the pixels tell that no shadow reaches (`scatter_of`), with its course over the
-    panel; a number is the same everywhere, and 0 is for scans whose open pixels are brighter than their open field for
-    another reason.
+    `response` "tube" is a tube behind `filtration`, seen by `detector`, null for 0.2 mm of GOS; `filtration` null has
+    it found, on grids of at least 32 voxels along x and y. `readout` "hardened" is by the object's own water;
+    `Volume.at_energy` gives the volume at any energy. `scatter` "found" is what the pixels tell that no shadow reaches
+    (`scatter_of`), with its course over the panel; a number is the same everywhere, and 0 is for scans whose open
+    pixels are brighter than their open field for another reason.
     """
 
     passes: Annotated[tuple[Passes, Passes] | None, about("over the views: on each coarser level, on the finest")] = (
@@ -99,7 +99,8 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def make_response(self, e_max: float, filtration: float) -> Response:
         """Build the response for a scan of greatest energy `e_max` (keV), of the tube behind a `filtration` (mm Al)."""
         if self.response == "tube":
-            return make_response("tube", e_max=e_max, basis="klein-nishina", theta=(filtration,))
+            sees = None if self.detector is None else known_detector(self.detector)
+            return make_response("tube", e_max=e_max, basis="klein-nishina", theta=(filtration,), detector=sees)
         seen = detected(self.tube, self.detector, e_max)
         return make_response("known", e_max=e_max, basis="klein-nishina", spectrum=seen)
 

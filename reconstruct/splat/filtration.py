@@ -18,15 +18,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.interpolate import Akima1DInterpolator
 
 from ctsim.reconstruct.splat.ordered import Fit
-from ctsim.reconstruct.splat.response import FILTER
 
 USUAL = 0.5  # mm of aluminium, from which the search starts
-TRIED = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 14.0, 20.0)
+TRIED = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 14.0, 20.0)
+THIN = 0.1  # mm of aluminium, below which filtrations differ by their difference, not by their ratio
 PLAUSIBLE = 1.05  # times the least misfit, at two standard deviations: materials, scatter and spectra are assumed
 UNTOLD, SOFT = 8.0, 1.0
 """A plausible range from SOFT mm or less to UNTOLD times its lower end or more says that a scan hides its beam."""
@@ -64,7 +64,7 @@ class Filtration:
         """
         if not self.misfits:
             return ""
-        if self.low <= SOFT and self.high >= UNTOLD * self.low:
+        if self.low <= SOFT and self.high >= UNTOLD * max(self.low, THIN):
             return (
                 f"the scan does not tell its beam (round bodies do not): {self.low:g} to {self.high:g} mm Al explain "
                 'it alike; `filtration` or the response "known" tells it'
@@ -75,11 +75,11 @@ class Filtration:
                 "alike, and no more was tried; a nearly round body may be behind less; `filtration` or the response "
                 '"known" tells it'
             )
-        if min(self.misfits, key=lambda t: self.misfits[t]) != FILTER[0]:
+        if self.low > TRIED[0]:
             return ""
         return (
-            f"the beam is as soft as that of the assumed tube behind {FILTER[0]:g} mm Al, or softer: values may be "
-            'too low; the response "known" takes the tube and the detector'
+            "the beam is as soft as that of the assumed tube without a filter, or softer: values may be too low; "
+            '`detector` or the response "known" tells more of it'
         )
 
 
@@ -93,7 +93,7 @@ def found(coarse: Callable[[float], Fit | None], fine: Callable[[float], Fit | N
         finer = _searched(fine, min(misfits, key=lambda t: misfits[t]) if misfits else USUAL)
         misfits = finer if len(finer) > 1 or not misfits else misfits
     if not misfits:
-        return Filtration(value=USUAL, low=FILTER[0], high=FILTER[2], misfits={})
+        return Filtration(value=USUAL, low=TRIED[0], high=TRIED[-1], misfits={})
     return _chosen(misfits)
 
 
@@ -120,19 +120,31 @@ def _searched(fit_of: Callable[[float], Fit | None], start: float) -> dict[float
 
 
 def _chosen(misfits: dict[float, float]) -> Filtration:
-    """Return the mean filtration by how likely each is, on a curve through the misfits, both axes logarithmic.
+    """Return the mean filtration by how likely each is, on a curve through the logarithms of the misfits over `scale`.
 
     Where all explain the scan alike, that is the middle of what was tried. A cubic spline would dip behind a steep
     slope, where misfits may be flat.
     """
-    tried, values = np.log(list(misfits)), np.log(list(misfits.values()))
+    tried, values = scale(list(misfits)), np.log(list(misfits.values()))
     fine = np.linspace(tried[0], tried[-1], 2001)
     above = Akima1DInterpolator(tried, values, method="makima")(fine) if len(tried) > 1 else np.zeros_like(fine)
     above -= above.min()
     plausible = fine[above <= math.log(PLAUSIBLE)]
     mean = np.average(fine, weights=np.exp(-2 * above / math.log(PLAUSIBLE)))
-    value, low, high = (round(math.exp(t), 3) for t in (mean, plausible[0], plausible[-1]))
+    value, low, high = (round(float(t), 3) for t in from_scale([mean, plausible[0], plausible[-1]]))
     return Filtration(value=value, low=low, high=high, misfits=misfits)
+
+
+def scale(filtration: ArrayLike) -> NDArray[np.float64]:
+    """Return where filtrations (mm) lie on the scale of their differences: log(t/THIN), below THIN t/THIN − 1."""
+    t = np.asarray(filtration, np.float64) / THIN
+    return np.where(t < 1, t - 1, np.log(np.maximum(t, 1)))
+
+
+def from_scale(place: ArrayLike) -> NDArray[np.float64]:
+    """Return the filtrations (mm) that lie at places on `scale`."""
+    x = np.asarray(place, np.float64)
+    return THIN * np.where(x < 0, x + 1, np.exp(np.maximum(x, 0)))
 
 
 def rays_of(fit: Fit) -> NDArray[np.bool_]:

@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from ctsim.errors import InputError
-from ctsim.reconstruct.beam import detected, refuse_beam
+from ctsim.reconstruct.beam import detected, known_detector, refuse_beam
 from ctsim.reconstruct.settings import about
 from ctsim.reconstruct.splat import response as responses
 from ctsim.reconstruct.splat.common import Common, Energy
@@ -103,6 +103,7 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def make_response(self, e_max: float) -> Response:
         """Build the response for a scan of greatest energy `e_max` (keV)."""
         flat, e_max = self.response == "flat", e_max if self.e_max is None else self.e_max
+        sees = known_detector(self.detector) if self.response == "tube" and self.detector is not None else None
         return make_response(
             "paper" if self.response == "flat" else self.response,
             e_max=e_max,
@@ -110,6 +111,7 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
             nodes=self.nodes,
             theta=FLAT if flat else self.theta,
             spectrum=detected(self.tube, self.detector, e_max) if self.response == "known" else None,
+            detector=sees,
         )
 
     @property

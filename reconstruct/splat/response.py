@@ -42,7 +42,11 @@ MOST_NODES = 64
 _SMOOTH = 0.05  # width in Ē of the hinge
 _PEAKS = 5
 _RELATIVE_WIDTH = 0.5  # ε of "sinh"; ρb/ε is all that the data know, so that no other value fits better
-FILTER = (0.1, 1.0, 20.0)  # mm of aluminium: least, start, most; the nodes are those of Gauss behind the least
+FILTER = (0.1, 1.0, 20.0)
+"""Filtration (mm of aluminium) that "tube" learns: least, start, most.
+
+The nodes are those of Gauss behind the least, or behind the filtration itself where that is thinner."""
+STOPPED = 5.0  # keV, below which photons count as stopped by air and windows where the filtration is thinner
 _NODES: dict[Name, int] = {"paper": 15, "hinge": 10, "tube": 14, "mono": 1, "sinh": 16, "gmm": 15, "free": 15}
 
 
@@ -71,7 +75,7 @@ class Response:
 
     def bounds(self) -> Array:
         """Return the least and the greatest value of every parameter [T, 2]."""
-        return _bounds(self.name, self.eta.size, self.e_max)
+        return _bounds(self.name, self.eta.size, self.e_max, self.trainable)
 
     def with_theta(self, theta: Sequence[float]) -> "Response":
         """Return the response at another θ; raises InputError outside `bounds`."""
@@ -94,6 +98,7 @@ def make_response(
     nodes: int | None = None,
     theta: Sequence[float] | None = None,
     spectrum: tuple[ArrayLike, ArrayLike] | None = None,
+    detector: Detector | None = None,
 ) -> Response:
     """Build a response for photons up to `e_max` keV; `nodes` is their number, `theta` the start of what is learned.
 
@@ -102,7 +107,8 @@ def make_response(
       the start values); it is clamped to 0 there, and so is its gradient. The sum is far from converged.
     - "hinge": θ = (r, Ē_th), the same idea, positive and less smooth, 10 Gauss–Legendre nodes.
     - "tube": θ = (t,), equivalent aluminium (mm): Finkelshtein and Pavlova's tube at kVp = `e_max` behind t, seen by
-      0.2 mm of GOS; 14 Gauss nodes that stay when t changes: P within 2e-4 for 60 to 140 kVp and t of 0.1 to 20.
+      `detector`, 0.2 mm of GOS for None; 14 Gauss nodes that stay when t changes: P within 2e-4 for 60 to 140 kVp and t
+      of 0.1 to 20. A start below 0.1 has nodes of its own, which do not reach below 5 keV: P within 0.02 there.
     - "known": nothing to learn; `spectrum` is (energies keV, share of the detected signal), reduced to the fewest
       Gauss nodes that keep P within 1e-4 up to P = 14.6, or to `nodes`.
     - "mono": one node at Ē = 1.
@@ -113,12 +119,17 @@ def make_response(
     Raises InputError for what it does not know, for θ outside `bounds`, and for a spectrum that is not one.
     """
     _check_call(name, e_max, basis, nodes, spectrum is not None)
+    if detector is not None and name != "tube":
+        raise InputError(f"detector: only for response 'tube', got it with response {name!r}")
     if spectrum is not None:
         energies, weights = _reduced(_signal(spectrum, e_max), basis, e_max, nodes)
+    elif name == "tube":
+        n = _NODES[name] if nodes is None else nodes
+        energies, weights = _behind(_thinnest(theta), e_max, detector or SCINTILLATOR, n)
     else:
         energies, weights = _quadrature(name, e_max, _NODES[name] if nodes is None else nodes)
     start = _start(name, energies, e_max) if theta is None else theta
-    values = _checked(name, _bounds(name, energies.size, e_max), start)
+    values = _checked(name, _bounds(name, energies.size, e_max, start), start)
     a, b = basis_functions(energies, basis, e_max)
     h, _ = _form(name, energies, e_max, values)
     return Response(
@@ -228,16 +239,27 @@ def _quadrature(name: Name, e_max: float, n: int) -> tuple[Array, Array]:
     center, half = _center(e_max), _half_range(e_max)
     if name == "mono":
         return np.array([center]), np.ones(1)
-    if name == "tube":
-        behind = Tube(kvp=e_max, model="finkelshtein-pavlova", filters=(Filter(material="Al", thickness=FILTER[0]),))
-        rule = gauss_rule(tube_spectrum(behind), SCINTILLATOR, n)
-        mu = _aluminium(rule.energies)
-        return rule.energies, rule.w1 * np.exp(FILTER[0] * mu)
     if name in ("hinge", "sinh"):
         x, w = np.polynomial.legendre.leggauss(n)
         share = 1 + half * x if name == "hinge" else (1 + _RELATIVE_WIDTH * x) ** (-1 / 3)
         return center * share, w / 2
     return center * np.linspace(1 - half, 1 + half, n), np.full(n, 1 / n)
+
+
+def _behind(filtration: float, e_max: float, detector: Detector, n: int) -> tuple[Array, Array]:
+    """Return `_quadrature` of "tube", by n nodes of Gauss for the beam behind a filtration (mm Al)."""
+    behind = (Filter(material="Al", thickness=filtration),) if filtration else ()
+    beam = tube_spectrum(Tube(kvp=e_max, model="finkelshtein-pavlova", filters=behind))
+    if filtration < FILTER[0]:
+        kept = beam.energies >= STOPPED
+        beam = Spectrum(energies=beam.energies[kept], weights=_normalised(beam.weights[kept]))
+    rule = gauss_rule(beam, detector, n)
+    return rule.energies, rule.w1 * np.exp(filtration * _aluminium(rule.energies))
+
+
+def _thinnest(theta: Sequence[float] | None) -> float:
+    """Return the least filtration (mm Al) of "tube" that starts at θ, None for its own start."""
+    return max(0.0, min((FILTER[0], *(() if theta is None else theta))))
 
 
 def _aluminium(energies: Array) -> Array:
@@ -302,12 +324,12 @@ def _start(name: Name, energies: Array, e_max: float) -> tuple[float, ...]:
     return ()
 
 
-def _bounds(name: Name, n_nodes: int, e_max: float) -> Array:
+def _bounds(name: Name, n_nodes: int, e_max: float, theta: Sequence[float]) -> Array:
     half = _half_range(e_max)
     if name in ("paper", "hinge"):
         return np.array([[0.0, 1.0], [1 - 0.9 * half, 1 + half]])
     if name == "tube":
-        return np.array([[FILTER[0], FILTER[2]]])
+        return np.array([[_thinnest(theta), FILTER[2]]])
     if name == "gmm":
         means, widths = [1 - half, 1 + half], [math.log(0.1 * half), math.log(2.0)]
         return np.array([[-20.0, 20.0]] * _PEAKS + [means] * _PEAKS + [widths] * _PEAKS)
