@@ -135,6 +135,13 @@ def test_a_known_spectrum_is_the_one_that_is_told():
     assert found.item() == pytest.approx(exact, abs=1e-4)  # to which a spectrum is reduced
 
 
+def test_a_detector_that_is_told_sees_the_assumed_tube():
+    told, assumed = (
+        Settings(response="tube", detector=kind).make_response(90.0) for kind in ({"kind": "counting"}, None)
+    )
+    assert told.energies_kev @ told.eta < assumed.energies_kev @ assumed.eta - 1  # a photon counts whatever its energy
+
+
 def test_nothing_seen_and_no_time_give_what_there_is():
     for method in (paper, r2):
         empty = method(sphere(mu=0.0), steps=5)
