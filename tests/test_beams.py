@@ -13,9 +13,9 @@ from ctsim.errors import InputError
 from ctsim.reconstruct.splat import fast
 
 
-@pytest.mark.parametrize("thickness", [0.06, 0.3, 2.0, 9.0])
+@pytest.mark.parametrize("thickness", [0.0, 0.06, 0.3, 2.0, 9.0])
 def test_the_assumed_tube_is_equivalent_to_its_own_filter(thickness):
-    filters = (Filter(material="Al", thickness=thickness),)
+    filters = (Filter(material="Al", thickness=thickness),) if thickness else ()
     scanner = msgspec.structs.replace(
         load("beams")[0].resolve(),
         tube=Tube(kvp=90.0, filters=filters, model="finkelshtein-pavlova"),

@@ -189,6 +189,7 @@ def test_gains_over_fdk_are_not_over_the_ramp():
     [
         ("splat", {}, ASSUMED),
         ("splat", {"filtration": 2.5}, ASSUMED),
+        ("splat", {"detector": {"kind": "counting"}}, ASSUMED),
         ("splat", {"response": "known"}, SPECTRUM),
         ("splat-paper", {}, COUNTS_ONLY),
         ("splat-paper", {"response": "tube"}, ASSUMED),

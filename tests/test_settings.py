@@ -117,7 +117,7 @@ def test_a_parameter_that_is_not_there_is_refused_and_near_ones_are_suggested(na
         ("splat.preset=paper", "--method splat-paper or --method splat-r2"),
         ("splat.tube={}", "only for response 'known', got it with response 'tube'"),
         ("splat-paper.detector={}", "only for response 'known' or 'tube', got it with response 'paper'"),
-        ("splat.detector={\"kind\":\"film\"}", "film"),
+        ("splat.detector={\"kind\":\"film\"}", "detector: Invalid enum value 'film' - at `$.kind`"),
         ("field.filtration=-1", "expected a number within 0 to 20 (mm Al), or null, got -1"),
         ("splat-paper.response=mono", "basis: expected constant with response mono"),
         ("fdk.cutoff=NaN", "expected a number above 0, at most 1 (of the Nyquist frequency), got 'NaN'"),

@@ -64,7 +64,7 @@ def test_beams_without_a_filter_are_found(monkeypatch, at):
     tried = Tried(monkeypatch, lambda t: math.exp((filtration.scale(t) - filtration.scale(at)) ** 2))
     got = found(tried)
     assert got.value == pytest.approx(at, abs=0.015) and got.low <= at <= got.high < 0.15
-    assert ("without a filter, or softer" in got.sentence) == (at < 0.03) and min(tried.asked) == 0
+    assert ("without a filter" in got.sentence) == (at < 0.03) and min(tried.asked) == 0
 
 
 def test_a_scan_behind_a_thin_filter_tells_its_beam(monkeypatch):
@@ -227,8 +227,9 @@ def test_a_trial_that_fails_is_left_out(monkeypatch, broken):
 
 
 def test_a_beam_softer_than_any_assumed_is_said(monkeypatch):
-    assert "as soft as" in found(Tried(monkeypatch, lambda t: 1 + t)).sentence
-    assert "as soft as" not in found(Tried(monkeypatch, lambda t: 1 / t)).sentence
+    got = found(Tried(monkeypatch, lambda t: 1 + t))
+    assert f"without a filter, or a softer one, for which values are too low: 0 to {got.high:g} mm Al" in got.sentence
+    assert "without a filter" not in found(Tried(monkeypatch, lambda t: 1 / t)).sentence
     assert not found(Tried(monkeypatch, valley(2.0, steepness=0.5))).sentence
 
 
@@ -287,6 +288,12 @@ def test_a_tube_without_a_filter_is_found_and_said():
     blind, got = quality(bare)
     assert got["value"] < 0.03 and got["low"] == 0 and {"0", "0.05", "0.1"} <= set(got["misfits"])
     assert blind > least + 2
+
+
+def test_no_filtration_can_be_told():
+    """0 is a filtration, not none given."""
+    bare = scan_behind(n_views=12, n_voxel=[18, 18, 18], n_detector=[27, 27], scatter={"level": 0})
+    assert reconstruct(bare.scan, Settings(filtration=0)).details["response"]["theta"] == [0.0]
 
 
 def test_a_detector_that_is_told_replaces_the_assumed_one():

@@ -251,6 +251,19 @@ def test_a_fit_ends_when_views_it_does_not_see_gain_no_more():
     np.testing.assert_allclose(passes[about["step"]], volume.values, rtol=1e-4, atol=1e-8)
 
 
+@pytest.mark.parametrize("falls", [False, True])
+def test_a_tube_that_starts_thin_is_learned_to_the_end(falls, monkeypatch):
+    """The best state may have less filtration than the last one, and the least, rounded to float32, is below itself."""
+    learn = Learner._learn_response
+    if falls:
+        monkeypatch.setattr(Learner, "_learn_response", lambda self, slope, done: learn(self, np.abs(slope) + 1, done))
+    settings = msgspec.structs.replace(PAPER, response="tube", theta=(0.03,), steps=400, held_out=4, patience=2)
+    noisy = torch.from_numpy(np.random.default_rng(5).poisson(sphere(i0=30.0).counts.numpy())).float()
+    volume = fit_published(dataclasses.replace(sphere(i0=30.0), counts=noisy), settings)
+    (found,) = volume.details["response"]["theta"]
+    assert volume.status is Status.OK and (found == 0.03 if falls else 0.03 < found < 0.5)
+
+
 def test_a_loss_that_is_not_finite_ends_the_fit_and_says_so(monkeypatch):
     steps = []
     monkeypatch.setattr(Learner, "step", lambda self, done: steps.append(done) or (math.nan if done == 25 else 0.5))

@@ -295,6 +295,16 @@ def test_a_tube_behind_less_has_nodes_of_its_own(kvp, thickness):
         assert np.abs(got - full)[full < 12].max() < 0.02
 
 
+def test_a_tube_that_starts_thin_may_come_back_to_its_start():
+    thin = make_response("tube", e_max=E_MAX, theta=(0.05,))
+    there = thin.with_theta((5.0,)).with_theta((0.07,))
+    assert there.with_theta((0.05,)).eta.tolist() == thin.eta.tolist()
+    with pytest.raises(InputError, match=r"expected a value within \[0.05, 20\], got 0.04"):
+        there.with_theta((0.04,))
+    with pytest.raises(InputError, match=r"expected a value within \[0.1, 20\], got 0.05"):
+        make_response("tube", e_max=E_MAX).with_theta((0.05,))
+
+
 def test_a_tube_is_seen_by_the_detector_that_is_told():
     counting = Detector(kind="counting")
     told = make_response("tube", e_max=90.0, theta=(0.5,), detector=counting)

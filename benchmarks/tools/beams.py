@@ -123,7 +123,7 @@ def equivalent(scanner: Scanner) -> float:
 
     ends = [float(end) for end in scale([TRIED[0], TRIED[-1]])]
     best: Any = minimize_scalar(curved, bounds=ends, method="bounded")
-    return float(from_scale(best.x))
+    return round(float(from_scale(best.x)), 3)  # the search comes near its ends, but never to them
 
 
 def _p(lengths: NDArray[np.float64], energies: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:

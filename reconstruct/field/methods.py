@@ -20,7 +20,6 @@ from ctsim.reconstruct.splat import fast
 from ctsim.reconstruct.splat.common import Energy
 from ctsim.reconstruct.splat.course import levels_of
 from ctsim.reconstruct.splat.curve import MaterialCurve
-from ctsim.reconstruct.splat.filtration import USUAL
 from ctsim.reconstruct.splat.level import Data as Level
 from ctsim.reconstruct.splat.level import least_met
 from ctsim.reconstruct.splat.response import Response, basis_functions, tangent
@@ -125,7 +124,7 @@ def _field_model(given: Given, settings: Field, readings: dict[str, Any]) -> Mod
     finest = fast.finer(given.scan.geometry, beam.fineness)
     level = Level(geometry=finest, p=given.data.p, weights=given.data.weights, scatter=given.scatter)
     filtration = fast.find_filtration(levels_of(level, coarse=True), given.scan, beam)
-    response = beam.make_response(given.scan.e_max, filtration.value if filtration else settings.filtration or USUAL)
+    response = beam.make_response(given.scan.e_max, filtration.value if filtration else beam.assumed)
     curve = MaterialCurve.of(response, fast.rough_length(level, response, least_met(level)))
     physics = curve_physics(given, curve, response, settings.tv)
     read = functools.partial(_read, physics, curve, response, settings.readout)

@@ -15,7 +15,7 @@ Seconds = Annotated[
 
 
 class Common(Readings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Scatter, what is known of the beam (for the response "known"), and how long a fit may take."""
+    """Scatter, what is known of the tube (for the response "known") and the detector, and how long a fit may take."""
 
     tube: TubeTable = None
     detector: AssumedDetector = None

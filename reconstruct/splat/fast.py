@@ -96,6 +96,11 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
         refuse_beam(self.response, self.tube, self.detector)
         refuse_filtration(self.response, self.filtration)
 
+    @property
+    def assumed(self) -> float:
+        """The filtration (mm Al) where none is found."""
+        return USUAL if self.filtration is None else self.filtration
+
     def make_response(self, e_max: float, filtration: float) -> Response:
         """Build the response for a scan of greatest energy `e_max` (keV), of the tube behind a `filtration` (mm Al)."""
         if self.response == "tube":
@@ -120,7 +125,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     data, clamped = _weighted(scan, settings, finest, scatter, (Below.of(scan) if panel else as_read).noise)
     levels = levels_of(data, coarse=(settings.passes or PASSES)[0] > 0)
     filtration = None if clamped.all() else find_filtration(levels, scan, settings)
-    response = settings.make_response(scan.e_max, filtration.value if filtration else settings.filtration or USUAL)
+    response = settings.make_response(scan.e_max, filtration.value if filtration else settings.assumed)
 
     fit = None if clamped.all() else _fitted(_course(levels, response, settings), scan, settings, stopwatch)
     details: dict[str, Any] = {

@@ -29,7 +29,9 @@ TRIED = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 14.0, 20.0)
 THIN = 0.1  # mm of aluminium, below which filtrations differ by their difference, not by their ratio
 PLAUSIBLE = 1.05  # times the least misfit, at two standard deviations: materials, scatter and spectra are assumed
 UNTOLD, SOFT = 8.0, 1.0
-"""A plausible range from SOFT mm or less to UNTOLD times its lower end or more says that a scan hides its beam."""
+"""A plausible range from SOFT mm or less to UNTOLD times its lower end or more says that a scan hides its beam.
+
+A lower end below THIN counts as THIN: such beams are nearly the same."""
 WIDTH = 1 / 16  # σ of the averages, in widths of the panel
 MET, DARK = 0.15, 3.0
 """P of rays that count: below they graze the object, above scatter and lacking photons make more than the beam does."""
@@ -78,8 +80,9 @@ class Filtration:
         if self.low > TRIED[0]:
             return ""
         return (
-            "the beam is as soft as that of the assumed tube without a filter, or softer: values may be too low; "
-            '`detector` or the response "known" tells more of it'
+            f"the beam may be that of the assumed tube without a filter, or a softer one, for which values are too "
+            f"low: {self.low:g} to {self.high:g} mm Al explain the scan alike; "
+            '`filtration`, `detector` or the response "known" tells the method more'
         )
 
 

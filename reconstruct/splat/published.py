@@ -150,7 +150,7 @@ class _Run:
         learner = self.learner
         if not self.best:
             return learner.splats(), learner.response
-        theta = self.best["theta"].astype(np.float64)
+        theta = np.clip(self.best["theta"].astype(np.float64), *learner.response.bounds().T)  # it was rounded
         response = learner.response.with_theta(theta.tolist()) if self.settings.learns else learner.response
         return splats_of(self.best, learner.objective.activation), response
 

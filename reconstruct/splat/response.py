@@ -43,10 +43,10 @@ _SMOOTH = 0.05  # width in Ē of the hinge
 _PEAKS = 5
 _RELATIVE_WIDTH = 0.5  # ε of "sinh"; ρb/ε is all that the data know, so that no other value fits better
 FILTER = (0.1, 1.0, 20.0)
-"""Filtration (mm of aluminium) that "tube" learns: least, start, most.
+"""Filtration (mm of aluminium) of "tube": least unless it starts thinner, usual start, most.
 
-The nodes are those of Gauss behind the least, or behind the filtration itself where that is thinner."""
-STOPPED = 5.0  # keV, below which photons count as stopped by air and windows where the filtration is thinner
+The nodes are those of Gauss behind the least."""
+STOPPED = 5.0  # keV, below which photons count as stopped by air and windows where a start is thinner
 _NODES: dict[Name, int] = {"paper": 15, "hinge": 10, "tube": 14, "mono": 1, "sinh": 16, "gmm": 15, "free": 15}
 
 
@@ -54,7 +54,8 @@ _NODES: dict[Name, int] = {"paper": 15, "hinge": 10, "tube": 14, "mono": 1, "sin
 class Response:
     """Nodes of a response: `energies_kev`, `a`, `b`, quadrature `weights` and `eta` (sum 1), each float64 [node].
 
-    `trainable` is θ [T], empty where nothing is to be learned; `make_response` says what it holds.
+    `trainable` is θ [T], empty where nothing is to be learned; `make_response` says what it holds. `thinnest` is the
+    least filtration (mm) of "tube".
     """
 
     name: Name
@@ -66,6 +67,7 @@ class Response:
     weights: Array
     eta: Array
     trainable: tuple[float, ...] = ()
+    thinnest: float = FILTER[0]
 
     def described(self) -> dict[str, Any]:
         """Return what P is computed from in the types of JSON: names, θ as "theta", and lists over the nodes."""
@@ -75,7 +77,7 @@ class Response:
 
     def bounds(self) -> Array:
         """Return the least and the greatest value of every parameter [T, 2]."""
-        return _bounds(self.name, self.eta.size, self.e_max, self.trainable)
+        return _bounds(self.name, self.eta.size, self.e_max, self.thinnest)
 
     def with_theta(self, theta: Sequence[float]) -> "Response":
         """Return the response at another θ; raises InputError outside `bounds`."""
@@ -107,8 +109,9 @@ def make_response(
       the start values); it is clamped to 0 there, and so is its gradient. The sum is far from converged.
     - "hinge": θ = (r, Ē_th), the same idea, positive and less smooth, 10 Gauss–Legendre nodes.
     - "tube": θ = (t,), equivalent aluminium (mm): Finkelshtein and Pavlova's tube at kVp = `e_max` behind t, seen by
-      `detector`, 0.2 mm of GOS for None; 14 Gauss nodes that stay when t changes: P within 2e-4 for 60 to 140 kVp and t
-      of 0.1 to 20. A start below 0.1 has nodes of its own, which do not reach below 5 keV: P within 0.02 there.
+      `detector`, None for 0.2 mm of GOS; 14 Gauss nodes that stay when t changes: with GOS P within 2e-4 for 60 to
+      140 kVp and t of 0.1 to 20. A start below 0.1 has nodes of its own and is the least t from then on: with GOS P
+      within 0.02 of that of the photons above 5 keV.
     - "known": nothing to learn; `spectrum` is (energies keV, share of the detected signal), reduced to the fewest
       Gauss nodes that keep P within 1e-4 up to P = 14.6, or to `nodes`.
     - "mono": one node at Ē = 1.
@@ -121,15 +124,16 @@ def make_response(
     _check_call(name, e_max, basis, nodes, spectrum is not None)
     if detector is not None and name != "tube":
         raise InputError(f"detector: only for response 'tube', got it with response {name!r}")
+    thinnest = max(0.0, min((FILTER[0], *(() if theta is None else theta))))
     if spectrum is not None:
         energies, weights = _reduced(_signal(spectrum, e_max), basis, e_max, nodes)
     elif name == "tube":
         n = _NODES[name] if nodes is None else nodes
-        energies, weights = _behind(_thinnest(theta), e_max, detector or SCINTILLATOR, n)
+        energies, weights = _behind(thinnest, e_max, detector or SCINTILLATOR, n)
     else:
         energies, weights = _quadrature(name, e_max, _NODES[name] if nodes is None else nodes)
     start = _start(name, energies, e_max) if theta is None else theta
-    values = _checked(name, _bounds(name, energies.size, e_max, start), start)
+    values = _checked(name, _bounds(name, energies.size, e_max, thinnest), start)
     a, b = basis_functions(energies, basis, e_max)
     h, _ = _form(name, energies, e_max, values)
     return Response(
@@ -142,6 +146,7 @@ def make_response(
         weights=weights,
         eta=_normalised(weights * h),
         trainable=values,
+        thinnest=thinnest,
     )
 
 
@@ -257,11 +262,6 @@ def _behind(filtration: float, e_max: float, detector: Detector, n: int) -> tupl
     return rule.energies, rule.w1 * np.exp(filtration * _aluminium(rule.energies))
 
 
-def _thinnest(theta: Sequence[float] | None) -> float:
-    """Return the least filtration (mm Al) of "tube" that starts at θ, None for its own start."""
-    return max(0.0, min((FILTER[0], *(() if theta is None else theta))))
-
-
 def _aluminium(energies: Array) -> Array:
     """Attenuation (1/mm) less its smallest, which no normalised spectrum knows of."""
     mu = attenuation("Al", energies)
@@ -324,12 +324,12 @@ def _start(name: Name, energies: Array, e_max: float) -> tuple[float, ...]:
     return ()
 
 
-def _bounds(name: Name, n_nodes: int, e_max: float, theta: Sequence[float]) -> Array:
+def _bounds(name: Name, n_nodes: int, e_max: float, thinnest: float) -> Array:
     half = _half_range(e_max)
     if name in ("paper", "hinge"):
         return np.array([[0.0, 1.0], [1 - 0.9 * half, 1 + half]])
     if name == "tube":
-        return np.array([[_thinnest(theta), FILTER[2]]])
+        return np.array([[thinnest, FILTER[2]]])
     if name == "gmm":
         means, widths = [1 - half, 1 + half], [math.log(0.1 * half), math.log(2.0)]
         return np.array([[-20.0, 20.0]] * _PEAKS + [means] * _PEAKS + [widths] * _PEAKS)
