@@ -98,6 +98,18 @@ def test_white_noise_has_its_deviation_and_no_grain(scan):
         assert abs(values[f"grain_{where}"]) < 5 / math.sqrt(n)
     even = min(int(soft.even[name].sum()) for name in soft.pair)
     assert values["cnr"] == pytest.approx(160 / sigma, rel=5 / math.sqrt(even))
+    swapped = scored(scan, noise - np.where(soft.classes["muscle"], 320.0, 0.0))
+    assert swapped["contrast"] == pytest.approx(-1, abs=0.05)
+    assert swapped["cnr"] == pytest.approx(-160 / sigma, rel=5 / math.sqrt(even))
+
+
+def test_a_volume_without_deviation_has_no_cnr(vessel):
+    """One value inside, up to rounding: its contrast over rounding would be any number."""
+    for exact in (0.0, 1e-3):
+        rest = exact * np.random.default_rng(5).standard_normal(SHAPE) - np.where(vessel[2].classes["adipose"], 0, 160)
+        assert scored(vessel, rest)["cnr"] is None and scored(vessel, rest)["fine_cnr"] is None
+    noise = np.random.default_rng(5).standard_normal(SHAPE)
+    assert scored(vessel, noise)["cnr"] > 0 and scored(vessel, noise)["fine_cnr"] > 0
 
 
 VESSEL = (slice(18, 34), slice(30, 33), slice(24, 26))
@@ -121,7 +133,7 @@ def test_fine_structures_are_vessels_away_from_bone(vessel):
     assert np.array_equal(fine, expected)
 
 
-@pytest.mark.parametrize("left", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("left", [-0.5, 0.0, 0.5, 1.0])
 def test_the_contrast_of_a_vessel_is_the_share_that_is_left(vessel, left):
     sigma = 20.0
     painted = sigma * np.random.default_rng(4).standard_normal(SHAPE)
@@ -139,7 +151,7 @@ def test_the_contrast_of_a_vessel_is_the_share_that_is_left(vessel, left):
     # the residual is that noise: of about 150 voxels in a mean, so 1 % less than σ; its RMS is known to 1/√(2n)
     n = len(places)
     expected = values["fine_contrast"] * math.sqrt(power / n) / sigma
-    assert values["fine_cnr"] == pytest.approx(abs(expected), rel=0.02 + 4 / math.sqrt(2 * n))
+    assert values["fine_cnr"] == pytest.approx(expected, rel=0.02 + 4 / math.sqrt(2 * n))
 
 
 @pytest.mark.parametrize("spoilt", [0.09, 0.11])

@@ -413,7 +413,7 @@ def test_absurd_values_are_shown_and_crash_nothing(tmp_path, value):
 def soft(record, rmse, bone=0.0):
     """Add what the protocols `soft` and `structure` say."""
     blank = record.scores["tissue"]
-    more = {"soft": {"rmse": rmse}, "structure": {"false_bone": bone}}
+    more = {"soft": {"rmse": rmse}, "structure": {"false_bone": bone, "false_air": bone / 2}}
     scores = {p: msgspec.structs.replace(blank, values=values) for p, values in more.items()}
     return changed(record, scores=record.scores | scores)
 
@@ -455,9 +455,9 @@ def test_the_main_table_has_what_matters_of_each_scene_and_their_mean():
     heads = ["PSNR3D (dB)", "SSIM3D", "cost of metal (dB)", "short of FDK without metal (dB)", "false bone (%)"]
     for scene in ("lung", "teeth", "mean"):
         part = text[text.index(f"## main: {scene}") :]
-        assert cells(part, "| inputs")[2:] == [*heads, "soft tissue RMSE (HU)", "wall (s)"]
-        row = [cell.strip("*") for cell in cells(part, "| counts only | net")[2:7]]
-        assert row == ["23.00", "0.500", "0.00", "-3.00", "25.00"]
+        assert cells(part, "| inputs")[2:] == [*heads, "false air (%)", "soft tissue RMSE (HU)", "wall (s)"]
+        row = [cell.strip("*") for cell in cells(part, "| counts only | net")[2:8]]
+        assert row == ["23.00", "0.500", "0.00", "-3.00", "25.00", "12.50"]
 
 
 def test_scenes_whose_range_differs_are_to_be_compared_in_hu():

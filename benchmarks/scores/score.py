@@ -11,7 +11,7 @@ import msgspec
 
 from ctsim.benchmarks.engine.record import OK
 
-VERSION = 10
+VERSION = 11
 """Part of every run's identity; raised when a protocol changes its meaning.
 
 1: tissue, aligned, paper, metal, cost. 2: every method runs on the metal-free twin too, for `artefact`.
@@ -20,7 +20,8 @@ part of the identity. 4: `soft` and `structure`, of the twin too; `tissue` stays
 5: fine structures in `soft`. 6: false bone begins at 1000 HU. 7: metal that
 fills less than half of its voxels is left out of `tissue`. 8: near metal is at least 6 voxels. 9: noise near metal is
 without errors of its edge, each metal has its own threshold for Dice, and bone that the reference holds is not false.
-10: MTF50 near metal reaches 12 voxels, and the contrast of fine structures is left out where noise decides it.
+10: MTF50 near metal reaches 12 voxels, and the contrast of fine structures is left out where noise decides it. 11: both
+CNR of `soft` have the sign of the contrast, and are left out where nothing deviates.
 """
 
 AS_RETURNED, AT_50KEV = "as returned", "read at 50 keV"
@@ -191,6 +192,7 @@ MAIN: dict[tuple[str, str], Metric] = {
     ("metal_cost", "own_db"): Metric("cost of metal (dB)", 2, "min"),
     ("metal_cost", "fdk_db"): Metric("short of FDK without metal (dB)", 2, "min"),
     ("structure", "false_bone"): Metric("false bone (%)", 2, "min", 100),
+    ("structure", "false_air"): Metric("false air (%)", 2, "min", 100),
     ("soft", "rmse"): Metric("soft tissue RMSE (HU)", 1, "min"),
     ("cost", "wall"): Metric("wall (s)", 2, "min"),
 }
@@ -202,6 +204,7 @@ MAIN_ACROSS: dict[tuple[str, str], Metric] = {
     ("metal_cost", "own_hu"): Metric("cost of metal (HU)", 1, "min"),
     ("metal_cost", "fdk_hu"): Metric("short of FDK without metal (HU)", 1, "min"),
     ("structure", "false_bone"): MAIN["structure", "false_bone"],
+    ("structure", "false_air"): MAIN["structure", "false_air"],
     ("tissue", "psnr3d"): _IMAGE["psnr3d"],
     ("tissue", "ssim3d"): _IMAGE["ssim3d"],
     ("cost", "wall"): MAIN["cost", "wall"],

@@ -39,6 +39,8 @@ LEAST_POWER = 1e6
 """HU², summed over fine structures: white noise of 100 HU changes the share that is left by 100/√power, here 0.1."""
 AROUND = 9
 """The contrast of a fine structure is against the mean over a cube of this edge."""
+LEAST_DEVIATION = 0.01
+"""HU: below it, as in a volume of one value, a deviation is rounding, and a contrast over it says nothing."""
 HIGH_PASS = 5
 """Noise is what is left of an error without its mean over a cube of this edge (voxels)."""
 REGION = "soft tissue inside the body, outside the metal dilated by 2 voxels"
@@ -224,20 +226,24 @@ def _greatest(found: dict[str, float | None], start: str) -> float | None:
 
 
 def _told_apart(hu: NDArray[np.float64], error: NDArray[np.float64], layout: SoftLayout) -> dict[str, float | None]:
-    """Return how much of the contrast of two classes is left, and the contrast over the error's deviation in them."""
+    """Return how much of the contrast of two classes is left, and that contrast over the error's deviation in them.
+
+    Both are negative where the darker class reads as the brighter one.
+    """
     if layout.pair is None:
         return {"contrast": None, "cnr": None}
     a, b = (layout.even[name] for name in layout.pair)
     found, true = (float(image[a].mean() - image[b].mean()) for image in (hu, layout.reference))
     deviation = math.sqrt((float(error[a].var()) + float(error[b].var())) / 2)
-    return {"contrast": found / true, "cnr": abs(found) / deviation if deviation else None}
+    return {"contrast": found / true, "cnr": found / deviation if deviation > LEAST_DEVIATION else None}
 
 
 def _fine_structures(hu: NDArray[np.float64], layout: SoftLayout) -> dict[str, float | None]:
     """Return how much of the contrast of fine structures is left, and that contrast over what does not belong to it.
 
     Contrast is the deviation from the mean over 9³ voxels, of those in `layout.fine`. The share left is its regression
-    on the reference's; 0 is nothing, 1 is all. The RMS of the contrast left over that of the residual is the CNR.
+    on the reference's; 0 is nothing, 1 is all. The RMS of the contrast left over that of the residual is the CNR, with
+    the sign of the share.
     """
     none: dict[str, float | None] = {"fine_contrast": None, "fine_cnr": None}
     if not layout.fine.any():
@@ -251,8 +257,9 @@ def _fine_structures(hu: NDArray[np.float64], layout: SoftLayout) -> dict[str, f
     if power < LEAST_POWER:
         return {**none}
     left = float(found @ true) / power
-    residual = float(np.sum((found - left * true) ** 2))
-    return {"fine_contrast": left, "fine_cnr": abs(left) * math.sqrt(power / residual) if residual else None}
+    residual = math.sqrt(float(np.mean((found - left * true) ** 2)))
+    rms = math.sqrt(power / len(true))
+    return {"fine_contrast": left, "fine_cnr": left * rms / residual if residual > LEAST_DEVIATION else None}
 
 
 def _noise(error: NDArray[np.float64], layout: SoftLayout) -> dict[str, float | None]:
