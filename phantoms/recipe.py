@@ -33,8 +33,8 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     by_layers: ClassVar[bool] = True
     """Whether a layer of the labels can be drawn without the others."""
 
-    n_voxel: tuple[Side, Side, Side] = (96, 96, 96)
-    """Label grid (z, y, x) over the cube: how finely the body is drawn, never its shape."""
+    n_voxel: tuple[Side, Side, Side] = (107, 107, 107)
+    """Label grid (z, y, x) over the cube: how finely the body is drawn, never its shape; 107 is on no method's grid."""
     size: Millimetres = 60.0
     """Edge of the object's cube in mm. The object stays inside 92 % of it."""
     metal: str = "Fe"

@@ -192,6 +192,15 @@ EXEMPT: dict[Place, str] = {
 }
 """Columns of tables for which no fault is painted, and why."""
 
+DERIVED: dict[str, str] = {
+    "metal_cost": "differences of the scores above, between a scan and its metal-free twin",
+    "against": "differences of `tissue` PSNR3D between rows",
+    "anchored": "quotients of errors above, by FDK's",
+    "no_reference": "of measured scans, which have no truth to paint faults on",
+    "cost": "of the run, not of its volume",
+}
+"""Protocols of tables that judge no volume with a painted fault, and what their columns are."""
+
 SHOWN: tuple[Place, ...] = tuple(
     (protocol, metric) for protocol in PROTOCOLS for metric in COLUMNS[protocol] if (protocol, metric) not in EXEMPT
 )
@@ -219,6 +228,7 @@ def page(name: str, judge: Judge) -> str:
         f"# {TITLE}\n\nMade by {commands}. Do not edit. Scan {name}, commit {commit()}, {machine()}.\n\n{CAPTION}\n\n"
     )
     unseen = "".join(f"- `{p}` {_metric((p, m)).title}: {why}.\n" for (p, m), why in EXEMPT.items())
+    unseen += "".join(f"- `{protocol}`, all columns: {what}.\n" for protocol, what in DERIVED.items())
     return (
         f"{made}{table(*measure(judge)).markdown()}\nColumns of the results for which no fault is painted:\n\n{unseen}"
     )
