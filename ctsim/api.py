@@ -24,8 +24,7 @@ from ctsim.benchmarks.suites import load, select
 from ctsim.dataset.truth import ScanWithTruth
 from ctsim.errors import InputError, check_kind
 from ctsim.human import human_choice
-from ctsim.phantoms.scene import Scene
-from ctsim.phantoms.suites import decode
+from ctsim.phantoms.scene import Scene, read_scene
 from ctsim.simulate import REFERENCE_KEV
 from ctsim.types import Scan, Status, Volume
 
@@ -52,7 +51,7 @@ def new_scene(**keys: Any) -> Scene:
     `new_scene(name="pins", phantom={"recipe": "walnut", "metal": "Fe"}, scanner={"preset": "dental"})`. Raises
     InputError naming a wrong key or value.
     """
-    return decode(keys, Scene, "scene")
+    return read_scene(keys, "scene")
 
 
 def reconstruct_scan(scan: ScanWithTruth | Scan, method: str = "fdk", **parameters: Any) -> Volume:

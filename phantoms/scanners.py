@@ -8,7 +8,8 @@ sources). The preset "ideal" has the distances of the micro-CT and none of it.
 """
 
 import math
-from typing import Annotated, Literal, NamedTuple
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 
@@ -79,6 +80,27 @@ MACHINES: dict[str, Machine] = {
         Scatter(level=3, grid_ratio=10.0),
     ),
 }  # fmt: skip
+
+
+def with_machine(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the scanner table of a scene file with the preset's values for what its parts leave open.
+
+    `tube = { kvp = 110.0 }` keeps the preset's filters, another detector than the preset's has no thickness from it.
+    """
+    machine = MACHINES.get(table.get("preset", "ideal"), MACHINES["ideal"])
+    found = dict(table)
+    for name, keys in _KEPT.items():
+        given, own = table.get(name), msgspec.to_builtins(getattr(machine, name))
+        if not isinstance(given, dict):
+            continue
+        kind = keys[0]
+        if kind in ("kind", "level") and given.get(kind, own[kind]) != own[kind]:
+            continue
+        found[name] = {key: own[key] for key in keys if own[key] is not None} | given
+    return found
+
+
+_KEPT = {"tube": ("kvp", "filters"), "detector": ("kind", "thickness"), "scatter": ("level", "grid_ratio")}
 
 
 def shadow(dso: float, dsd: float, object_mm: float) -> Pair:
@@ -170,13 +192,14 @@ class ScannerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     geometry: Geometry | None = None
     """All of the geometry, instead of a preset."""
     tube: Tube | None = None
-    """Replaces the preset's tube, except a focal spot, off-focal radiation and falloff that it does not state."""
+    """Changes to the preset's tube: voltage, filters, focal spot, off-focal radiation, falloff stay if not stated."""
     detector: Detector | None = None
-    """Replaces the preset's detector, except blur and lag that it does not state; a lag of share 0 is none."""
+    """Changes to the preset's detector: kind, thickness, blur, lag stay if not stated; another kind has no thickness
+    from it, a lag of share 0 is none."""
     noise: Noise | None = None
     """How photons become counts."""
     scatter: Scatter | None = None
-    """The scatter model."""
+    """The scatter model; of level 3 a preset's grid stays if not stated."""
     i0: Annotated[float, msgspec.Meta(ge=1, le=1e12)] | None = None
     """Photons that reach an open pixel in one view, behind the filters (1e5 by default)."""
     scan_mas: Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None = None

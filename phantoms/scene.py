@@ -3,7 +3,7 @@
 import functools
 import hashlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +18,7 @@ from ctsim.geometry import Geometry, crosswise
 from ctsim.look import all_rays
 from ctsim.phantoms.identity import identity
 from ctsim.phantoms.recipes import AnyRecipe, build_recipe
-from ctsim.phantoms.scanners import REACH, ScannerSettings
+from ctsim.phantoms.scanners import REACH, ScannerSettings, with_machine
 from ctsim.phantoms.suites import NULL, decode, parse_toml, read_toml, scenes_of
 from ctsim.phantoms.vary import Drawn, expand, individual_of
 from ctsim.phantoms.visible import build_in_view
@@ -174,10 +174,24 @@ def _scenes(data: dict[str, Any], where: str) -> tuple[Scene, ...]:
     if "scene" not in data and not set(data).isdisjoint(Scene.__struct_fields__):
         data = {"scene": [data]} if "count" in data else data
         if "scene" not in data:
-            return (decode(data, Scene, where),)
-    scenes = scenes_of(data, Scene, where, expand)
+            return (read_scene(data, where),)
+    scenes = scenes_of(data, Scene, where, _expand)
     _check_splits(scenes, where)
     return scenes
+
+
+def read_scene(table: Mapping[str, Any], where: str) -> Scene:
+    """Read one scene of a table; `where` names it in messages. See `load_suite`."""
+    return decode(_with_machine(table), Scene, where)
+
+
+def _expand(place: str, table: dict[str, Any], where: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    return ((where_in, _with_machine(one)) for where_in, one in expand(place, table, where))
+
+
+def _with_machine(table: Mapping[str, Any]) -> dict[str, Any]:
+    scanner = table.get("scanner")
+    return {**table, "scanner": with_machine(scanner)} if isinstance(scanner, dict) else dict(table)
 
 
 def _check_splits(scenes: Sequence[Scene], where: str) -> None:

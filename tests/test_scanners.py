@@ -6,8 +6,9 @@ import pytest
 from ctsim.beam.spectrum import Tube
 from ctsim.detector.panel import Blur
 from ctsim.detector.response import Detector
+from ctsim.errors import InputError
 from ctsim.phantoms.scanners import MACHINES, ScannerSettings
-from ctsim.phantoms.scene import parse_suite
+from ctsim.phantoms.scene import parse_suite, scene_to_toml
 from ctsim.scatter import Scatter
 
 REAL = [name for name in MACHINES if name != "ideal"]
@@ -79,3 +80,56 @@ def test_a_scene_sets_the_level_of_scatter(name, level):
     scanner = resolved(preset=name, scatter={"level": level})
     assert scanner.scatter == Scatter(level=level)  # without the machine's grid
     assert scanner.tube == MACHINES[name].tube and scanner.detector == MACHINES[name].detector
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ('preset = "dental"\ntube = { kvp = 110.0 }', ("Al 2.5", 110.0, "csi", 0.5, None)),
+        ('preset = "c-arm"\ntube = { anode_deg = 9.0 }', ("Al 2.5 Cu 0.1", 100.0, "csi", 0.6, 10.0)),
+        (
+            'preset = "c-arm"\ntube = { filters = [{ material = "Cu", thickness = 0.3 }] }',
+            ("Cu 0.3", 100.0, "csi", 0.6, 10.0),
+        ),
+        ('preset = "dental"\ntube = { filters = [] }', ("", 90.0, "csi", 0.5, None)),
+        ('preset = "dental"\ndetector = { thickness = 0.3 }', ("Al 2.5", 90.0, "csi", 0.3, None)),
+        ('preset = "dental"\ndetector = { kind = "gos" }', ("Al 2.5", 90.0, "gos", 0.1, None)),
+        ('preset = "dental"\ndetector = { kind = "csi" }', ("Al 2.5", 90.0, "csi", 0.5, None)),
+        ('preset = "c-arm"\nscatter = { level = 3 }', ("Al 2.5 Cu 0.1", 100.0, "csi", 0.6, 10.0)),
+        ('preset = "c-arm"\nscatter = { grid_ratio = 6.0 }', ("Al 2.5 Cu 0.1", 100.0, "csi", 0.6, 6.0)),
+        ('preset = "c-arm"\nscatter = { level = 1, fraction = 0.1 }', ("Al 2.5 Cu 0.1", 100.0, "csi", 0.6, None)),
+        ("tube = { kvp = 60.0 }", ("Al 0.5", 60.0, "gos", 0.1, None)),
+    ],
+)
+def test_a_part_keeps_what_of_the_preset_it_does_not_state(given, expected):
+    text = f'name = "s"\nphantom = {{ recipe = "lung", metal = "Fe" }}\n[scanner]\n{given}\n'
+    (scene,) = parse_suite(text)
+    machine = scene.resolve()
+    sheets = " ".join(f"{f.material} {f.thickness:g}" for f in machine.tube.filters)
+    found = sheets, machine.tube.kvp, machine.detector.kind, machine.detector.thickness, machine.scatter.grid_ratio
+    assert found == expected
+    assert parse_suite(scene_to_toml(scene)) == (scene,)  # which states all of it
+    under = f'[defaults.phantom]\nrecipe = "lung"\nmetal = "Fe"\n[[scene]]\nname = "s"\n[scene.scanner]\n{given}\n'
+    assert parse_suite(under) == (scene,)
+
+
+def test_a_voltage_that_is_drawn_keeps_the_filters_of_the_preset():
+    text = """
+[[scene]]
+name = "s"
+count = 2
+phantom = { recipe = "lung", metal = "Fe" }
+scanner = { preset = "dental" }
+vary = { "scanner.tube.kvp" = { uniform = [80.0, 110.0] } }
+"""
+    tubes = [scene.resolve().tube for scene in parse_suite(text)]
+    assert len({tube.kvp for tube in tubes}) == 2
+    assert {(f.material, f.thickness) for tube in tubes for f in tube.filters} == {("Al", 2.5)}
+
+
+@pytest.mark.parametrize(
+    "given", ["tube = 3", 'tube = "x"', "detector = []", "scatter = [1]", 'preset = "x"\ntube = {}']
+)
+def test_a_part_of_another_type_is_refused_as_before(given):
+    with pytest.raises(InputError, match=r"scanner\.(tube|detector|scatter|preset)"):
+        parse_suite(f'name = "s"\nphantom = {{ recipe = "lung" }}\n[scanner]\n{given}\n')

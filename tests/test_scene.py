@@ -146,8 +146,11 @@ def test_ids_of_scenes_made_before_are_what_they_were() -> None:
         noise=Noise(electronic=8.0),
         scatter=Scatter(level=1),
     )
-    full = scene(name="a", phantom=Lung(metal="Ti"), scanner=machine)
-    plain = scene(scanner=ScannerSettings(preset="skyscan1273"))
+    grid = (96, 96, 96)  # the default at that time
+    full = scene(name="a", phantom=Lung(metal="Ti", n_voxel=grid), scanner=machine)
+    plain = scene(
+        phantom=msgspec.structs.replace(scene().phantom, n_voxel=grid), scanner=ScannerSettings(preset="skyscan1273")
+    )
     assert (scene_id(plain), stream_id(plain)) == ("80f9b04bed06", "d9e1e0d59da4")
     assert (scene_id(full), stream_id(full)) == ("c2118d26f899", "cee0d3662a8e")
     suites = {"lung-Fe": ("d883fb1e4e96", "7556d2a12999"), "teeth-Ti": ("110450d6ba50", "eed43024ea85")}
