@@ -34,7 +34,7 @@ class Recipe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Whether a layer of the labels can be drawn without the others."""
 
     n_voxel: tuple[Side, Side, Side] = (107, 107, 107)
-    """Label grid (z, y, x) over the cube: how finely the body is drawn, never its shape; 107 is on no method's grid."""
+    """Label grid (z, y, x) over the cube: how finely the body is drawn, never its shape."""
     size: Millimetres = 60.0
     """Edge of the object's cube in mm. The object stays inside 92 % of it."""
     metal: str = "Fe"

@@ -85,22 +85,24 @@ MACHINES: dict[str, Machine] = {
 def with_machine(table: Mapping[str, Any]) -> dict[str, Any]:
     """Return the scanner table of a scene file with the preset's values for what its parts leave open.
 
-    `tube = { kvp = 110.0 }` keeps the preset's filters, another detector than the preset's has no thickness from it.
+    `tube = { kvp = 110.0 }` keeps the preset's filters. Another kind of detector has no thickness from the preset, and
+    scatter whose level is stated no grid: files that state a scene in full leave out a grid that is not there.
     """
-    machine = MACHINES.get(table.get("preset", "ideal"), MACHINES["ideal"])
+    name = table.get("preset", "ideal")
+    machine = MACHINES.get(name if isinstance(name, str) else "", MACHINES["ideal"])
     found = dict(table)
-    for name, keys in _KEPT.items():
-        given, own = table.get(name), msgspec.to_builtins(getattr(machine, name))
-        if not isinstance(given, dict):
+    for part, keys in KEPT.items():
+        given, own = table.get(part), msgspec.to_builtins(getattr(machine, part))
+        if not isinstance(given, Mapping):
             continue
-        kind = keys[0]
-        if kind in ("kind", "level") and given.get(kind, own[kind]) != own[kind]:
-            continue
-        found[name] = {key: own[key] for key in keys if own[key] is not None} | given
+        whole = (part == "scatter" and "level" in given) or given.get("kind", own.get("kind")) != own.get("kind")
+        if not whole:
+            found[part] = {**{key: own[key] for key in keys if own[key] is not None}, **given}
     return found
 
 
-_KEPT = {"tube": ("kvp", "filters"), "detector": ("kind", "thickness"), "scatter": ("level", "grid_ratio")}
+KEPT = {"tube": ("kvp", "filters"), "detector": ("kind", "thickness"), "scatter": ("level", "grid_ratio")}
+"""In what presets differ, besides what `ScannerSettings.resolve` keeps."""
 
 
 def shadow(dso: float, dsd: float, object_mm: float) -> Pair:
@@ -192,14 +194,15 @@ class ScannerSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     geometry: Geometry | None = None
     """All of the geometry, instead of a preset."""
     tube: Tube | None = None
-    """Changes to the preset's tube: voltage, filters, focal spot, off-focal radiation, falloff stay if not stated."""
+    """Changes to the preset's tube: voltage, filters, focal spot, off-focal radiation, falloff stay if not stated.
+    A `Tube` made in Python is whole but for the last three."""
     detector: Detector | None = None
     """Changes to the preset's detector: kind, thickness, blur, lag stay if not stated; another kind has no thickness
-    from it, a lag of share 0 is none."""
+    from it, a lag of share 0 is none. A `Detector` made in Python is whole but for blur and lag."""
     noise: Noise | None = None
     """How photons become counts."""
     scatter: Scatter | None = None
-    """The scatter model; of level 3 a preset's grid stays if not stated."""
+    """The scatter model; if its level is stated, a preset's grid is left out."""
     i0: Annotated[float, msgspec.Meta(ge=1, le=1e12)] | None = None
     """Photons that reach an open pixel in one view, behind the filters (1e5 by default)."""
     scan_mas: Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None = None

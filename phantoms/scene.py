@@ -3,7 +3,7 @@
 import functools
 import hashlib
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -175,23 +175,21 @@ def _scenes(data: dict[str, Any], where: str) -> tuple[Scene, ...]:
         data = {"scene": [data]} if "count" in data else data
         if "scene" not in data:
             return (read_scene(data, where),)
-    scenes = scenes_of(data, Scene, where, _expand)
+    scenes = scenes_of(data, Scene, where, lambda *row: map(on_machine, expand(*row)))
     _check_splits(scenes, where)
     return scenes
 
 
 def read_scene(table: Mapping[str, Any], where: str) -> Scene:
     """Read one scene of a table; `where` names it in messages. See `load_suite`."""
-    return decode(_with_machine(table), Scene, where)
+    return decode(on_machine(("", table))[1], Scene, where)
 
 
-def _expand(place: str, table: dict[str, Any], where: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    return ((where_in, _with_machine(one)) for where_in, one in expand(place, table, where))
-
-
-def _with_machine(table: Mapping[str, Any]) -> dict[str, Any]:
+def on_machine(row: tuple[str, Mapping[str, Any]]) -> tuple[str, dict[str, Any]]:
+    """Return a place in a file and its scene's table, with what of the preset its scanner does not state."""
+    place, table = row
     scanner = table.get("scanner")
-    return {**table, "scanner": with_machine(scanner)} if isinstance(scanner, dict) else dict(table)
+    return place, {**table, "scanner": with_machine(scanner)} if isinstance(scanner, Mapping) else dict(table)
 
 
 def _check_splits(scenes: Sequence[Scene], where: str) -> None:

@@ -1,14 +1,20 @@
 """Presets: a machine has the effects of a real one, a scene's changes keep them, and "ideal" has none."""
 
+from importlib import resources
+from types import MappingProxyType
+
 import msgspec
 import pytest
 
+import ctsim
 from ctsim.beam.spectrum import Tube
+from ctsim.benchmarks.studies.detect import suite as detect
 from ctsim.detector.panel import Blur
 from ctsim.detector.response import Detector
 from ctsim.errors import InputError
-from ctsim.phantoms.scanners import MACHINES, ScannerSettings
-from ctsim.phantoms.scene import parse_suite, scene_to_toml
+from ctsim.phantoms.recipes import Lung
+from ctsim.phantoms.scanners import KEPT, MACHINES, ScannerSettings
+from ctsim.phantoms.scene import Scene, parse_suite, scene_to_toml
 from ctsim.scatter import Scatter
 
 REAL = [name for name in MACHINES if name != "ideal"]
@@ -78,7 +84,7 @@ def test_a_counting_detector_has_no_light_to_spread():
 @pytest.mark.parametrize("level", [0, 1])
 def test_a_scene_sets_the_level_of_scatter(name, level):
     scanner = resolved(preset=name, scatter={"level": level})
-    assert scanner.scatter == Scatter(level=level)  # without the machine's grid
+    assert scanner.scatter == Scatter(level=level)  # without the machine's grid, as a `Scatter` is whole
     assert scanner.tube == MACHINES[name].tube and scanner.detector == MACHINES[name].detector
 
 
@@ -95,7 +101,8 @@ def test_a_scene_sets_the_level_of_scatter(name, level):
         ('preset = "dental"\ndetector = { thickness = 0.3 }', ("Al 2.5", 90.0, "csi", 0.3, None)),
         ('preset = "dental"\ndetector = { kind = "gos" }', ("Al 2.5", 90.0, "gos", 0.1, None)),
         ('preset = "dental"\ndetector = { kind = "csi" }', ("Al 2.5", 90.0, "csi", 0.5, None)),
-        ('preset = "c-arm"\nscatter = { level = 3 }', ("Al 2.5 Cu 0.1", 100.0, "csi", 0.6, 10.0)),
+        ('preset = "c-arm"\nscatter = { level = 3 }', ("Al 2.5 Cu 0.1", 100.0, "csi", 0.6, None)),
+        ('preset = "c-arm"\nscatter = { grid_ratio = "null" }', ("Al 2.5 Cu 0.1", 100.0, "csi", 0.6, None)),
         ('preset = "c-arm"\nscatter = { grid_ratio = 6.0 }', ("Al 2.5 Cu 0.1", 100.0, "csi", 0.6, 6.0)),
         ('preset = "c-arm"\nscatter = { level = 1, fraction = 0.1 }', ("Al 2.5 Cu 0.1", 100.0, "csi", 0.6, None)),
         ("tube = { kvp = 60.0 }", ("Al 0.5", 60.0, "gos", 0.1, None)),
@@ -128,8 +135,46 @@ vary = { "scanner.tube.kvp" = { uniform = [80.0, 110.0] } }
 
 
 @pytest.mark.parametrize(
-    "given", ["tube = 3", 'tube = "x"', "detector = []", "scatter = [1]", 'preset = "x"\ntube = {}']
+    "given",
+    ["tube = 3", 'tube = "x"', "detector = []", "scatter = [1]", "preset = []\ntube = {}", 'preset = "x"\ntube = {}'],
 )
 def test_a_part_of_another_type_is_refused_as_before(given):
     with pytest.raises(InputError, match=r"scanner\.(tube|detector|scatter|preset)"):
         parse_suite(f'name = "s"\nphantom = {{ recipe = "lung" }}\n[scanner]\n{given}\n')
+
+
+def test_presets_differ_in_nothing_that_a_scene_would_lose():
+    later = {"tube": {"focal_spot", "off_focal", "falloff"}, "detector": {"blur", "lag"}, "scatter": set()}
+    for machine in MACHINES.values():
+        for part, keys in KEPT.items():
+            own = getattr(machine, part)
+            plain = type(own)()
+            differs = {name for name in own.__struct_fields__ if getattr(own, name) != getattr(plain, name)}
+            assert differs <= {*keys, *later[part]}
+
+
+@pytest.mark.parametrize("scatter", [Scatter(level=3), Scatter(level=3, grid_ratio=4.0), Scatter()])
+def test_a_scene_made_in_python_is_read_back_as_it_is(scatter):
+    scanner = ScannerSettings(preset="c-arm", tube=Tube(), detector=Detector(), scatter=scatter)
+    scene = Scene(name="s", phantom=Lung(metal="Fe"), scanner=scanner)
+    assert parse_suite(scene_to_toml(scene)) == (scene,)
+    assert scene.resolve().tube.filters == Tube().filters
+
+
+@pytest.mark.parametrize("tube", [{"kvp": 110.0}, MappingProxyType({"kvp": 110.0})])
+def test_a_scene_of_dicts_keeps_the_preset_as_a_file_does(tube):
+    scene = ctsim.new_scene(name="s", phantom={"recipe": "lung"}, scanner={"preset": "dental", "tube": tube})
+    assert (scene.resolve().tube.kvp, scene.resolve().tube.filters) == (110.0, MACHINES["dental"].tube.filters)
+
+
+def test_a_scene_of_lesions_keeps_the_preset_too(tmp_path):
+    file = tmp_path / "own.toml"
+    bundled = resources.files("ctsim.benchmarks.suites").joinpath("detect.toml").read_text(encoding="utf-8")
+    file.write_text(bundled.replace('preset = "c-arm"', 'preset = "c-arm", tube = { kvp = 80.0 }'), encoding="utf-8")
+    tubes = [one.scanner.resolve(one.phantom.size).tube for one in detect.load(file)]
+    assert any(tube.kvp == 80.0 and tube.filters == MACHINES["c-arm"].tube.filters for tube in tubes)
+
+
+def test_labels_have_a_prime_number_by_default():
+    (n,) = set(Lung().n_voxel)
+    assert n > 96 and all(n % k for k in range(2, n))

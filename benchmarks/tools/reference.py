@@ -30,7 +30,7 @@ from ctsim.errors import InputError
 from ctsim.materials import _TABLE as MATERIALS
 from ctsim.phantoms.recipe import Recipe
 from ctsim.phantoms.recipes import BUILDERS
-from ctsim.phantoms.scanners import MACHINES, ScannerSettings
+from ctsim.phantoms.scanners import KEPT, MACHINES, ScannerSettings
 from ctsim.phantoms.scene import Scene
 from ctsim.phantoms.vary import Many
 
@@ -199,7 +199,10 @@ def _section(title: str, kind: type[msgspec.Struct], links: dict[type, str], wit
         rows.append((f"`{item.encode_name}`", value, _default(item), said.get(item.name, "")))
     rows = [row for row in rows if row[0].strip("`") not in without]
     keys = "\n\n" + table(("key", "value", "default", "meaning"), rows) if rows else ""
-    return f"## {title}\n\n{described(kind)}{keys}"
+    part = title.removeprefix("scanner.")
+    names = " and ".join(f"`{key}`" for key in KEPT.get(part, ()))
+    kept = f"\n\nIn a scene file the default of {names} is the preset's." if names else ""
+    return f"## {title}\n\n{described(kind)}{kept}{keys}"
 
 
 def _default(item: msgspec.structs.FieldInfo) -> str:

@@ -34,7 +34,7 @@ def main_caption(shown: Sequence[RunRecord]) -> str:
             f"Skipped, since they need a truth: {', '.join(NEED_TRUTH)}. Controls have no rank."
         )
     image = "PSNR3D and SSIM3D of all tissue outside the metal (protocol tissue)."
-    bone = "False bone, false air: shares of soft tissue near and between metal that read as one (protocol structure)."
+    bone = "False bone, false air: shares of soft tissue near and between metal that read so (protocol structure)."
     clean = (
         "Short of FDK without metal: what it lacks of the best FDK of that twin, so that erasing detail with and "
         "without metal alike is no gain."

@@ -16,7 +16,7 @@ from ctsim.phantoms.suites import decode, parse_toml, read_toml
 from ctsim.settings import Simulation, Subrays, Tolerance
 
 NAME = "pareto.toml"
-USUAL = 1.0  # label voxels per pixel along an axis, nearly a scene's by default; the bundled suites have 0.5 to 1.2
+USUAL = 107 / 96  # label voxels per pixel along an axis, as a scene has by default; the bundled suites have 0.5 to 1.2
 EXACT, BODY, VOXELS, SCATTER = "exact solids", "body in voxels, metal exact", "all in voxels", "scatter"
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Level = Literal[0, 1, 3]  # of scatter
@@ -215,7 +215,7 @@ def choices(asked: Choices) -> list[Choice]:
 
 def _grids(asked: Choices) -> dict[int, float]:
     """Return the grids by their number of labels; of equal numbers the default grid, else the first."""
-    grids = (*reversed(asked.grids), *(grid for grid in asked.grids if grid == USUAL))
+    grids = (*reversed(asked.grids), USUAL)
     return dict(sorted({round(grid * asked.side): grid for grid in grids}.items()))
 
 
