@@ -55,6 +55,44 @@ def test_large_means_are_normal_and_whole(mean):
     assert stats.kstest((drawn - mean) / math.sqrt(mean), "norm").pvalue > 1e-4
 
 
+def test_rows_of_poisson_numbers_are_those_drawn_one_by_one():
+    """Means on both sides of every limit of the kernel, in an order that mixes them within a row."""
+    gen = np.random.default_rng(2)
+    means = np.concatenate([10 ** gen.uniform(-2, 7, 4000), gen.uniform(8, 12, 1000), gen.uniform(900, 1200, 1000)])
+    means[:4] = 0, 9.999999, 10, 1024  # of more than 1e7 the reference's plain formula knows too little
+    gen.shuffle(means)
+    expected = np.empty(means.size)
+    noise_reference.poisson(means, KEY, expected)
+    assert np.array_equal(draw(means), expected)
+
+
+def test_a_draw_near_the_bound_of_its_test_is_judged_as_by_one_number_or_left_in_doubt():
+    """Second uniform numbers are put next to the bound, where two roundings of it might differ."""
+    gen = np.random.default_rng(4)
+    means = 10 ** gen.uniform(1, 12, 20_000)
+    words = gen.integers(0, 2**64, (2, means.size), np.uint64, endpoint=False)
+    counts, marks = np.empty(means.size), np.empty(means.size, np.int64)
+    noise_cpu.judge(means, words, counts, marks)
+    b = 0.931 + 2.53 * np.sqrt(means)
+    us = 0.5 - np.abs((words[0] >> np.uint64(11)) * 2.0**-53 - 0.5)
+    likely = np.exp([noise_cpu.log_poisson(max(k, 1.0), mean) for k, mean in zip(counts, means, strict=True)])
+    bound = likely * ((-0.059 + 0.02483 * b) / us**2 + b) / (1.1239 + 1.1328 / (b - 3.4))
+    inside = (counts >= 10) & (bound > 1e-3) & (bound < 0.999) & ((us < 0.07) | (bound > 0.9277 - 3.6224 / (b - 2)))
+    assert inside.sum() > 2000
+    for off in (0, 40, -40, 10**6, -(10**6)):  # in 2^-32; the bound computed here is good to about 1e-9 of itself
+        at = np.clip(np.floor(bound * 2**32) + off, 0, 2**32 - 1)
+        noise_cpu.judge(means, np.stack([words[0], at.astype(np.uint64)]), counts, marks)
+        v = (at + 0.5) * 2.0**-32
+        single = np.array([noise_cpu.accepts(*given) for given in zip(counts, means, us, v, strict=True)])
+        quick = (us >= 0.07) & (v <= 0.9277 - 3.6224 / (b - 2))
+        sure = inside & (marks != 2)
+        assert np.array_equal(marks[sure] == 1, (single | quick)[sure])
+        if off == 0:
+            assert np.mean(marks[inside] == 2) > 0.99
+        elif abs(off) > 40:  # 2e-4 of the bound, and the margin is 1e-7 and 1e-12 of the mean
+            assert np.mean(marks[inside & (means < 1e6)] == 2) < 0.01
+
+
 @pytest.mark.parametrize("mean", [12.0, 100.0, 900.0, 1e4, 1e9, 1e12])
 def test_log_probability_keeps_twelve_digits(mean):
     # Differences between neighbours are known exactly: log p(k+1) − log p(k) = log(mean/(k+1)). The values' own

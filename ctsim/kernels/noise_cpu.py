@@ -4,12 +4,17 @@ Images are [v, u]. A pixel's random words depend on the stream's key and on the 
 nothing changes with the number of threads, the order, or what other pixels see. Draw n of pixel i is the
 block philox((i low, i high, n, 0), key); its words 0 and 1 make one uniform number, word 2 another; word 3 of
 draw 0 is the pixel's Gaussian number.
+
+A row of pixels is drawn at once, in loops without branches, of which LLVM does several pixels at a time. What they
+leave undecided, the functions of one number decide (`normal`, `accepts`); both give the same numbers.
 """
 
 import math
 
 import numpy as np
 from numba import njit, prange
+
+from ctsim.kernels.log64_cpu import log
 
 _M0, _M1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
 _W0, _W1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
@@ -23,6 +28,10 @@ _SMALL = 10.0
 _TABLE = 1024
 # A mean above this is a mistake (m2 far below m1², say), not a signal.
 _MOST = 1e30
+# Normal numbers of probabilities this near to a half have a formula of their own.
+_CENTRE = 0.425
+# Fewer than this many counts are no matter for Stirling's series.
+_FEW = 10.0
 _FLOAT32_MAX = float(np.finfo(np.float32).max)
 _LOG_FACTORIAL = np.array([math.lgamma(k + 1.0) for k in range(_TABLE)])
 _RECIPROCAL = np.array([0.0] + [1.0 / k for k in range(1, 128)])
@@ -55,6 +64,13 @@ def blocks(key, first, draw, out):
         out[i, 0], out[i, 1], out[i, 2], out[i, 3] = w0, w1, w2, w3
 
 
+@njit(cache=True, inline="always")
+def _central(q):
+    r = 0.180625 - q * q
+    top = ((59.109374720 * r + 159.29113202) * r + 50.434271938) * r + 3.3871327179
+    return q * top / (((67.187563600 * r + 78.757757664) * r + 17.895169469) * r + 1.0)
+
+
 @njit(cache=True)
 def normal(word):
     """Turn one 32-bit word into a standard normal number by the inverse distribution function.
@@ -62,10 +78,8 @@ def normal(word):
     Wichura 1988, AS 241 (doi:10.2307/2347330), the 7-digit variant; |result| <= 6.3, so its far tail is never met.
     """
     q = (float(word) + 0.5) * _TWO_M32 - 0.5
-    if abs(q) <= 0.425:
-        r = 0.180625 - q * q
-        top = ((59.109374720 * r + 159.29113202) * r + 50.434271938) * r + 3.3871327179
-        return q * top / (((67.187563600 * r + 78.757757664) * r + 17.895169469) * r + 1.0)
+    if abs(q) <= _CENTRE:
+        return _central(q)
     r = math.sqrt(-math.log(0.5 - abs(q))) - 1.6
     top = ((0.17023821103 * r + 1.3067284816) * r + 2.7568153900) * r + 1.4234372777
     return math.copysign(top / ((0.12021132975 * r + 0.73700164250) * r + 1.0), q)
@@ -106,81 +120,198 @@ def _poisson_small(mean, u):
     return float(k)
 
 
-@njit(cache=True)
-def _poisson_retry(mean, b, a, v_quick, u, v, index, key):
-    """Finish Hörmann's rejection from a first pair (u, v) that missed the quick test."""
-    inverse_alpha = 1.1239 + 1.1328 / (b - 3.4)
-    draw = 0
-    while True:
-        us = 0.5 - abs(u)
-        k = np.floor((2.0 * a / us + b) * u + mean + 0.43)
-        if us >= 0.07 and v <= v_quick:
-            return k
-        if (
-            k >= 0.0
-            and not (us < 0.013 and v > us)
-            and math.log(v * inverse_alpha / (a / (us * us) + b)) <= log_poisson(k, mean)
-        ):
-            return k
-        draw += 1
-        w0, w1, w2, _ = philox(index & _LOW, index >> _32, np.uint64(draw), np.uint64(0), key & _LOW, key >> _32)
-        u = float(((w0 << _32) | w1) >> _11) * _TWO_M53 - (0.5 - 0.5 * _TWO_M53)
-        v = (float(w2) + 0.5) * _TWO_M32
+@njit(cache=True, inline="always")
+def _shape(mean):
+    """Return b, a and the bound of the quick test of Hörmann's transformed rejection."""
+    b = 0.931 + 2.53 * math.sqrt(mean)
+    return b, -0.059 + 0.02483 * b, 0.9277 - 3.6224 / (b - 2.0)
 
 
 @njit(cache=True, inline="always")
-def _poisson(mean, w0, w1, w2, index, key):
-    """Draw a Poisson number: inversion below 10, else transformed rejection (PTRS).
-
-    Hörmann 1993, doi:10.1016/0167-6687(93)90997-4. About 9 of 10 draws end here, without a logarithm.
-    """
-    u = float(((w0 << _32) | w1) >> _11) * _TWO_M53
-    if mean < _SMALL:
-        return _poisson_small(mean, u)
-    b = 0.931 + 2.53 * math.sqrt(mean)
-    a = -0.059 + 0.02483 * b
-    u -= 0.5 - 0.5 * _TWO_M53
-    v = (float(w2) + 0.5) * _TWO_M32
-    us = 0.5 - abs(u)
-    v_quick = 0.9277 - 3.6224 / (b - 2.0)
-    if us >= 0.07 and v <= v_quick:
-        return np.floor((2.0 * a / us + b) * u + mean + 0.43)
-    return _poisson_retry(mean, b, a, v_quick, u, v, index, key)
+def _pair(w01, w2):
+    """Return the two uniform numbers of a draw, the first from −½ to ½, the second from 0 to 1."""
+    return np.float64(w01 >> _11) * _TWO_M53 - (0.5 - 0.5 * _TWO_M53), (np.float64(w2) + 0.5) * _TWO_M32
 
 
 @njit(cache=True)
-def poisson(means, key, out):
-    """Draw out[i] ~ Poisson(means[i]) for the pixels i of stream `key`; float64 [n] both."""
-    key = np.uint64(key)
-    for i in range(means.size):
-        index = np.uint64(i)
-        w0, w1, w2, _ = philox(index & _LOW, index >> _32, np.uint64(0), np.uint64(0), key & _LOW, key >> _32)
-        out[i] = _poisson(means[i], w0, w1, w2, index, key)
+def accepts(k, mean, us, v):
+    """Say whether Hörmann's rejection takes k, which has missed the quick test."""
+    b, a, _ = _shape(mean)
+    if k < 0.0 or (us < 0.013 and v > us):
+        return False
+    return math.log(v * (1.1239 + 1.1328 / (b - 3.4)) / (a / (us * us) + b)) <= log_poisson(k, mean)
 
 
 @njit(cache=True)
 def _row_words(key, first, words):
+    """Fill `words` [3, n] with words 0 and 1, word 2 and word 3 of draw 0 of the pixels first, first + 1 and on."""
     k0, k1 = key & _LOW, key >> _32
     for u in range(words.shape[1]):
         index = first + np.uint64(u)
         w0, w1, w2, w3 = philox(index & _LOW, index >> _32, np.uint64(0), np.uint64(0), k0, k1)
         words[0, u] = (w0 << _32) | w1
-        words[1, u] = (w2 << _32) | w3
+        words[1, u] = w2
+        words[2, u] = w3
+
+
+@njit(cache=True, error_model="numpy")
+def _next_words(key, first, todo, draw, words):
+    """Fill words[:2] with those of draw number `draw` of the pixels first + todo[i]."""
+    k0, k1, draw = key & _LOW, key >> _32, np.uint64(draw)
+    for i in range(todo.size):
+        index = first + np.uint64(todo[i])
+        w0, w1, w2, _ = philox(index & _LOW, index >> _32, draw, np.uint64(0), k0, k1)
+        words[0, i] = (w0 << _32) | w1
+        words[1, i] = w2
+
+
+@njit(cache=True, error_model="numpy")
+def judge(means, words, counts, verdicts):
+    """Fill `counts` with the number of each draw and `verdicts` with 1 if it is taken, 0 if not, 2 in doubt.
+
+    `accepts` compares log(v/α…) with log_poisson(k, mean). Here both sides have half of log(mean) more, which leaves
+    two logarithms. Beyond the margin, far above the error of `_log` and of the sums, the comparison is the same.
+    """
+    for i in range(means.size):
+        mean = means[i]
+        b, a, quick = _shape(mean)
+        u, v = _pair(words[0, i], words[1, i])
+        us = 0.5 - abs(u)
+        k = np.floor((2.0 * a / us + b) * u + mean + 0.43)
+        x = v * (1.1239 + 1.1328 / (b - 3.4)) / (a / (us * us) + b)
+        some = max(k, _FEW)
+        inverse = 1.0 / some
+        ratio = log(some / mean)
+        tail = inverse * (1 / 12.0 - inverse * inverse * (1 / 360.0 - inverse * inverse / 1260.0))
+        left = 0.5 * log(x * x * mean)
+        right = some - mean - some * ratio - tail - _HALF_LOG_2PI - 0.5 * ratio
+        margin = 1e-7 + 1e-12 * mean
+        verdict = 2
+        verdict = 1 if left < right - margin else verdict
+        verdict = 0 if left > right + margin else verdict
+        verdict = 2 if k < _FEW else verdict
+        verdict = 0 if (k < 0.0) | ((us < 0.013) & (v > us)) else verdict
+        verdict = 1 if (us >= 0.07) & (v <= quick) else verdict
+        counts[i] = k
+        verdicts[i] = verdict
+
+
+@njit(cache=True, error_model="numpy")
+def _row_poisson(photons, words, first, key, drawn, room):
+    """Draw a Poisson number for each mean of a row; `room` is that of `_room`.
+
+    Inversion below 10, else transformed rejection (PTRS; Hörmann 1993, doi:10.1016/0167-6687(93)90997-4), whose first
+    test takes two to four of five draws without a logarithm.
+    """
+    numbers, others, marks, todo = room
+    left = marks[: photons.size]
+    for u in range(photons.size):
+        mean = photons[u]
+        b, a, quick = _shape(mean)
+        x, v = _pair(words[0, u], words[1, u])
+        us = 0.5 - abs(x)
+        drawn[u] = np.floor((2.0 * a / us + b) * x + mean + 0.43)
+        left[u] = not ((mean >= _SMALL) & (us >= 0.07) & (v <= quick))
+    n = 0
+    for u in range(photons.size):
+        todo[n] = u
+        n += left[u]
+    draw, kept = 0, 0
+    for i in range(n):
+        u = todo[i]
+        if photons[u] < _SMALL:
+            drawn[u] = _poisson_small(photons[u], float(words[0, u] >> _11) * _TWO_M53)
+        else:
+            others[0, kept], others[1, kept] = words[0, u], words[1, u]
+            todo[kept] = u
+            kept += 1
+    while kept > 0:
+        n = kept
+        for i in range(n):
+            numbers[0, i] = photons[todo[i]]
+        if draw > 0:
+            _next_words(key, first, todo[:n], draw, others)
+        judge(numbers[0, :n], others, numbers[1], marks)
+        kept = 0
+        for i in range(n):
+            u = todo[i]
+            if marks[i] == 2:
+                x, v = _pair(others[0, i], others[1, i])
+                marks[i] = accepts(numbers[1, i], numbers[0, i], 0.5 - abs(x), v)
+            drawn[u] = numbers[1, i]
+            todo[kept] = u
+            kept += 1 - marks[i]
+        draw += 1
+
+
+@njit(cache=True)
+def _room(n):
+    """Return what `_row_poisson` and `_row_normal` work in, for n pixels."""
+    return np.empty((2, n)), np.empty((2, n), np.uint64), np.empty(n, np.int64), np.empty(n + 1, np.int64)
+
+
+@njit(cache=True)
+def poisson(means, key, out):
+    """Draw out[i] ~ Poisson(means[i]) for the pixels i of stream `key`; float64 [n] both."""
+    key, words = np.uint64(key), np.empty((3, means.size), np.uint64)
+    _row_words(key, np.uint64(0), words)
+    _row_poisson(means, words, np.uint64(0), key, out, _room(means.size))
+
+
+@njit(cache=True, error_model="numpy")
+def _row_normal(words, normals, room):
+    """Turn each word into a standard normal number, the one of `normal`; `room` is that of `_room`."""
+    todo, n = room[3], 0
+    for u in range(words.size):
+        normals[u] = _central((np.float64(words[u]) + 0.5) * _TWO_M32 - 0.5)
+    for u in range(words.size):
+        todo[n] = u
+        n += abs((np.float64(words[u]) + 0.5) * _TWO_M32 - 0.5) > _CENTRE
+    for i in range(n):
+        normals[todo[i]] = normal(words[todo[i]])
+
+
+@njit(cache=True, error_model="numpy")
+def _row_photons(m1, m2, i0, photons):
+    """Fill `photons` with the means of the Poisson numbers; say whether a moment is impossible."""
+    wrong = False
+    for u in range(photons.size):
+        mean, second = np.float64(m1[u]), np.float64(m2[u])
+        lit = i0 * mean * (m1[u] / m2[u])  # a quotient of float32 stays one, as always
+        seen = (mean > 0.0) & (second > 0.0) & (lit > 0.0) & (lit <= _MOST)
+        wrong |= not (seen | ((mean == 0.0) & (second >= 0.0) & (second < np.inf)))
+        photons[u] = lit if seen else 0.0
+    return wrong
+
+
+@njit(cache=True, error_model="numpy")
+def _row_signals(m1, m2, i0, photons, signals):
+    """Turn the photons drawn, in `signals`, into relative signals."""
+    for u in range(signals.size):
+        of_one = np.float64(m2[u]) / (np.float64(m1[u]) * i0)
+        signals[u] = signals[u] * of_one if photons[u] > 0.0 else 0.0
 
 
 @njit(cache=True, inline="always")
-def _reading(signal, p0, p1, word, electronic, gain, dark, full):
-    """Return what is written of a relative signal; `word` holds the random bits of the electronic noise."""
-    value = dark
+def _reading(signal, p0, p1, noisy, electrons, gain, dark, full):
+    """Return what is written of a relative signal and of the electronic noise, if there is any."""
     factor = p0 * (1.0 + p1 * max(1.0 - signal, 0.0))
-    if factor > 0.0:
-        if electronic > 0.0:
-            value += gain * (signal * factor + electronic * normal(word & _LOW))
-        else:
-            value += gain * signal * factor
-    if full > 0.0:
-        value = min(max(np.floor(value + 0.5), 0.0), full)
-    return value
+    value = gain * (signal * factor + electrons) if noisy else gain * signal * factor
+    value = dark + value if factor > 0.0 else dark
+    return min(max(np.floor(value + 0.5), 0.0), full) if full > 0.0 else value
+
+
+@njit(cache=True, error_model="numpy")
+def _row_readings(signals, pattern, v, begin, electronic, normals, gain, dark, full, out):
+    """Write the counts of row v from column `begin` on."""
+    noisy = electronic > 0.0
+    if pattern.size > 0:
+        for u in range(signals.size):
+            p0, p1 = np.float64(pattern[0, v, begin + u]), np.float64(pattern[1, v, begin + u])
+            out[u] = _reading(signals[u], p0, p1, noisy, electronic * normals[u], gain, dark, full)
+    else:
+        for u in range(signals.size):
+            out[u] = _reading(signals[u], 1.0, 0.0, noisy, electronic * normals[u], gain, dark, full)
 
 
 @njit(parallel=True, cache=True)
@@ -194,31 +325,19 @@ def detect(m1, m2, pattern, spans, i0, electronic, gain, dark, full, key, out, b
     """
     n_v, n_u = m1.shape
     key = np.uint64(key)
-    electronic = electronic / i0
     for v in prange(n_v):
         begin, end = spans[v, 0], spans[v, 1]
-        words = np.empty((2, end - begin), np.uint64)
-        first = np.uint64(v) * np.uint64(n_u)
-        _row_words(key, first + np.uint64(begin), words)
-        wrong = False
-        for u in range(begin, end):
-            mean = float(m1[v, u])
-            second = float(m2[v, u])
-            signal = 0.0
-            photons = 0.0
-            if mean > 0.0 and second > 0.0:
-                photons = i0 * mean * (mean / second)
-            if 0.0 < photons <= _MOST:
-                hi, lo = words[0, u - begin], words[1, u - begin]
-                k = _poisson(photons, hi >> _32, hi & _LOW, lo >> _32, first + np.uint64(u), key)
-                signal = k * (second / (mean * i0))
-            elif not (mean == 0.0 and 0.0 <= second < np.inf):
-                wrong = True
-            p0, p1 = 1.0, 0.0
-            if pattern.size > 0:
-                p0, p1 = float(pattern[0, v, u]), float(pattern[1, v, u])
-            out[v, u] = _reading(signal, p0, p1, words[1, u - begin], electronic, gain, dark, full)
-        bad[v] = wrong
+        n, first = end - begin, np.uint64(v) * np.uint64(n_u) + np.uint64(begin)
+        words, room = np.empty((3, n), np.uint64), _room(n)
+        photons, signals, normals = np.empty(n), np.empty(n), np.zeros(n)
+        mean, second = m1[v, begin:end], m2[v, begin:end]
+        _row_words(key, first, words)
+        bad[v] = _row_photons(mean, second, i0, photons)
+        _row_poisson(photons, words, first, key, signals, room)
+        _row_signals(mean, second, i0, photons, signals)
+        if electronic > 0.0:
+            _row_normal(words[2], normals, room)
+        _row_readings(signals, pattern, v, begin, electronic / i0, normals, gain, dark, full, out[v, begin:end])
 
 
 @njit(parallel=True, cache=True)
@@ -226,15 +345,15 @@ def read_out(drawn, pattern, i0, electronic, gain, dark, full, key, out):
     """Write the counts of a signal [v, u] that was drawn already, in photons; arguments as in `detect`."""
     n_v, n_u = drawn.shape
     key = np.uint64(key)
-    electronic = electronic / i0
     for v in prange(n_v):
-        words = np.empty((2, n_u), np.uint64)
-        _row_words(key, np.uint64(v) * np.uint64(n_u), words)
+        signals, normals = np.empty(n_u), np.zeros(n_u)
         for u in range(n_u):
-            p0, p1 = 1.0, 0.0
-            if pattern.size > 0:
-                p0, p1 = float(pattern[0, v, u]), float(pattern[1, v, u])
-            out[v, u] = _reading(float(drawn[v, u]) / i0, p0, p1, words[1, u], electronic, gain, dark, full)
+            signals[u] = np.float64(drawn[v, u]) / i0
+        if electronic > 0.0:
+            words = np.empty((3, n_u), np.uint64)
+            _row_words(key, np.uint64(v) * np.uint64(n_u), words)
+            _row_normal(words[2], normals, _room(n_u))
+        _row_readings(signals, pattern, v, 0, electronic / i0, normals, gain, dark, full, out[v])
 
 
 @njit(parallel=True, cache=True)
@@ -246,12 +365,14 @@ def detect_tigre(m1, top, i0, electronic, key, out):
     n_v, n_u = m1.shape
     key = np.uint64(key)
     for v in prange(n_v):
-        words = np.empty((2, n_u), np.uint64)
+        words, room = np.empty((3, n_u), np.uint64), _room(n_u)
+        means, drawn, normals = np.empty(n_u), np.empty(n_u), np.empty(n_u)
         first = np.uint64(v) * np.uint64(n_u)
         _row_words(key, first, words)
         for u in range(n_u):
-            mean = i0 * float(m1[v, u]) ** (1.0 / top)
-            hi, lo = words[0, u], words[1, u]
-            k = _poisson(mean, hi >> _32, hi & _LOW, lo >> _32, first + np.uint64(u), key)
-            k = max(k + electronic * normal(lo & _LOW), 1e-6)
+            means[u] = i0 * float(m1[v, u]) ** (1.0 / top)
+        _row_poisson(means, words, first, key, drawn, room)
+        _row_normal(words[2], normals, room)
+        for u in range(n_u):
+            k = max(drawn[u] + electronic * normals[u], 1e-6)
             out[v, u] = min(i0 * (k / i0) ** top, _FLOAT32_MAX)
