@@ -25,7 +25,7 @@ from ctsim.settings import Simulation, Truth
 from ctsim.types import Phantom, Scanner
 
 # a draw and core, a byte, a voxel of a scan's labels and references (4.4 s for 2 scans of 256³)
-NOISE_SECONDS, WRITE_SECONDS, VOLUME_SECONDS = 40e-9, 1e-9, 130e-9
+NOISE_SECONDS, WRITE_SECONDS, VOLUME_SECONDS = 15e-9, 1e-9, 130e-9
 HISTORY_SECONDS = 1.3e-6  # a core and photon of scatter by Monte Carlo: 0.8 (broccoli) to 1.8 (a head of water)
 PLANNING_BYTES = 45_000_000  # of the search for energies
 DENSITY_BYTES = 12  # a voxel of a density map's bricks and runs: 9 in large pieces, 21 where four materials mix
@@ -65,6 +65,7 @@ class Plan(Looked):
     stages: tuple[Stage, ...]
     outputs: tuple[Output, ...]
     spectrum: Spectrum
+    beam: str
     dose: Dose
     scatter_fraction: float
     scatter_error: float | None
@@ -131,6 +132,7 @@ class Plan(Looked):
             "does": does,
             "skips": "; ".join(f"{reason}: {', '.join(names)}" for reason, names in skipped.items()),
             "error": f"{self.error:.0e} (energies){edges}{spot}{scatter}",
+            "beam": self.beam,
             "dose": self.dose.text(),
             "takes": f"{human_time(self.seconds)}, {human_bytes(self.disk_bytes)} on disk, "
             f"{human_bytes(self.memory_bytes)} of memory, {self.n_rays / 1e6:.3g} M rays, {self.flops / 1e9:.2g} Gflop",
@@ -170,6 +172,7 @@ def make_plan(
         outputs=outputs,
         **{item.name: getattr(looked, item.name) for item in fields(Looked)},
         spectrum=spectrum(scanner.tube),
+        beam=f"{scanner.tube.text()}; {scanner.detector.text()}",
         dose=dose_of(scanner.tube, scanner.geometry, scanner.i0),
         scatter_fraction=open_fraction(scanner.scatter, scanner.geometry),
         scatter_error=scatter_error,

@@ -103,3 +103,24 @@ def test_as_many_photons_are_followed_as_planned(monkeypatch, name):
     (scatter,) = found
     # photons are doubled until they suffice: a factor of √2 either way of the mean; scenes differ by 2 either way
     assert 1 / 3 < scatter.histories / series.expected_histories(scanner.geometry, 0.05) < 3
+
+
+@pytest.mark.parametrize(
+    ("scanner", "beam"),
+    [
+        ('preset = "dental", tube = { kvp = 110.0 }', "beam    110 kV, 2.5 mm Al; csi of 0.5 mm\n"),
+        ('preset = "c-arm"', "beam    100 kV, 2.5 mm Al + 0.1 mm Cu; csi of 0.6 mm\n"),
+        ('tube = { model = "mono", kvp = 60.0 }', "beam    60 keV; gos of 0.1 mm\n"),
+        (
+            'tube = { filters = [] }, detector = { kind = "counting" }',
+            "kV, no filter; counting of 0.1 mm above 15 keV\n",
+        ),
+    ],
+)
+def test_a_plan_names_the_beam(scanner, beam):
+    (one,) = parse_suite(
+        'name = "s"\nphantom = { recipe = "validation", n_voxel = [8, 8, 8] }\n'
+        f"scanner = {{ {scanner}, n_views = 2, n_detector = [8, 8], scatter = {{ level = 0 }} }}\n"
+    )
+    found = make_plan(build(one), one.resolve(), one.simulation, one.truth, "s")
+    assert beam in found.text()

@@ -63,7 +63,7 @@ class Settled:
     def text(self) -> str:
         """Say what was imported in one line."""
         g = self.geometry
-        tube = "spectrum unknown" if self.tube is None else f"{self.tube.kvp:g} kV behind {_sheets(self.tube)}"
+        tube = "spectrum unknown" if self.tube is None else f"{self.tube.kvp:g} kV behind {self.tube.sheets()}"
         held = f", {len(self.held)} more held out" if len(self.held) else ""
         axis = f"{round(self.axis, 2) + 0.0:+.2f}"  # no -0.00
         sizes = [f"{d:.4g}" for d in g.d_voxel]
@@ -279,7 +279,3 @@ def water_path(tube: Tube, p: float) -> float:
     lengths = np.linspace(0.0, DEEPEST, 2001)
     left = signal @ np.exp(-np.outer(attenuation("water", found.energies), lengths))
     return float(np.interp(p, -np.log(left / left[0]), lengths))
-
-
-def _sheets(tube: Tube) -> str:
-    return " + ".join(f"{f.thickness:g} mm {f.material}" for f in tube.filters) or "no filter"

@@ -108,6 +108,14 @@ class Tube(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         if not (math.isfinite(self.anode_deg) and low <= self.anode_deg <= high):
             raise InputError(f"tube: anode_deg must be within [{low:g}, {high:g}], got {self.anode_deg}")
 
+    def sheets(self) -> str:
+        """Return the filters in words."""
+        return " + ".join(f"{f.thickness:g} mm {f.material}" for f in self.filters) or "no filter"
+
+    def text(self) -> str:
+        """Return voltage and filters for people."""
+        return f"{self.kvp:g} keV" if self.model == "mono" else f"{self.kvp:g} kV, {self.sheets()}"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spectrum:

@@ -52,6 +52,11 @@ class Detector(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         if self.kind == "counting" and (self.blur is not None or self.lag):
             raise InputError('detector: "counting" has no light; expected neither blur nor lag with it')
 
+    def text(self) -> str:
+        """Return kind and thickness for people."""
+        above = f" above {self.threshold:g} keV" if self.kind == "counting" else ""
+        return f"{self.kind} of {self.thickness:g} mm{above}"
+
 
 def response(detector: Detector, energies: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the mean deposit a1 (keV) [n] and mean squared deposit a2 (keV2) [n] per incident photon.
