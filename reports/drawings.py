@@ -96,23 +96,25 @@ def _panel(axes: Axes) -> None:
 
 
 def artefact(scene: Path, volumes: list[Path], path: Path) -> None:
-    """Draw the slice of a scene with the most metal: the reference and reconstructions named SCENE__METHOD.tif."""
+    """Draw the slice of a scene with the most metal: the reference and reconstructions named SCENE__METHOD.tif.
+
+    The first row's window holds bone, the second's soft tissue, in which faint streaks show.
+    """
     truth = truth_of(open_scan(scene))
     z = cut(truth.metal, truth.body)[0]
     reference = np.asarray(truth.references["effective"][z])
-    top = 2.5 * float(np.median(reference[truth.body[z] & ~truth.metal[z]]))  # a window on tissue
-    figure = Figure(figsize=(2.8 * (1 + len(volumes)) + 0.6, 3.2), layout="constrained")
+    tissue = float(np.median(reference[truth.body[z] & ~truth.metal[z]]))
+    figure = Figure(figsize=(2.8 * (1 + len(volumes)) + 0.6, 6.0), layout="constrained")
     panels = [("reference", reference)]
     panels += [(v.stem.split("__")[-1].upper(), np.asarray(tifffile.memmap(v, mode="r")[z])) for v in volumes]
-    grid = figure.subplots(1, len(panels), squeeze=False)[0]
-    shown = None
-    for axes, (title, image) in zip(grid, panels, strict=True):
-        shown = axes.imshow(image, cmap="gray", vmin=0.0, vmax=top, origin="lower")
-        axes.contour(truth.metal[z], levels=[0.5], colors="#ffb000", linewidths=0.7)
-        axes.set(title=title, xticks=[], yticks=[])
-    scale_bar(grid[0], reference.shape, truth.d_voxel[2], size=8)
-    assert shown is not None
-    figure.colorbar(shown, ax=list(grid), fraction=0.02, pad=0.01, label="1/mm")
+    windows = ((0.0, 2.5 * tissue), (0.6 * tissue, 1.4 * tissue))
+    for row, (low, high) in zip(figure.subplots(2, len(panels), squeeze=False), windows, strict=True):
+        for axes, (title, image) in zip(row, panels, strict=True):
+            axes.imshow(image, cmap="gray", vmin=low, vmax=high, origin="lower")
+            axes.contour(truth.metal[z], levels=[0.5], colors="#ffb000", linewidths=0.7)
+            axes.set(title=title, xticks=[], yticks=[])
+        scale_bar(row[0], reference.shape, truth.d_voxel[2], size=8)
+        figure.colorbar(row[0].images[0], ax=list(row), fraction=0.02, pad=0.01, label="1/mm")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
 
