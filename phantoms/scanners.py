@@ -102,7 +102,7 @@ def with_machine(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 KEPT = {"tube": ("kvp", "filters"), "detector": ("kind", "thickness"), "scatter": ("level", "grid_ratio")}
-"""In what presets differ, besides what `ScannerSettings.resolve` keeps."""
+"""What presets differ in, besides what `ScannerSettings.resolve` keeps."""
 
 
 def shadow(dso: float, dsd: float, object_mm: float) -> Pair:

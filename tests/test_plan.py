@@ -112,6 +112,10 @@ def test_as_many_photons_are_followed_as_planned(monkeypatch, name):
         ('preset = "c-arm"', "beam    100 kV, 2.5 mm Al + 0.1 mm Cu; csi of 0.6 mm\n"),
         ('tube = { model = "mono", kvp = 60.0 }', "beam    60 keV; gos of 0.1 mm\n"),
         (
+            'tube = { model = "finkelshtein-pavlova", bowtie = { center = 1.0, edge = 4.0, half_angle_deg = 9.0 } }',
+            "beam    90 kV (finkelshtein-pavlova), 0.5 mm Al + bow-tie; gos of 0.1 mm\n",
+        ),
+        (
             'tube = { filters = [] }, detector = { kind = "counting" }',
             "kV, no filter; counting of 0.1 mm above 15 keV\n",
         ),

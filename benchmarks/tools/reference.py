@@ -201,7 +201,8 @@ def _section(title: str, kind: type[msgspec.Struct], links: dict[type, str], wit
     keys = "\n\n" + table(("key", "value", "default", "meaning"), rows) if rows else ""
     part = title.removeprefix("scanner.")
     names = " and ".join(f"`{key}`" for key in KEPT.get(part, ()))
-    kept = f"\n\nIn a scene file the default of {names} is the preset's." if names else ""
+    but = {"detector": ", unless another `kind` is stated", "scatter": ", unless `level` is stated"}.get(part, "")
+    kept = f"\n\nIn a scene file the default of {names} is the preset's{but}." if names else ""
     return f"## {title}\n\n{described(kind)}{kept}{keys}"
 
 

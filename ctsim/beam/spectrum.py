@@ -113,8 +113,11 @@ class Tube(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         return " + ".join(f"{f.thickness:g} mm {f.material}" for f in self.filters) or "no filter"
 
     def text(self) -> str:
-        """Return voltage and filters for people."""
-        return f"{self.kvp:g} keV" if self.model == "mono" else f"{self.kvp:g} kV, {self.sheets()}"
+        """Return voltage, filters and a model other than the usual one for people."""
+        if self.model == "mono":
+            return f"{self.kvp:g} keV"
+        model = "" if self.model == "table" else f" ({self.model})"
+        return f"{self.kvp:g} kV{model}, {self.sheets()}{'' if self.bowtie is None else ' + bow-tie'}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

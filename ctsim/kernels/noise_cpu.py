@@ -170,7 +170,7 @@ def judge(means, words, counts, verdicts):
     """Fill `counts` with the number of each draw and `verdicts` with 1 if it is taken, 0 if not, 2 in doubt.
 
     `accepts` compares log(v/α…) with log_poisson(k, mean). Here both sides have half of log(mean) more, which leaves
-    two logarithms. Beyond the margin, far above the error of `_log` and of the sums, the comparison is the same.
+    two logarithms. Beyond the margin, far above the error of `log` and of the sums, the comparison is the same.
     """
     for i in range(means.size):
         mean = means[i]
@@ -201,7 +201,7 @@ def _row_poisson(photons, words, first, key, drawn, room):
     """Draw a Poisson number for each mean of a row; `room` is that of `_room`.
 
     Inversion below 10, else transformed rejection (PTRS; Hörmann 1993, doi:10.1016/0167-6687(93)90997-4), whose first
-    test takes two to four of five draws without a logarithm.
+    test takes a third (mean 10) to four fifths of the draws without a logarithm.
     """
     numbers, others, marks, todo = room
     left = marks[: photons.size]
@@ -247,7 +247,7 @@ def _row_poisson(photons, words, first, key, drawn, room):
 @njit(cache=True)
 def _room(n):
     """Return what `_row_poisson` and `_row_normal` work in, for n pixels."""
-    return np.empty((2, n)), np.empty((2, n), np.uint64), np.empty(n, np.int64), np.empty(n + 1, np.int64)
+    return np.empty((2, n)), np.empty((2, n), np.uint64), np.empty(n, np.int64), np.empty(n, np.int64)
 
 
 @njit(cache=True)
