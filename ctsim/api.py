@@ -48,10 +48,9 @@ def find_scene(suite: str, name: str, *, seed: int | None = None) -> Scene:
 def new_scene(**keys: Any) -> Scene:
     """Return a scene of your own; the keys are those of a scene file, tables are dicts.
 
-    As in a file, `tube={"kvp": 110.0}` keeps the preset's filters; a `Tube` would replace them.
-
-    `new_scene(name="pins", phantom={"recipe": "walnut", "metal": "Fe"}, scanner={"preset": "dental"})`. Raises
-    InputError naming a wrong key or value.
+    `new_scene(name="pins", phantom={"recipe": "walnut", "metal": "Fe"}, scanner={"preset": "dental"})`. As in a file,
+    `"tube": {"kvp": 110.0}` in the scanner keeps the preset's filters; a `Tube` would replace them. Raises InputError
+    naming a wrong key or value.
     """
     return read_scene(keys, "scene")
 

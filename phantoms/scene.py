@@ -175,21 +175,20 @@ def _scenes(data: dict[str, Any], where: str) -> tuple[Scene, ...]:
         data = {"scene": [data]} if "count" in data else data
         if "scene" not in data:
             return (read_scene(data, where),)
-    scenes = scenes_of(data, Scene, where, lambda *row: map(on_machine, expand(*row)))
+    scenes = scenes_of(data, Scene, where, lambda *row: ((at, on_machine(one)) for at, one in expand(*row)))
     _check_splits(scenes, where)
     return scenes
 
 
 def read_scene(table: Mapping[str, Any], where: str) -> Scene:
     """Read one scene of a table; `where` names it in messages. See `load_suite`."""
-    return decode(on_machine(("", table))[1], Scene, where)
+    return decode(on_machine(table), Scene, where)
 
 
-def on_machine(row: tuple[str, Mapping[str, Any]]) -> tuple[str, dict[str, Any]]:
-    """Return a place in a file and its scene's table, with what of the preset its scanner does not state."""
-    place, table = row
+def on_machine(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a scene's table with what of the preset its scanner does not state."""
     scanner = table.get("scanner")
-    return place, {**table, "scanner": with_machine(scanner)} if isinstance(scanner, Mapping) else dict(table)
+    return {**table, "scanner": with_machine(scanner)} if isinstance(scanner, Mapping) else dict(table)
 
 
 def _check_splits(scenes: Sequence[Scene], where: str) -> None:

@@ -154,7 +154,7 @@ def metal_points(body: Phantom, geometry: Geometry) -> NDArray[np.float64]:
 def load(path: Path | None = None) -> tuple[DetectScene, ...]:
     """Read a file of scenes, by default the bundled one; raises InputError with file, key and expectation."""
     if path is not None:
-        return scenes_of(read_toml(path), DetectScene, str(path), lambda *row: [scenes.on_machine(row[:2])])
+        return scenes_of(read_toml(path), DetectScene, str(path), lambda at, one, _: [(at, scenes.on_machine(one))])
     with resources.as_file(resources.files("ctsim.benchmarks.suites") / "detect.toml") as bundled:
         return load(bundled)
 
