@@ -135,7 +135,10 @@ def _pair(w01, w2):
 
 @njit(cache=True)
 def accepts(k, mean, us, v):
-    """Say whether Hörmann's rejection takes k, which has missed the quick test."""
+    """Say whether Hörmann's rejection takes k, which has missed the quick test.
+
+    `us` is ½ less the magnitude of the first uniform number of `_pair`, `v` is the second.
+    """
     b, a, _ = _shape(mean)
     if k < 0.0 or (us < 0.013 and v > us):
         return False
@@ -167,8 +170,9 @@ def _next_words(key, first, todo, draw, words):
 
 @njit(cache=True, error_model="numpy")
 def judge(means, words, counts, verdicts):
-    """Fill `counts` with the number of each draw and `verdicts` with 1 if it is taken, 0 if not, 2 in doubt.
+    """Fill `counts` [n] with the number of each draw and `verdicts` [n] with 1 if it is taken, 0 if not, 2 in doubt.
 
+    `means` [n] are 10 or more, `words` uint64 [2, n] are as in `_row_words`.
     `accepts` compares log(v/α…) with log_poisson(k, mean). Here both sides have half of log(mean) more, which leaves
     two logarithms. Beyond the margin, far above the error of `log` and of the sums, the comparison is the same.
     """
