@@ -222,6 +222,12 @@ def test_carving_marks_the_pixel_that_a_voxel_falls_on(threads):
     carve_cpu.carve(poses, blocked, z, y, x, state)
     assert np.array_equal(state, carve_reference.carve(poses, blocked, z, y, x))
     assert {*np.unique(state)} == {-1, 0, 1}
+    again = np.where(np.random.default_rng(7).random(SHAPE) < 0.5, 5, 0).astype(
+        np.int8
+    )  # half of them done
+    expected = np.where(again == 0, state, again)
+    carve_cpu.carve(poses, blocked, z, y, x, again)
+    assert np.array_equal(again, expected)
     # as far behind the first view's source as the middle lies before it: its pixels say nothing there
     behind = y + 2 * poses[0, 1], x + 2 * poses[0, 0]
     state[:] = 0

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from by_threads import one_and_several
+from scipy import ndimage
 
 from ctsim.benchmarks.make_dataset import main as make_dataset
 from ctsim.benchmarks.methods import find
@@ -25,6 +26,7 @@ from ctsim.reconstruct.splat.checkpoint import Checkpoint, identity_of
 from ctsim.reconstruct.splat.course import levels_of, passes_over
 from ctsim.reconstruct.splat.curve import MATERIALS, MaterialCurve
 from ctsim.reconstruct.splat.fast import Settings, finer
+from ctsim.reconstruct.splat.kernels import carve_reference
 from ctsim.reconstruct.splat.lattice import Lattice
 from ctsim.reconstruct.splat.level import Data, carve, coarser, refined, weighted
 from ctsim.reconstruct.splat.ordered import Fit, bit_reversed, step_length
@@ -134,6 +136,19 @@ def test_carving_keeps_every_voxel_of_the_object_and_few_more():
     kept = carve(data_of(geometry, p), 0.01)
     assert kept[ball].all()
     assert kept.sum() < 3 * ball.sum()
+    known = x + y[:, None] + z[:, None, None] > 2  # some of the ball, and air
+    assert np.array_equal(carve(data_of(geometry, p), 0.01, but=known), kept & ~known)
+
+
+def test_a_voxel_is_empty_where_none_of_nine_pixels_shows_anything():
+    """Against SciPy's filter: what is kept is what a maximum over 3 x 3 pixels, rims repeated, leaves."""
+    p = np.random.default_rng(0).random(GEOMETRY.shape).astype(np.float32)
+    widest = np.stack([ndimage.maximum_filter(view, 3, mode="nearest") for view in p])
+    poses, (z, y, x) = GEOMETRY.pose_array(), GEOMETRY.voxel_centres()
+    for limit in (0.6, 0.8):
+        expected = carve_reference.carve(poses, widest > limit, z, y, x) == 1
+        assert np.array_equal(carve(data_of(GEOMETRY, p), limit), expected)
+        assert 0 < expected.sum() < expected.size
 
 
 def test_pixels_without_weight_carve_nothing():

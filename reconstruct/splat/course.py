@@ -83,7 +83,7 @@ class Course:
             start = refined(before.volume(), level.geometry)
             support = start > EMPTY * water
             if not self.trial:
-                lost = carve(level, self.met) & ~support
+                lost = carve(level, self.met, but=support)
                 start[lost] = AGAIN * water
                 support |= lost
         if not support.any():

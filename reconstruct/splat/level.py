@@ -24,6 +24,7 @@ MOST_STARVED = 0.05, 0.1
 SMOOTH = 0.5  # second difference of p from pixel to pixel that wire and the outlines of metal exceed
 LOUD = 3.0  # standard deviations of a second difference, which noise alone does not exceed
 LEAST_VIEWS = 60  # that tell an object from the streaks between them
+LEFT_OUT = 2  # any state but those that carving gives
 AROUND = 3  # pixels whose majority counts: noise alone makes a reading of some pixel without photons in some view
 
 
@@ -126,18 +127,25 @@ def refined(values: NDArray[np.float32], fine: Geometry) -> NDArray[np.float32]:
     return values
 
 
-def carve(data: Data, open_below: float) -> NDArray[np.bool_]:
-    """Return the voxels [z, y, x] that some view sees and none shows to be empty.
+def carve(data: Data, open_below: float, but: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+    """Return the voxels [z, y, x] that some view sees and none shows to be empty, those of `but` left out.
 
     A voxel is empty where a view has its shadow and p of the pixels around that lies less than `open_below` above that
-    of a ray that met nothing. Pixels without weight say nothing.
+    of a ray that met nothing. Pixels without weight say nothing. What is left out costs nothing.
     """
     near = np.empty(data.p.shape, np.bool_)
     for shadow, p, weights in zip(near, data.p, data.weights, strict=True):  # a view at a time: p is large
-        met = np.where(weights > 0, p - np.float32(data.open), np.inf)
-        shadow[...] = np.asarray(ndimage.maximum_filter(met, (3, 3))) > open_below
+        met = (p - np.float32(data.open) > open_below) | (weights <= 0)
+        wide = met.copy()
+        wide[1:] |= met[:-1]
+        wide[:-1] |= met[1:]
+        shadow[...] = wide
+        shadow[:, 1:] |= wide[:, :-1]
+        shadow[:, :-1] |= wide[:, 1:]
     z, y, x = data.geometry.voxel_centres()
     state = np.zeros(data.geometry.n_voxel, np.int8)
+    if but is not None:
+        state[but] = LEFT_OUT
     carve_cpu.carve(data.geometry.pose_array(), near, z, y, x, state)
     return state == 1
 
