@@ -222,9 +222,7 @@ def test_carving_marks_the_pixel_that_a_voxel_falls_on(threads):
     carve_cpu.carve(poses, blocked, z, y, x, state)
     assert np.array_equal(state, carve_reference.carve(poses, blocked, z, y, x))
     assert {*np.unique(state)} == {-1, 0, 1}
-    again = np.where(np.random.default_rng(7).random(SHAPE) < 0.5, 5, 0).astype(
-        np.int8
-    )  # half of them done
+    again = np.where(np.random.default_rng(7).random(SHAPE) < 0.5, 5, 0).astype(np.int8)  # half of them done
     expected = np.where(again == 0, state, again)
     carve_cpu.carve(poses, blocked, z, y, x, again)
     assert np.array_equal(again, expected)

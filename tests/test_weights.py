@@ -15,7 +15,7 @@ from ctsim.reconstruct.splat import fast, level, verdict
 from ctsim.reconstruct.splat.course import levels_of
 from ctsim.reconstruct.splat.curve import MaterialCurve
 from ctsim.reconstruct.splat.lattice import Lattice
-from ctsim.reconstruct.splat.level import evening_error, rays_met, weighted
+from ctsim.reconstruct.splat.level import coarser, evening_error, rays_met, weighted
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.part import Part
 from ctsim.reconstruct.weights import DARK, doubt_edges, even_out, photon_weights
@@ -261,7 +261,7 @@ def test_what_only_dark_rays_tell_is_kept():
     def kept(error):
         levels = levels_of(weighted(geometry, p, every), coarse=True)
         even_out(levels[-1].weights, error)
-        found = fast._course(levels, response, settings).go(lambda *state: True).volume()
+        found = fast._course(levels, response, settings, 1e5).go(lambda *state: True).volume()
         seen = (np.abs(x) < 60) & (np.abs(y) < 20)
         return np.sum(found[4] * wave, where=seen) / np.sum(truth[4] * wave, where=seen)
 
@@ -297,6 +297,26 @@ def test_the_finest_level_is_doubted_and_the_coarser_ones_count_photons(monkeypa
     for coarse in seen[:-1]:
         read = coarse.weights > 0
         assert np.array_equal(coarse.weights[read], photon_weights(coarse.p, read)[read])
+
+
+def test_coarse_levels_of_a_fit_count_what_no_coarse_grid_holds():
+    """By an error of 0.005 of P, with fourfold photons on each coarser grid, and lowered at edges; not in trials."""
+    scan = simulate_scene(wire(n=36)).scan
+    p = line_integrals(scan, slice(None))[0].numpy()
+    finest = weighted(scan.geometry, p, np.ones(p.shape, np.bool_))
+    levels = [coarser(coarser(finest)), coarser(finest), finest]
+    settings = fast.Settings(filtration=0.5)
+    response = settings.make_response(scan.e_max, 0.5)
+    course = fast._course(levels, response, settings, 1e5)
+    for data, found, error in zip(levels, course.levels, (40.0, 10.0, 0.0), strict=True):
+        photons = photon_weights(data.p, data.weights > 0)
+        assert np.array_equal(data.weights, photons)  # those of the data are left as they are
+        expected = (1 + error) / (1 / photons + error)
+        if error:
+            doubt_edges(data.p, expected, EDGES)
+        np.testing.assert_allclose(found.weights, expected, rtol=1e-5)
+    brief = fast._course(levels, response, settings, 1e5, trial=True)
+    assert brief.levels is levels
 
 
 def wire(n):

@@ -19,8 +19,11 @@ from ctsim.reconstruct.splat.response import Response
 EMPTY, AGAIN = 0.05, 0.3
 """Times water: below the first a voxel of the coarser volume is empty; within the shadows it begins at the second."""
 SMALLEST, FLATTEST = 24, 8  # voxels along x and y, and along z, below which there is no coarser level
-PASSES, MOST = (3, 9), 6e10
-"""Passes over each coarser grid and the finest; fewer, at least one, where all of a grid would meet more voxels."""
+PASSES, MOST = (20, 9), 6e10
+"""Passes over each coarser grid and the finest; fewer, at least one, where all of a grid would meet more voxels.
+
+A pass over half the resolution costs a sixteenth. What dark rays alone tell, as between rods of metal, takes many.
+"""
 COARSER = 4.0  # times the denoising on a coarser grid
 
 
@@ -32,7 +35,7 @@ class Course:
     level; `exact` is how splats are projected. A voxel that a coarser fit emptied begins again where no view shows it
     to be empty: streaks of thick metal bite pieces off the object. The few passes of a `trial` do not empty the air
     again, so it goes without. `fine_metal` gives the surface of metal finer splats in the second half of the passes
-    over the finest grid.
+    over each grid.
     """
 
     levels: list[Data]
@@ -100,7 +103,7 @@ class Course:
             parts=[part],
             response=self.response,
             tv=self.tv * (1 if finest else COARSER),
-            metal_from=(self.passes[k] // 2 or None) if finest and self.fine_metal else None,
+            metal_from=(self.passes[k] // 2 or None) if self.fine_metal else None,
             view_updates=int(self._updates[:k].sum()),
         )
 

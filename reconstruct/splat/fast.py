@@ -31,7 +31,16 @@ from ctsim.reconstruct.splat.common import Common, Energy
 from ctsim.reconstruct.splat.course import PASSES, Course, levels_of, passes_over
 from ctsim.reconstruct.splat.curve import DENSEST, MaterialCurve
 from ctsim.reconstruct.splat.filtration import USUAL, Filtration, found
-from ctsim.reconstruct.splat.level import VIEWS, Data, by_photons, evening_error, least_met, some_readings, thinned
+from ctsim.reconstruct.splat.level import (
+    VIEWS,
+    Data,
+    by_photons,
+    doubted,
+    evening_error,
+    least_met,
+    some_readings,
+    thinned,
+)
 from ctsim.reconstruct.splat.ordered import Fit
 from ctsim.reconstruct.splat.response import FILTER, Response, basis_functions, evaluate, make_response, tangent
 from ctsim.reconstruct.splat.verdict import bounded, dark_misfit, flat, metal_unread, uneven, unexplained, verdict
@@ -56,13 +65,13 @@ Filter = Annotated[float, msgspec.Meta(ge=0, le=FILTER[2])]
 class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How a fit goes, what beam it assumes, and how its volume is read.
 
-    `passes` null makes them 3 and 9, or fewer, at least one, where the passes over a level times its views times its
+    `passes` null makes them 20 and 9, or fewer, at least one, where the passes over a level times its views times its
     voxels would be more than 6e10, minutes of two cores. `tv` is stronger in the first passes and on coarser levels.
-    Weights are the share of photons that came through. Where a body is thick those of dark rays are raised on the
-    finest grid, to half of the usual weight, but by no more than an error of P of `model_error` besides noise would; 0
-    leaves them. `edges` then lowers some.
+    Weights are the share of photons that came through. On coarser grids those of dark rays are raised as by an error of
+    P of 0.005 besides noise. Where a body is thick they are raised on the finest grid, too, to half of the usual
+    weight, but by no more than an error of `model_error` would; 0 leaves them. `edges` then lowers some.
     The finest grid is at most as fine as the detector's pixels at the isocentre. With `fine_metal` the splats within
-    two voxels of the surface of metal are half as far apart in the second half of the passes over that grid.
+    two voxels of the surface of metal are half as far apart in the second half of the passes over each grid.
     `response` "tube" is a tube behind `filtration`, seen by `detector`, null for 0.2 mm of GOS; `filtration` null has
     it found, on grids of at least 32 voxels along x and y. `readout` "hardened" is by the object's own water;
     `Volume.at_energy` gives the volume at any energy. `scatter` "found" is what the pixels tell that no shadow reaches
@@ -127,7 +136,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     filtration = None if clamped.all() else find_filtration(levels, scan, settings)
     response = settings.make_response(scan.e_max, filtration.value if filtration else settings.assumed)
 
-    fit = None if clamped.all() else _fitted(_course(levels, response, settings), scan, settings, stopwatch)
+    fit = None if clamped.all() else _fitted(_course(levels, response, settings, scan.i0), scan, settings, stopwatch)
     details: dict[str, Any] = {
         "response": response.described(),
         **({} if filtration is None else {"filtration": filtration.described()}),
@@ -204,7 +213,7 @@ def find_filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtr
 
     def fits_on(few: list[Data]) -> Callable[[float], Fit | None]:
         def fit_of(value: float) -> Fit | None:
-            course = _course(few, settings.make_response(scan.e_max, value), brief, trial=True)
+            course = _course(few, settings.make_response(scan.e_max, value), brief, scan.i0, trial=True)
             return course.go(lambda fit, whole, share: True)
 
         return fit_of
@@ -294,11 +303,11 @@ def _summed(weights: tuple[float, float], rho: Image) -> Image:
     return np.float32(weights[0]) * rho[0] + np.float32(weights[1]) * rho[1]
 
 
-def _course(levels: list[Data], response: Response, settings: Settings, trial: bool = False) -> Course:
+def _course(levels: list[Data], response: Response, settings: Settings, i0: float, trial: bool = False) -> Course:
     data = levels[-1]
     met = least_met(data)
     return Course(
-        levels=levels,
+        levels=levels if trial else doubted(levels, i0, settings.edges),
         passes=passes_over(levels, settings.passes),
         response=response,
         curve=MaterialCurve.of(response, rough_length(data, response, met)),

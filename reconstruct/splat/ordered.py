@@ -7,7 +7,7 @@ s·F(s·g), g the gradient, s² the inverse of a separable majoriser of the Hess
 44, 1999, doi:10.1088/0031-9155/44/11/311), and F a ramp filter of the transverse frequencies: n views of a subset
 overlap only below n/π cycles a field of view; above, one view alone answers for a frequency, and up to n times the step
 is stable there. At half resolution one pass with F left a smaller error on a thorax with iron than three without.
-In the last passes the surface of metal has finer splats and pixels (`ctsim.reconstruct.splat.metal`).
+In the second half of the passes the surface of metal has finer splats and pixels (`ctsim.reconstruct.splat.metal`).
 """
 
 import math
