@@ -3,7 +3,7 @@
     make-dataset assumptions data/ --seeds 1 2 3
     run-benchmark data/ results/ --method hull --method twin-fdk --method fdk --method limar --method nmar
     run-benchmark data/ results/ --method bhc-poly --method ibhc --method sirt --method asd-pocs --method fista-tv
-    run-benchmark data/ results/ --method fusion --method dicdnet-lite --method field --method splat
+    run-benchmark data/ results/ --method fusion --method dicdnet-lite --method splat
     python -m ctsim.benchmarks.tools.assumptions results/ docs/measured
 
 The scenes of the suite `assumptions` are "OBJECT-FAVOUR"; "OBJECT-strict" grants no method anything. A cell is what a
