@@ -330,8 +330,8 @@ def test_a_dark_level_that_cannot_be_is_said(tmp_path):
 @pytest.mark.parametrize(
     "sizes, views, given, expected",
     [
-        ((48, 96, 192), (60, 120, 240), None, [3, 3, 9]),
-        ((48, 96, 192, 384), (90, 180, 360, 720), None, [3, 3, 3, 1]),
+        ((48, 96, 192), (60, 120, 240), None, [20, 20, 9]),
+        ((48, 96, 192, 384), (90, 180, 360, 720), None, [20, 20, 20, 1]),
         ((48, 96, 192, 384), (90, 180, 360, 720), (3, 4), [3, 3, 3, 4]),
         ((32,), (24,), None, [12]),
         ((1000,), (2000,), None, [1]),
@@ -362,9 +362,10 @@ def test_early_passes_and_coarser_grids_denoise_more(small, monkeypatch):
     monkeypatch.setattr(Lattice, "denoise", noting)
     reconstruct(small.scan, passes=(3, 5))
     sizes = list(dict.fromkeys(size for size, _ in told))
-    assert len(sizes) == 3
-    coarse, fine, metal = ([tau for size, tau in told if size == wanted] for wanted in sizes)
-    assert metal == fine[-len(metal) :]  # of three of the five passes
+    assert len(sizes) == 4
+    coarse, coarse_metal, fine, metal = ([tau for size, tau in told if size == wanted] for wanted in sizes)
+    assert metal == fine[-len(metal) :] and 5 * len(metal) == 3 * len(fine)  # of three of the five passes
+    assert coarse_metal == coarse[-len(coarse_metal) :] and 3 * len(coarse_metal) == 2 * len(coarse)
     assert np.allclose(np.reshape(coarse, (3, -1)) / coarse[-1], np.array([[4], [2], [1]]))
     assert np.allclose(np.reshape(fine, (5, -1)) / fine[-1], np.array([[8], [4], [2], [1], [1]]))
     assert coarse[-1] == pytest.approx(4 * fine[-1] / 2)  # half as many views
@@ -381,21 +382,21 @@ def test_an_interrupted_fit_goes_on_to_the_same_bits(small, tmp_path, monkeypatc
 
     def interrupt(progress):
         shares.append(progress.share)
-        # on the coarse grid, at its end, at the fine one's start, and in its second pass
-        if len(shares) in {5, 9, 11, 25}:
+        # on the coarse grid, there with finer splats at metal, at its end, at the fine one's start, in its second pass
+        if len(shares) in {5, 13, 18, 20, 34}:
             raise Interrupted
 
-    told = {"passes": (1, 3), "checkpoints": str(tmp_path)}
+    told = {"passes": (2, 3), "checkpoints": str(tmp_path)}
     with listen(interrupt, every=0.0):
-        for _ in range(4):
+        for _ in range(5):
             with pytest.raises(Interrupted):
                 reconstruct(small.scan, **told)
             assert len(list(tmp_path.iterdir())) == 1
         found = reconstruct(small.scan, **told)
-    whole = reconstruct(small.scan, passes=(1, 3))
+    whole = reconstruct(small.scan, passes=(2, 3))
     assert torch.equal(found.values, whole.values)
     assert found.details["misfit"] == whole.details["misfit"]
-    assert len(shares) == 8 + 3 * 8 + 4  # subsets; one that was cut off had been taken, but not written
+    assert len(shares) == 2 * 8 + 3 * 8 + 5  # subsets; one that was cut off had been taken, but not written
     assert not list(tmp_path.iterdir())
 
 

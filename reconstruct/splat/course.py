@@ -19,8 +19,9 @@ from ctsim.reconstruct.splat.response import Response
 EMPTY, AGAIN = 0.05, 0.3
 """Times water: below the first a voxel of the coarser volume is empty; within the shadows it begins at the second."""
 SMALLEST, FLATTEST = 24, 8  # voxels along x and y, and along z, below which there is no coarser level
-PASSES, MOST = (20, 9), 6e10
-"""Passes over each coarser grid and the finest; fewer, at least one, where all of a grid would meet more voxels.
+PASSES, ALONE, MOST = (20, 9), 12, 6e10
+"""Passes over each coarser grid and the finest, or over one alone; fewer, at least one, where all of a grid would meet
+more voxels.
 
 A pass over half the resolution costs a sixteenth. What dark rays alone tell, as between rods of metal, takes many.
 """
@@ -135,8 +136,11 @@ def _is_coarsest(n_voxel: tuple[int, int, int]) -> bool:
 
 
 def passes_over(levels: list[Data], given: tuple[int, int] | None) -> list[int]:
-    """Return the passes over each level, coarsest first; a level that is alone has those of all."""
-    most = [(given or PASSES)[level is levels[-1]] for level in levels] if len(levels) > 1 else [sum(given or PASSES)]
+    """Return the passes over each level, coarsest first; a level that is alone has those of all that are `given`."""
+    if len(levels) == 1:
+        most = [ALONE if given is None else sum(given)]
+    else:
+        most = [(given or PASSES)[level is levels[-1]] for level in levels]
     if given is not None:
         return most
     return [min(n, affordable(level.geometry)) for n, level in zip(most, levels, strict=True)]

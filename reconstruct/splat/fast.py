@@ -65,11 +65,12 @@ Filter = Annotated[float, msgspec.Meta(ge=0, le=FILTER[2])]
 class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How a fit goes, what beam it assumes, and how its volume is read.
 
-    `passes` null makes them 20 and 9, or fewer, at least one, where the passes over a level times its views times its
-    voxels would be more than 6e10, minutes of two cores. `tv` is stronger in the first passes and on coarser levels.
-    Weights are the share of photons that came through. On coarser grids those of dark rays are raised as by an error of
-    P of 0.005 besides noise. Where a body is thick they are raised on the finest grid, too, to half of the usual
-    weight, but by no more than an error of `model_error` would; 0 leaves them. `edges` then lowers some.
+    `passes` null makes them 20 and 9, or 12 over a grid that is alone, and fewer, at least one, where the passes over a
+    level times its views times its voxels would be more than 6e10, minutes of two cores. `tv` is stronger in the first
+    passes and on coarser levels. Weights are the share of photons that came through. On coarser grids those of dark
+    rays are raised as by an error of P of 0.005 besides noise. Where a body is thick they are raised on the finest
+    grid, too, to half of the usual weight, but by no more than an error of `model_error` would; 0 leaves them. `edges`
+    then lowers some.
     The finest grid is at most as fine as the detector's pixels at the isocentre. With `fine_metal` the splats within
     two voxels of the surface of metal are half as far apart in the second half of the passes over each grid.
     `response` "tube" is a tube behind `filtration`, seen by `detector`, null for 0.2 mm of GOS; `filtration` null has
