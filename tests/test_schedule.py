@@ -1,6 +1,7 @@
 """Which runs come first, what they are said to take, records of several machines, and tables in any order of ends."""
 
 import dataclasses
+import math
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,7 +17,8 @@ from ctsim.benchmarks.studies.methods.records import RunTask
 from ctsim.benchmarks.studies.methods.run import FDKS, fdk_seconds, in_fdks
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
-from ctsim.reconstruct.splat.course import PASSES
+from ctsim.reconstruct.splat.course import ALONE, PASSES
+from ctsim.reconstruct.splat.fast import finer
 
 CIRCLE = Geometry(
     dso=100.0,
@@ -131,7 +133,15 @@ def test_a_guess_counts_iterations_passes_or_steps(name, overrides, expected):
 
 def test_where_a_pass_is_long_splat_is_guessed_with_fewer():
     long = msgspec.structs.replace(CIRCLE, n_views=10_000, angles_deg=None)
-    assert in_fdks(find("splat"), long) == pytest.approx((1 + 3 / 15) * 1.5**3 * FDKS["splat"])
+    assert in_fdks(find("splat"), long) == pytest.approx((1 + 8 / 15) * 1.5**3 * FDKS["splat"])
+
+
+def test_a_flat_scan_is_guessed_with_the_passes_over_one_grid():
+    flat = msgspec.structs.replace(CIRCLE, n_voxel=(1, *CIRCLE.n_voxel[1:]), d_voxel=(1.0, *CIRCLE.d_voxel[1:]))
+    for given, expected in (({}, ALONE), ({"passes": [20, 9]}, 29)):
+        found = in_fdks(find("splat", given), flat)
+        grid = math.prod(finer(flat, 1.5).n_voxel) / math.prod(flat.n_voxel)
+        assert found == pytest.approx(expected * grid * FDKS["splat"])
 
 
 def test_a_method_that_has_so_many_seconds_is_guessed_to_take_no_more(monkeypatch):

@@ -155,7 +155,7 @@ def test_filtrations_are_tried_on_grids_coarser_than_the_fit(monkeypatch, sizes,
             gone.append([(level.geometry.n_voxel[0], level.geometry.n_views) for level in self.levels])
 
     monkeypatch.setattr(fast, "_course", lambda levels, *rest, **more: Course(levels))
-    got = fast.find_filtration(levels_in_name(sizes, views), types.SimpleNamespace(e_max=90.0, i0=1e5), Settings())
+    got = fast.find_filtration(levels_in_name(sizes, views), types.SimpleNamespace(e_max=90.0), Settings())
     assert gone == (fitted or [])
     assert (got is None) == (fitted is None) and (got is None or got.value == USUAL)
 

@@ -261,7 +261,7 @@ def test_what_only_dark_rays_tell_is_kept():
     def kept(error):
         levels = levels_of(weighted(geometry, p, every), coarse=True)
         even_out(levels[-1].weights, error)
-        found = fast._course(levels, response, settings, 1e5).go(lambda *state: True).volume()
+        found = fast._course(levels, response, settings).go(lambda *state: True).volume()
         seen = (np.abs(x) < 60) & (np.abs(y) < 20)
         return np.sum(found[4] * wave, where=seen) / np.sum(truth[4] * wave, where=seen)
 
@@ -279,7 +279,7 @@ def test_a_ramp_keeps_its_weights_and_an_edge_does_not():
     np.testing.assert_allclose(weights[0, :, 3], before[0, :, 3] / (1 + before[0, :, 3]), rtol=1e-5)
 
 
-def test_the_finest_level_is_doubted_and_the_coarser_ones_count_photons(monkeypatch):
+def test_the_search_has_the_finest_level_doubted_and_the_coarser_ones_by_photons(monkeypatch):
     scan = simulate_scene(wire(n=36))
     seen = []
 
@@ -300,23 +300,23 @@ def test_the_finest_level_is_doubted_and_the_coarser_ones_count_photons(monkeypa
 
 
 def test_coarse_levels_of_a_fit_count_what_no_coarse_grid_holds():
-    """By an error of 0.005 of P, with fourfold photons on each coarser grid, and lowered at edges; not in trials."""
+    """By an error of 0.005 of P, with fourfold photons on each coarser grid, but no more; then lowered at edges."""
     scan = simulate_scene(wire(n=36)).scan
     p = line_integrals(scan, slice(None))[0].numpy()
     finest = weighted(scan.geometry, p, np.ones(p.shape, np.bool_))
     levels = [coarser(coarser(finest)), coarser(finest), finest]
-    settings = fast.Settings(filtration=0.5)
-    response = settings.make_response(scan.e_max, 0.5)
-    course = fast._course(levels, response, settings, 1e5)
-    for data, found, error in zip(levels, course.levels, (40.0, 10.0, 0.0), strict=True):
+    one_row = msgspec.structs.replace(scan.geometry, n_detector=(1, scan.geometry.n_detector[1]))
+    slab = weighted(one_row, p[:, 30:31], np.ones((len(p), 1, p.shape[2]), np.bool_))
+    for data, found, error in zip(levels, level.doubted(levels, 1e5, EDGES), (40.0, 10.0, 0.0), strict=True):
         photons = photon_weights(data.p, data.weights > 0)
         assert np.array_equal(data.weights, photons)  # those of the data are left as they are
         expected = (1 + error) / (1 / photons + error)
         if error:
             doubt_edges(data.p, expected, EDGES)
         np.testing.assert_allclose(found.weights, expected, rtol=1e-5)
-    brief = fast._course(levels, response, settings, 1e5, trial=True)
-    assert brief.levels is levels
+    most, flat = level.doubted(levels, 1e9, 1e6), level.doubted([coarser(slab), slab], 1e5, 1e6)
+    np.testing.assert_allclose(most[0].weights, 161 / (1 / levels[0].weights + 160), rtol=1e-5)
+    np.testing.assert_allclose(flat[0].weights, 6 / (1 / coarser(slab).weights + 5), rtol=1e-5)  # two pixels in one
 
 
 def wire(n):

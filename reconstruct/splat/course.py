@@ -19,9 +19,9 @@ from ctsim.reconstruct.splat.response import Response
 EMPTY, AGAIN = 0.05, 0.3
 """Times water: below the first a voxel of the coarser volume is empty; within the shadows it begins at the second."""
 SMALLEST, FLATTEST = 24, 8  # voxels along x and y, and along z, below which there is no coarser level
-PASSES, ALONE, MOST = (20, 9), 12, 6e10
+PASSES, ALONE, MOST, HALF = (20, 9), 12, 6e10, 0.5
 """Passes over each coarser grid and the finest, or over one alone; fewer, at least one, where all of a grid would meet
-more voxels.
+more voxels, and over a coarser grid where they would meet more than this share of what those over the finest do.
 
 A pass over half the resolution costs a sixteenth. What dark rays alone tell, as between rods of metal, takes many.
 """
@@ -126,26 +126,44 @@ class Course:
 def levels_of(data: Data, coarse: bool) -> list[Data]:
     """Return the data at each resolution, the coarsest first; at their own alone unless `coarse`."""
     levels = [data]
-    while coarse and not _is_coarsest(levels[0].geometry.n_voxel):
+    while coarse and not is_coarsest(levels[0].geometry.n_voxel):
         levels.insert(0, coarser(levels[0]))
     return levels
 
 
-def _is_coarsest(n_voxel: tuple[int, int, int]) -> bool:
+def is_coarsest(n_voxel: tuple[int, int, int]) -> bool:
+    """Whether half of these voxels [z, y, x] would be too few."""
     return min(n_voxel[1:]) < 2 * SMALLEST or n_voxel[0] < 2 * FLATTEST
 
 
 def passes_over(levels: list[Data], given: tuple[int, int] | None) -> list[int]:
-    """Return the passes over each level, coarsest first; a level that is alone has those of all that are `given`."""
-    if len(levels) == 1:
-        most = [ALONE if given is None else sum(given)]
-    else:
-        most = [(given or PASSES)[level is levels[-1]] for level in levels]
+    """Return the passes over each level, coarsest first: both numbers of those `given`, or `ALONE`, if there is one."""
     if given is not None:
-        return most
-    return [min(n, affordable(level.geometry)) for n, level in zip(most, levels, strict=True)]
+        return [given[level is levels[-1]] for level in levels] if len(levels) > 1 else [sum(given)]
+    finest = min(ALONE if len(levels) == 1 else PASSES[1], affordable(levels[-1].geometry))
+    most = min(HALF * finest * work(levels[-1].geometry), MOST)
+    return [*(max(min(PASSES[0], int(most / work(level.geometry))), 1) for level in levels[:-1]), finest]
+
+
+def in_passes(finest: Geometry, given: tuple[int, int] | None) -> float:
+    """Return about how much work a fit is, in passes over its finest grid.
+
+    Σ 16⁻ⁿ: a coarser grid has an eighth of the voxels and half of the views.
+    """
+    alone = is_coarsest(finest.n_voxel)
+    if given is not None:
+        return float(sum(given)) if alone else given[1] + given[0] / 15
+    if alone:
+        return float(min(ALONE, affordable(finest)))
+    last = min(PASSES[1], affordable(finest))
+    return last + min(PASSES[0], 16 * HALF * last) / 15
 
 
 def affordable(geometry: Geometry) -> int:
     """Return how many passes over the views of a grid stay below the most that is spent on one."""
-    return max(int(MOST / (geometry.n_views * math.prod(geometry.n_voxel))), 1)
+    return max(int(MOST / work(geometry)), 1)
+
+
+def work(geometry: Geometry) -> int:
+    """Return how many voxels a pass over all views meets."""
+    return geometry.n_views * math.prod(geometry.n_voxel)

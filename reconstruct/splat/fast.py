@@ -69,8 +69,8 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     level times its views times its voxels would be more than 6e10, minutes of two cores. `tv` is stronger in the first
     passes and on coarser levels. Weights are the share of photons that came through. On coarser grids those of dark
     rays are raised as by an error of P of 0.005 besides noise. Where a body is thick they are raised on the finest
-    grid, too, to half of the usual weight, but by no more than an error of `model_error` would; 0 leaves them. `edges`
-    then lowers some.
+    grid, too, to half of the usual weight, but by no more than an error of `model_error` would; 0 leaves them there.
+    `edges` then lowers some.
     The finest grid is at most as fine as the detector's pixels at the isocentre. With `fine_metal` the splats within
     two voxels of the surface of metal are half as far apart in the second half of the passes over each grid.
     `response` "tube" is a tube behind `filtration`, seen by `detector`, null for 0.2 mm of GOS; `filtration` null has
@@ -137,7 +137,8 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
     filtration = None if clamped.all() else find_filtration(levels, scan, settings)
     response = settings.make_response(scan.e_max, filtration.value if filtration else settings.assumed)
 
-    fit = None if clamped.all() else _fitted(_course(levels, response, settings, scan.i0), scan, settings, stopwatch)
+    levels = doubted(levels, scan.i0, settings.edges)
+    fit = None if clamped.all() else _fitted(_course(levels, response, settings), scan, settings, stopwatch)
     details: dict[str, Any] = {
         "response": response.described(),
         **({} if filtration is None else {"filtration": filtration.described()}),
@@ -145,7 +146,7 @@ def reconstruct(scan: Scan, settings: Settings) -> Volume:
         **scatter.details(),
         "clamped_pixels": int(clamped.sum()),
         "evened_out": data.error,
-        "grid": [n * (1 if fit is None else fit.finer) for n in finest.n_voxel],
+        "grid": list(finest.n_voxel) if fit is None else [n * fit.finer for n in fit.data.geometry.n_voxel],
         "splats": 0 if fit is None else fit.n_splats,
     }
     if fit is None:
@@ -214,7 +215,7 @@ def find_filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtr
 
     def fits_on(few: list[Data]) -> Callable[[float], Fit | None]:
         def fit_of(value: float) -> Fit | None:
-            course = _course(few, settings.make_response(scan.e_max, value), brief, scan.i0, trial=True)
+            course = _course(few, settings.make_response(scan.e_max, value), brief, trial=True)
             return course.go(lambda fit, whole, share: True)
 
         return fit_of
@@ -304,11 +305,11 @@ def _summed(weights: tuple[float, float], rho: Image) -> Image:
     return np.float32(weights[0]) * rho[0] + np.float32(weights[1]) * rho[1]
 
 
-def _course(levels: list[Data], response: Response, settings: Settings, i0: float, trial: bool = False) -> Course:
+def _course(levels: list[Data], response: Response, settings: Settings, trial: bool = False) -> Course:
     data = levels[-1]
     met = least_met(data)
     return Course(
-        levels=levels if trial else doubted(levels, i0, settings.edges),
+        levels=levels,
         passes=passes_over(levels, settings.passes),
         response=response,
         curve=MaterialCurve.of(response, rough_length(data, response, met)),

@@ -14,7 +14,9 @@ from ctsim.reconstruct.starved import WEIGHT
 from ctsim.reconstruct.weights import as_read, bends, doubt_edges, even_out, photon_weights
 
 OPEN, LEAST_OPEN = 5.0, 0.01  # standard deviations of an open pixel, or p, below which a ray met nothing
-COARSE_ERROR = 0.005  # of P on a coarse grid, besides noise; the error on headline's scenes is 0.004 to 0.016
+COARSE_ERROR, MOST_EVEN = 0.005, 160.0
+"""The error of P on a coarse grid besides noise, 0.004 to 0.016 on the scenes of `headline`, and the greatest variance
+of it, in those of an open ray, that weights are evened out by: no greater one was tried."""
 VIEWS = 12  # whose pixels stand for all
 DARKER = 0.9  # share of the rays that are brighter than the dark one
 SHARE = 0.5  # of the usual weight, that the dark ray is to have
@@ -99,23 +101,24 @@ def coarser(data: Data) -> Data:
 
 
 def doubted(levels: list[Data], i0: float, edges: float) -> list[Data]:
-    """Return the levels with what coarse grids cannot hold taken into the weights of all but the finest.
+    """Return the levels, coarsest first, with what grids cannot hold taken into the weights of all but the finest.
 
-    Even behind bright rays they miss P by about `COARSE_ERROR`, and the photons of a pixel, `i0` on the finest grid,
-    are fourfold on each coarser one: by photons alone dark rays would hardly count. `edges` as in `doubt_edges`.
+    Even behind bright rays a coarse grid misses P by about `COARSE_ERROR`, and its pixels, which are larger, have more
+    photons than the `i0` of the finest grid's: by photons alone dark rays would hardly count. `edges` is that of
+    `doubt_edges`.
     """
-    coarse, finest = levels[:-1], levels[-1]
-    changed = []
-    for k, level in enumerate(coarse):
+    finest, changed = levels[-1], []
+    for level in levels[:-1]:
+        pixels = math.prod(level.geometry.d_detector) / math.prod(finest.geometry.d_detector)
         weights = level.weights.copy()
-        even_out(weights, COARSE_ERROR**2 * i0 * 4.0 ** (len(coarse) - k))
+        even_out(weights, min(COARSE_ERROR**2 * i0 * pixels, MOST_EVEN))
         doubt_edges(level.p, weights, edges, level.scatter)
         changed.append(replace(level, weights=weights))
     return [*changed, finest]
 
 
 def by_photons(data: Data) -> Data:
-    """Return the data with weights as on coarser grids: by photons alone, not evened out nor lowered at edges."""
+    """Return the data with the weights of trial fits: by photons alone, not evened out nor lowered at edges."""
     weights = photon_weights(data.p, data.weights > 0)
     weights[data.weights < 0] = -WEIGHT
     return replace(data, weights=weights, error=0.0)

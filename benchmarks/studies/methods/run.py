@@ -43,7 +43,7 @@ from ctsim.dataset.store import StoredScan
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.fdk import reconstruct as fdk
-from ctsim.reconstruct.splat.course import PASSES, affordable
+from ctsim.reconstruct.splat.course import in_passes
 from ctsim.reconstruct.splat.fast import finer
 from ctsim.types import Scan
 
@@ -281,8 +281,7 @@ def in_fdks(method: Method, geometry: Geometry) -> float | None:
     try:
         if name == "splat":
             fine = finer(geometry, params["fineness"])
-            coarse, finest = params["passes"] or (PASSES[0], min(PASSES[1], affordable(fine)))
-            passes = finest + coarse / 15  # Σ 16⁻ⁿ: a coarser grid has an eighth of the voxels and half of the views
+            passes = in_passes(fine, params["passes"])
             return FDKS[name] * passes * math.prod(fine.n_voxel) / math.prod(geometry.n_voxel)
         count = next((params[key] for key in AMOUNTS if params.get(key) is not None), 1.0)
         return FDKS[name] * float(count)
