@@ -20,7 +20,7 @@ from scipy import fft, ndimage, optimize
 
 from ctsim.geometry import Geometry, few_views
 from ctsim.reconstruct.log import Filling, count_floor
-from ctsim.reconstruct.scatter import SPREAD, Image, alive, between, source_of
+from ctsim.reconstruct.scatter import SPREAD, Image, alive, between, laid, source_of
 from ctsim.types import Scan
 
 WIDTHS = tuple(16 * 2 ** (k / 2) for k in range(-4, 6))
@@ -291,8 +291,7 @@ class _GlareOf:
 
     def _straight(self, signal: Image) -> Image:
         glare = _glare(_blocks(signal, self._step), self._parts, self._d)
-        between_blocks = np.asarray(self._rows @ glare @ self._columns.T, np.float32)
-        return (signal - between_blocks) / np.float32(1 - _total(self._parts))
+        return (signal - laid(glare, self._rows, self._columns)) / np.float32(1 - _total(self._parts))
 
 
 def _columns(

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, optimize
+from scipy import ndimage, optimize, sparse
 
 from ctsim.geometry import Geometry
 
@@ -60,7 +60,7 @@ class Scatter:
         rows, columns = (
             between(n, blocks, step) for n, blocks, step in zip(shape, self.source.shape[1:], self.step, strict=True)
         )
-        return np.float32(self.floor) + np.float32(self.gain) * (rows @ self.source[view] @ columns.T)
+        return np.float32(self.floor) + np.float32(self.gain) * laid(self.source[view], rows, columns)
 
 
 def scatter_of(p: Image, valid: NDArray[np.bool_], geometry: Geometry, i0: float) -> Scatter:
@@ -174,8 +174,16 @@ def _block_means(p: Image, valid: NDArray[np.bool_]) -> tuple[Image, tuple[int, 
     return means, (step_v, step_u)
 
 
-def between(n: int, blocks: int, step: int) -> Image:
+def between(n: int, blocks: int, step: int) -> sparse.csr_array:
     """Return the matrix that interpolates `n` pixels from blocks of `step` pixels, of which the last may be shorter."""
     middles = np.minimum(np.arange(blocks) * step + (step - 1) / 2, (np.arange(blocks) * step + n - 1) / 2)
     weights = [np.interp(np.arange(n), middles, unit) for unit in np.eye(blocks)]
-    return np.stack(weights, 1, dtype=np.float32)
+    return sparse.csr_array(np.stack(weights, 1, dtype=np.float32))
+
+
+def laid(blocks: Image, rows: sparse.csr_array, columns: sparse.csr_array) -> Image:
+    """Return an image of blocks laid over pixels, [v, u], by the matrices of `between` along v and u.
+
+    Dense products would be slower, and their last bits would depend on how many threads NumPy's BLAS has.
+    """
+    return np.asarray((columns @ (rows @ blocks).T).T, np.float32)

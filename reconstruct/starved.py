@@ -71,7 +71,7 @@ class Below:
         for view in range(scan.geometry.n_views):
             signal = _signal(scan, view)
             below = -signal[np.isfinite(signal) & (signal < -rounded)].astype(np.float64) - rounded
-            count, total, squares = count + below.size, total + below.sum(), squares + below @ below
+            count, total, squares = count + below.size, total + below.sum(), squares + np.square(below).sum()
         open_field = float(scan.flat.double().mean()) - scan.dark
         if not open_field > 0 or not squares > 16 * rounded**2 * count:  # twice a count: less may be rounding alone
             return cls(count=0, mean=0.0, rms=0.0)

@@ -1,5 +1,9 @@
 """Scatter taken off the readings, for the methods that have no model of it."""
 
+import os
+import subprocess
+import sys
+
 import msgspec
 import numpy as np
 import pytest
@@ -119,3 +123,27 @@ def test_a_method_undoes_scatter_that_it_finds(scans, name):
 def test_a_scan_without_scatter_gives_the_same_bits(scans):
     volumes = [reconstruct_scan(scans[0], "fdk", scatter=scatter).values for scatter in (0.0, "found")]
     assert torch.equal(*volumes)
+
+
+LAID = """
+import hashlib
+
+import numpy as np
+
+from ctsim.reconstruct.scatter import Scatter
+
+source = np.random.default_rng(1).random((1, 48, 48), dtype=np.float32)
+image = Scatter(floor=0.01, gain=0.1, source=source, step=(8, 8)).of(0, (380, 384))
+assert image.shape == (380, 384)
+assert image.min() > 0.01
+print(hashlib.sha256(np.ascontiguousarray(image)).hexdigest())
+"""
+
+
+def test_scatter_has_the_same_bits_for_any_number_of_numpys_threads():
+    def printed(threads):
+        told = os.environ | {name: str(threads) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+        code = [sys.executable, "-c", LAID]
+        return subprocess.run(code, env=told, capture_output=True, text=True, timeout=120, check=True).stdout
+
+    assert len({printed(threads) for threads in (1, 2, 3)}) == 1
