@@ -31,7 +31,8 @@ def runs(sizes=TUBES, phantom="p", methods=("fdk", "splat")):
             hu = 40.0 * (size / 0.03) ** 4 - 5 * k
             scores = {
                 "tissue": score(size, psnr3d=1000 * size - 1 + k, ssim3d=0.9, rmse=0.001),
-                "soft": score(rmse=hu), "artefact": score(rmse=hu + 1), "structure": score(false_bone=0.1, false_air=0),
+                "soft": score(rmse=hu), "artefact": score(rmse=hu + 1),
+                "structure": score(false_bone=0.1, false_air=0, false_bone_between=0.2, rmse_between=9.0),
             }  # fmt: skip
             cost = Cost(wall=1.5, cpu=2.5, peak_bytes=2**21, view_updates=60, device="cpu")
             more = {"scene": scene, "inputs": "counts only", "status": "ok", "cost": cost, "phantom": phantom}

@@ -178,8 +178,8 @@ def test_a_scene_without_a_score_is_not_counted_as_unharmed():
     assert row[3:] == ["–", "–", "1.00 (1/1)"]
 
 
-def artefact_record(method, streak, note="ROI water"):
-    found = record(method, psnr=20.0)
+def artefact_record(method, streak, note="ROI water", rmse=0.5):
+    found = record(method, psnr=20.0, rmse=rmse)
     score = Score(
         region="ROIs", reference="twin", alignment="none", data_range=None, n_voxels=9, note=note,
         values={"streak": streak, "rmse_near": None},
@@ -188,7 +188,7 @@ def artefact_record(method, streak, note="ROI water"):
 
 
 def test_artefacts_are_anchored_on_nothing():
-    given = [artefact_record("fdk", 80.0), artefact_record("net", 20.0)]
+    given = [artefact_record("fdk", 80.0), record(rmse=0.1, variant="metal_free"), artefact_record("net", 20.0)]
     table = tables.summary(given).set_index(["method", "protocol", "metric"])["mean"]
     assert table["net", "anchored", "artefact/streak"] == 0.25
     assert ("net", "anchored", "artefact/rmse_near") not in table.index
@@ -473,3 +473,13 @@ def test_no_anchored_score_where_the_metal_hardly_matters():
         given = [record(rmse=rmse), record(rmse=0.1, variant="metal_free"), record("net", rmse=0.2)]
         there = tables.summary(given).set_index(["method", "protocol", "metric"]).index
         assert (("net", "anchored", "tissue/rmse") in there) is expected
+
+
+def test_nor_of_an_artefact():
+    """The error of an artefact is 0 without metal, so that of the tissue says whether the metal matters."""
+    for rmse, expected in ((0.124, False), (0.126, True)):
+        given = [artefact_record("fdk", 80.0, rmse=rmse), record(rmse=0.1, variant="metal_free")]
+        for twin in ([], given[1:]):
+            table = tables.summary([given[0], *twin, artefact_record("net", 20.0)])
+            there = table.set_index(["method", "protocol", "metric"]).index
+            assert (("net", "anchored", "artefact/streak") in there) is (expected and bool(twin))

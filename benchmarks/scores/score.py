@@ -193,6 +193,8 @@ MAIN: dict[tuple[str, str], Metric] = {
     ("metal_cost", "fdk_db"): Metric("short of FDK without metal (dB)", 2, "min"),
     ("structure", "false_bone"): Metric("false bone (%)", 2, "min", 100),
     ("structure", "false_air"): Metric("false air (%)", 2, "min", 100),
+    ("structure", "false_bone_between"): Metric("false bone between metal (%)", 2, "min", 100),
+    ("structure", "rmse_between"): Metric("RMSE between metal (HU)", 0, "min"),
     ("soft", "rmse"): Metric("soft tissue RMSE (HU)", 1, "min"),
     ("cost", "wall"): Metric("wall (s)", 2, "min"),
 }
@@ -205,6 +207,8 @@ MAIN_ACROSS: dict[tuple[str, str], Metric] = {
     ("metal_cost", "fdk_hu"): Metric("short of FDK without metal (HU)", 1, "min"),
     ("structure", "false_bone"): MAIN["structure", "false_bone"],
     ("structure", "false_air"): MAIN["structure", "false_air"],
+    ("structure", "false_bone_between"): MAIN["structure", "false_bone_between"],
+    ("structure", "rmse_between"): MAIN["structure", "rmse_between"],
     ("tissue", "psnr3d"): _IMAGE["psnr3d"],
     ("tissue", "ssim3d"): _IMAGE["ssim3d"],
     ("cost", "wall"): MAIN["cost", "wall"],
@@ -235,7 +239,8 @@ LOST = {
 }
 """What the cost of metal is taken of: (protocol, metric) -> its name's end, and the sign of what is worse."""
 LEAST_LOSS = 0.25
-"""An anchored score exists where the metal raises FDK's error by at least this share of its error without."""
+"""An anchored score exists where the metal raises FDK's error by more than this share of its error without: for
+`artefact`, whose error without is 0 by definition, the RMSE under `tissue`."""
 COMPARED = {
     **ANCHORED,
     "tissue": ("psnr3d", *ANCHORED["tissue"]),
@@ -355,8 +360,14 @@ def _anchors(row: SeedValue, values: dict[Place, float | None]) -> list[tuple[st
     if metric not in ANCHORED.get(protocol, ()) or row.value is None:
         return []
     worst = values.get(_place(row, FDK, "metal"))
-    # an artefact is a difference from the twin, so the twin's own is 0
-    best = error(metric, 0.0) if protocol == "artefact" else values.get(_place(row, FDK, "metal_free"))
+    if protocol == "artefact":
+        # an artefact is a difference from the twin, so the twin's own is 0
+        tissue = row._replace(protocol="tissue", metric="rmse")
+        with_it, without = (values.get(_place(tissue, FDK, variant)) for variant in ("metal", "metal_free"))
+        matters = with_it is not None and without is not None and anchored(0.0, without, with_it) is not None
+        best = error(metric, 0.0) if matters else None
+    else:
+        best = values.get(_place(row, FDK, "metal_free"))
     if worst is None or best is None:
         return []
     s = anchored(error(metric, row.value), error(metric, best), error(metric, worst))

@@ -34,7 +34,10 @@ def main_caption(shown: Sequence[RunRecord]) -> str:
             f"Skipped, since they need a truth: {', '.join(NEED_TRUTH)}. Controls have no rank."
         )
     image = "PSNR3D and SSIM3D of all tissue outside the metal (protocol tissue)."
-    bone = "False bone, false air: shares of soft tissue near and between metal that read so (protocol structure)."
+    bone = (
+        "False bone, false air: shares of soft tissue near and between metal that read so (protocol structure); "
+        "between metal: in soft tissue that has metal on both sides alone."
+    )
     clean = (
         "Short of FDK without metal: what it lacks of the best FDK of that twin, so that erasing detail with and "
         "without metal alike is no gain."
@@ -133,7 +136,7 @@ def caption(records: Sequence[RunRecord], protocol: str) -> str:
             "Anchored scores s = (e − e_ref)/(e_FDK − e_ref), e_ref from the metal-free scan reconstructed by FDK: "
             "0 as if the metal had never been there, 1 uncorrected. Harm rate: share of scenes with s > 1, "
             "and how many of how many scenes that have a score. There is no score where the metal raises FDK's "
-            f"error by less than {LEAST_LOSS:.0%}."
+            f"error by less than {LEAST_LOSS:.0%}; of artefacts, its RMSE in tissue."
         )
     found = [(r, r.scores[protocol]) for r in records if protocol in r.scores and r.run.variant == METAL]
     if not found:
