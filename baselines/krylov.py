@@ -13,7 +13,7 @@ from ctsim.types import Scan, Volume
 class Cgls(Iterations, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As `Iterations`."""
 
-    iterations: Count = 9
+    iterations: Count = 10
 
 
 @keywords(Cgls)

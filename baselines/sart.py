@@ -44,7 +44,7 @@ class Sart(Iterations, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class OsSart(Sart, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As `Sart`, with the views in interleaved subsets."""
 
-    iterations: Count = 3
+    iterations: Count = 4
     relaxation: Relaxation = 1.0
     subsets: Annotated[int, about("subsets of the views, at most one per view", ge=1, le=100_000)] = 20
 

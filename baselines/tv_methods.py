@@ -55,14 +55,14 @@ class Descent(Iterations, frozen=True, kw_only=True, forbid_unknown_fields=True)
 class AsdPocs(Descent, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As `Descent`."""
 
-    iterations: Count = 4
+    iterations: Count = 3
     epsilon: Annotated[Share | None, about("relative residual to reach; null: that of photon noise")] = None
 
 
 class AwPcsd(Descent, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As `Descent`."""
 
-    iterations: Count = 3
+    iterations: Count = 2
     delta: Annotated[
         float, about("difference between voxels above which an edge is kept", "of the scan's water", gt=0, le=1e6)
     ] = 2.0
