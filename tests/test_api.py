@@ -162,6 +162,12 @@ def test_a_measured_scan_has_no_truth_to_score_with(tmp_path):
     own = open_scan(bring(Flags(scan=log, out=tmp_path / "data")))
     with pytest.raises(InputError, match="data/rods: is a measured scan, which has no truth"):
         ctsim.score_volume(np.zeros(own.geometry.n_voxel), own)
+    for scan in (own, own.scan):  # said the same way of both
+        with pytest.raises(InputError, match=r"^mask = 'oracle': the scan has no true metal mask; say 'auto' or name"):
+            ctsim.reconstruct_scan(scan, "nmar")
+    assert ctsim.reconstruct_scan(own, "nmar", mask="auto").details["mask"] == "auto"
+    with pytest.raises(InputError, match=r"was written without metal\.tif"):
+        ctsim.reconstruct_scan(own, "cmd:true {scan} {out} {mask}")
 
 
 @pytest.mark.parametrize("status", list(Status))
@@ -224,6 +230,18 @@ def test_a_scene_of_ones_own_is_that_of_a_file():
     assert new_scene(name="smallest", seed=5, phantom=keys, scanner=scanner) == parse_suite(SMALLEST)[0]
     with pytest.raises(InputError, match=r"scene: phantom\.metl"):
         new_scene(name="a", phantom={"recipe": "validation", "metl": "Al"})
+
+
+def test_a_scene_takes_what_numpy_gives():
+    ours = new_scene(name="a", seed=3, phantom={"recipe": "walnut", "n_voxel": [40, 41, 42], "size": 50.0})
+    for n in (np.array([40, 41, 42]), tuple(np.int64(k) for k in (40, 41, 42))):
+        size = np.float32(50)
+        assert new_scene(name="a", seed=np.int64(3), phantom={"recipe": "walnut", "n_voxel": n, "size": size}) == ours
+    for wrong, said in ((np.array([40, 40]), "phantom.n_voxel"), (np.array([40.5, 40, 40]), r"phantom.n_voxel\[0\]")):
+        with pytest.raises(InputError, match=f"^scene: {said}: "):
+            new_scene(name="a", phantom={"recipe": "walnut", "n_voxel": wrong})
+    with pytest.raises(InputError, match=r"^scene: scanner.tube: "):
+        new_scene(name="a", phantom={"recipe": "walnut"}, scanner={"tube": np.ones(2)})
 
 
 def test_a_method_that_knows_energies_is_read_at_50_kev(simulated):
