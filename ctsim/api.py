@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from ctsim.benchmarks.known_beam import with_beam
 from ctsim.benchmarks.methods import Method, find
+from ctsim.benchmarks.scores import placement
+from ctsim.benchmarks.scores.artefact import effective_attenuation
 from ctsim.benchmarks.scores.judge import Judge, Twin
 from ctsim.benchmarks.scores.projection import held_out, with_floor
 from ctsim.benchmarks.scores.score import NOT_ASKED, PROJECTION, PROTOCOLS, Score
@@ -46,13 +48,22 @@ def find_scene(suite: str, name: str, *, seed: int | None = None) -> Scene:
 
 
 def new_scene(**keys: Any) -> Scene:
-    """Return a scene of your own; the keys are those of a scene file, tables are dicts.
+    """Return a scene of your own; the keys are those of a scene file, tables are dicts, lists may be arrays.
 
     `new_scene(name="pins", phantom={"recipe": "walnut", "metal": "Fe"}, scanner={"preset": "dental"})`. As in a file,
     `"tube": {"kvp": 110.0}` in the scanner keeps the preset's filters; a `Tube` would replace them. Raises InputError
     naming a wrong key or value.
     """
-    return read_scene(keys, "scene")
+    return read_scene(_plain(keys), "scene")
+
+
+def _plain(value: Any) -> Any:
+    """Return a table's value with NumPy's numbers and arrays as those of a file."""
+    if isinstance(value, dict):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
 def reconstruct_scan(scan: ScanWithTruth | Scan, method: str = "fdk", **parameters: Any) -> Volume:
@@ -86,7 +97,10 @@ def _readings(method: Method, scan: ScanWithTruth | Scan) -> Scan:
             raise InputError(f"{method.name} is told the metal-free twin: expected a simulated scan, got a Scan")
         return scan
     if not scan.is_twin:
-        return scan_for(method, scan, METAL)
+        measured = not scan.has_truth and method.mask == "oracle" and not method.program
+        return (
+            scan.scan if measured else scan_for(method, scan, METAL)
+        )  # the method says what it needs instead of truth
     readings = scan.scan
     if method.mask != "oracle":
         return readings
@@ -104,15 +118,18 @@ def score_volume(
     """Score a volume under those `protocols` that apply: name -> `Score`, the same numbers as `run-benchmark`.
 
     `twin` is the same method's volume of `scan.metal_free`, which the protocol `artefact` compares with. To score that
-    volume itself, name the `variant` "metal_free". An array is [z, y, x] in 1/mm. The truth of the last scan is kept
-    for the next call. Most of the work is to simulate views for the protocol `projection`: without it scores take
-    seconds.
+    volume itself, name the `variant` "metal_free". An array is [z, y, x] in 1/mm; one that is flipped, transposed, in
+    another unit or the same everywhere is refused, as by `run-benchmark score`. A `Volume`, such as a method's, is
+    scored as it is: `ctsim.Volume(values=torch.from_numpy(array))` makes one of an array that is meant to be so. The
+    truth of the last scan is kept for the next call. Most of the work is to simulate views for the protocol
+    `projection`: without it scores take seconds.
 
     Raises
     ------
     InputError
-        Where a volume is not finite or not on the scan's grid, where its method ended with neither "ok" nor "diverged",
-        where `scan` is a twin or was measured, and for an unknown protocol or variant.
+        Where a volume is not finite or not on the scan's grid, where an array is in another unit or orientation, where
+        a method ended with neither "ok" nor "diverged", where `scan` is a twin or was measured, and for an unknown
+        protocol or variant.
     """
     check_kind("scan", scan, ScanWithTruth, "a scan with its truth, such as of open_scan or simulate_scene")
     if not scan.has_truth:
@@ -128,7 +145,7 @@ def score_volume(
     values, at_50kev = _arrays(volume, scan)
     pair = Twin(reason=NOT_ASKED) if scan.metal_free is not None else Twin()
     if twin is not None:
-        pair = Twin(values=_arrays(twin, scan, (str(Status.OK),))[0])
+        pair = Twin(values=_arrays(twin, scan, (str(Status.OK),), "the twin's volume")[0])
     judge = _judge_with_views(scan) if variant == METAL and PROJECTION in protocols else _judge(scan)
     return judge.scores(values, variant, pair, at_50kev, protocols)
 
@@ -146,10 +163,14 @@ def _judge_with_views(scan: ScanWithTruth) -> Judge:
 
 
 def _arrays(
-    volume: Volume | NDArray[Any], scan: ScanWithTruth, ends: Collection[str] = SCORED
+    volume: Volume | NDArray[Any], scan: ScanWithTruth, ends: Collection[str] = SCORED, name: str = "the volume"
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Return a volume's values, and those at 50 keV of a method that knows energies; it must have one of the `ends`."""
+    """Return a volume's values, and those at 50 keV of a method that knows energies; it must have one of the `ends`.
+
+    An array, which may come from anywhere, must look like the scan.
+    """
     if isinstance(volume, Volume):
+        check_volume(volume)
         if str(volume.status) not in ends:
             raise InputError(f"the volume's status is {volume.status}, which is not scored: {volume.reason}")
         values, own = array_of(volume.values), volume.at_energy
@@ -157,8 +178,10 @@ def _arrays(
     else:
         values, at_50kev = np.asarray(volume), None
         if values.dtype.kind not in "fiu":
-            raise InputError(f"the volume must be real numbers in 1/mm, got {values.dtype}")
+            raise InputError(f"{name} must be real numbers in 1/mm, got {values.dtype}")
         values = values.astype(np.float32)
+        reference = placement.tissue_of(_judge(scan).truth)
+        placement.check(name, values, reference, "1/mm", effective_attenuation(scan))
     outcome = checked(Outcome(status="ok", values=values, at_50kev=at_50kev), scan.geometry.n_voxel)
     if outcome.status != "ok":
         raise InputError(outcome.reason)

@@ -7,6 +7,7 @@ from +z. At view angle a the source is at dso·(cos a, sin a, 0), the detector's
 """
 
 import math
+import reprlib
 from typing import Annotated, Any
 
 import msgspec
@@ -21,6 +22,21 @@ FARTHEST = 1e6  # mm, and degrees: nothing of a scanner is larger
 MOST_VIEWS, MOST_PIXELS, MOST_VOXELS = 10**6, 2**28, 2**34  # of a scan, of one view, of one volume
 _SHORTEST, _FLAT = 1e-9, 1e-6  # a pixel's step in mm; the sine below which two directions are one
 Count = Annotated[int, msgspec.Meta(ge=1)]
+_KINDS = {  # of the keys: numbers of an axis each, one number where there are none; and whether they are whole
+    "dso": ("", False),
+    "dsd": ("", False),
+    "n_voxel": ("zyx", True),
+    "d_voxel": ("zyx", False),
+    "n_detector": ("vu", True),
+    "d_detector": ("vu", False),
+    "n_views": ("", True),
+    "off_origin": ("zyx", False),
+    "off_detector": ("vu", False),
+    "start_deg": ("", False),
+    "arc_deg": ("", False),
+}
+_SAID = 80  # characters of what is refused
+_LISTS = {"angles_deg": "a number for each view", "poses": "12 numbers for each view"}
 
 
 class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -57,6 +73,7 @@ class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """12 numbers a view: source, detector centre, u step, v step; each x, y, z, the steps one pixel long."""
 
     def __post_init__(self) -> None:
+        self._settle()
         for name in ("dso", "dsd", "d_voxel", "d_detector", "off_origin", "off_detector", "start_deg", "arc_deg"):
             if not np.all(np.isfinite(getattr(self, name))):
                 raise InputError(f"{name} must be finite, got {getattr(self, name)}")
@@ -82,8 +99,12 @@ class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             given = getattr(self, name)
             if given is not None and len(given) != self.n_views:
                 raise InputError(f"{name} has {len(given)} entries but n_views is {self.n_views}")
-        if self.angles_deg is not None and not np.all(np.abs(self.angles_deg) <= FARTHEST):
-            raise InputError(f"angles_deg must be finite and within ±{FARTHEST:.0e}")
+        if self.angles_deg is not None:
+            angles = _numbers(self.angles_deg)
+            if angles is None or angles.ndim != 1:
+                raise InputError(f"angles_deg: expected {_LISTS['angles_deg']}, got {_brief(self.angles_deg)}")
+            if not np.all(np.abs(angles) <= FARTHEST):
+                raise InputError(f"angles_deg must be finite and within ±{FARTHEST:.0e}")
         if self.poses is not None:
             _check_poses(self.poses, self.n_detector)
         elif not (longest := _longest_rays(self.pose(0)[None], self.n_detector)[0]) < FARTHEST:
@@ -91,6 +112,32 @@ class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
                 f"d_detector, n_detector, dsd and off_detector put a pixel {longest:.3g} mm from the source; "
                 f"expected less than {FARTHEST:.0e} mm"
             )
+
+    def _settle(self) -> None:
+        """Refuse what is no number, or not as many as there are axes; turn NumPy's numbers and lists into ours.
+
+        msgspec checks what is read from a file. What is written in Python reaches here as it is.
+        """
+        for name, (axes, whole) in _KINDS.items():
+            given, kind = getattr(self, name), int if whole else float
+            values = given if axes and type(given) is tuple else (given,)
+            if len(values) == (len(axes) or 1) and all(type(x) is kind for x in values):
+                continue  # as nearly always, so that it costs little
+            found = _numbers(given)
+            if found is None or found.shape != (len(axes),) * bool(axes) or (whole and found.dtype.kind == "f"):
+                what = ("whole number" if whole else "number") + "s" * bool(axes)
+                many = f"{len(axes)} {what} ({', '.join(axes)})" if axes else f"a {what}"
+                raise InputError(f"{name}: expected {many}, got {_brief(given)}")
+            msgspec.structs.force_setattr(self, name, tuple(found.tolist()) if axes else found.item())
+        for name, wanted in _LISTS.items():
+            given = getattr(self, name)
+            if given is None or type(given) is tuple:
+                continue
+            rows = given.tolist() if isinstance(given, np.ndarray) else given
+            if not isinstance(rows, tuple | list):
+                raise InputError(f"{name}: expected {wanted}, got {_brief(given)}")
+            rows = tuple(tuple(row) if isinstance(row, list) else row for row in rows)
+            msgspec.structs.force_setattr(self, name, rows)
 
     @property
     def angles(self) -> NDArray[np.float64]:
@@ -177,6 +224,21 @@ class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         return self.dso * math.sin(math.atan(edge / self.dsd)) if edge > 0 else 0.0
 
 
+def _numbers(given: Any) -> NDArray[Any] | None:
+    """Return what is given as an array of real numbers; None where it is something else, or rows of unequal length."""
+    try:
+        found = np.asarray(given)
+    except (TypeError, ValueError, RuntimeError, OverflowError):  # the third of a tensor that needs a gradient
+        return None
+    return found if found.dtype.kind in "iuf" else None
+
+
+def _brief(given: Any) -> str:
+    """Return what is given in a few words on one line."""
+    text = " ".join(reprlib.repr(given).split())
+    return text if len(text) <= _SAID else f"{text[:_SAID]}…"
+
+
 def turn_of(
     angles: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
@@ -226,12 +288,16 @@ def _longest_rays(poses: NDArray[np.float64], n_detector: tuple[int, int]) -> ND
 def _check_poses(rows: tuple[tuple[float, ...], ...], n_detector: tuple[int, int]) -> None:
     """Refuse poses that are no source before a detector, naming the first such view."""
     for view, row in enumerate(rows):
+        if not isinstance(row, (tuple, list, np.ndarray)):
+            raise InputError(f"poses[{view}]: expected 12 numbers, got {_brief(row)}")
         if len(row) != 12:
             raise InputError(
                 f"poses[{view}] has {len(row)} numbers; expected 12: "
                 "source, detector centre, u step, v step (x, y, z each)"
             )
-    poses = np.asarray(rows, np.float64)
+    if (found := _numbers(rows)) is None or found.ndim != 2:
+        raise InputError(f"poses: expected {_LISTS['poses']}, got {_brief(rows)}")
+    poses = found.astype(np.float64)
 
     def refuse(bad: Any, what: str) -> None:
         if bad.any():

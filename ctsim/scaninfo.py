@@ -78,13 +78,14 @@ def read_info(path: Path) -> ScanInfo:
 
 def check_readings(dark: Any, i0: Any, e_max: Any) -> None:
     """Raise InputError unless the pedestal is finite, and photons and energy are finite and positive."""
-    if not _is_number(dark):
+    if not is_number(dark):
         raise InputError(f"dark must be a finite number of counts, got {dark!r}")
-    if not (_is_number(i0) and i0 > 0):
+    if not (is_number(i0) and i0 > 0):
         raise InputError(f"i0 must be positive and finite (photons per open pixel and view), got {i0!r}")
-    if not (_is_number(e_max) and e_max > 0):
+    if not (is_number(e_max) and e_max > 0):
         raise InputError(f"e_max must be positive and finite (keV), got {e_max!r}")
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite real number."""
     return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from ctsim.beam.spectrum import Tube
 from ctsim.detector.noise import Noise
 from ctsim.detector.response import Detector
-from ctsim.errors import InputError
+from ctsim.errors import InputError, check_kind
 from ctsim.geometry import Geometry, Triple
-from ctsim.scaninfo import check_readings
+from ctsim.scaninfo import check_readings, is_number
 from ctsim.scatter import Scatter
 from ctsim.solids import Solid
 
@@ -128,7 +128,9 @@ class Scan:
     floor: float | None = None
 
     def __post_init__(self) -> None:
-        if self.floor is not None and not 0 < self.floor < math.inf:
+        check_kind("geometry", self.geometry, Geometry, "a ctsim.Geometry")
+        check_kind("name", self.name, str, "a text")
+        if self.floor is not None and not (is_number(self.floor) and self.floor > 0):
             raise InputError(f"floor: expected a number of counts above 0, got {self.floor!r}")
         check_readings(self.dark, self.i0, self.e_max)
         _check_array("counts", self.counts, self.geometry.shape, READINGS)
@@ -162,8 +164,15 @@ class Scan:
         """
         import torch
 
+        check_kind("geometry", geometry, Geometry, "a ctsim.Geometry")
         check_readings(0.0, i0, e_max)
-        counts = i0 * torch.exp(-torch.as_tensor(p, dtype=torch.float64))
+        try:
+            p = torch.as_tensor(p)
+        except (TypeError, ValueError, RuntimeError):
+            kind = f"{type(p).__name__} of {p.dtype}" if isinstance(p, np.ndarray) else type(p).__name__
+            raise InputError(f"p: expected real numbers [view, v, u], got {kind}") from None
+        _check_array("p", p, geometry.shape, (*READINGS, "bfloat16", "uint64", "bool"))
+        counts = i0 * torch.exp(-p.double())
         flat = torch.full(geometry.n_detector, i0, dtype=torch.float32)
         return cls(geometry=geometry, counts=counts.float(), flat=flat, i0=i0, e_max=e_max)
 

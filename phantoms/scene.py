@@ -19,7 +19,7 @@ from ctsim.look import all_rays
 from ctsim.phantoms.identity import identity
 from ctsim.phantoms.recipes import AnyRecipe, build_recipe
 from ctsim.phantoms.scanners import REACH, ScannerSettings, with_machine
-from ctsim.phantoms.suites import NULL, decode, parse_toml, read_toml, scenes_of
+from ctsim.phantoms.suites import NULL, decode, located, parse_toml, read_toml, scenes_of
 from ctsim.phantoms.vary import Drawn, expand, individual_of
 from ctsim.phantoms.visible import build_in_view
 from ctsim.settings import Simulation, Truth
@@ -160,13 +160,18 @@ def load_suite(path: str | Path) -> tuple[Scene, ...]:
     """Read a file of `[[scene]]` tables over an optional `[defaults]`, or of one scene at top level.
 
     Defaults are merged under every scene, table by table. The string "null" stands for a value left
-    empty. Raises `InputError` with file, key and what was expected.
+    empty. A relative path of a CT volume begins at the file's folder. Raises `InputError` with file, key and what was
+    expected.
     """
-    return _scenes(read_toml(Path(path)), str(path))
+    path = Path(path)
+    return _scenes(located(read_toml(path), path.parent), str(path))
 
 
 def parse_suite(text: str, where: str = "scene") -> tuple[Scene, ...]:
-    """Read scenes from TOML text; `where` names the file in messages. See `load_suite`."""
+    """Read scenes from TOML text; `where` names the file in messages. See `load_suite`.
+
+    A relative path of a CT volume begins at the working directory.
+    """
     return _scenes(parse_toml(text, where), where)
 
 

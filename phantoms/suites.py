@@ -114,6 +114,16 @@ def _merge(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return merged
 
 
+def located(value: Any, folder: Path, key: str = "") -> Any:
+    """Return a scene file's tables with each `phantom.path`, drawn ones too, taken from the file's folder."""
+    if isinstance(value, dict):
+        return {name: located(one, folder, f"{key}.{name}") for name, one in value.items()}
+    if isinstance(value, list):
+        return [located(one, folder, key) for one in value]
+    path = isinstance(value, str) and value != NULL and key.endswith(".phantom.path")
+    return str(Path(folder, value).absolute()) if path else value
+
+
 def _nulls(value: Any) -> Any:
     if isinstance(value, dict):
         return {k: _nulls(v) for k, v in value.items()}

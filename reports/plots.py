@@ -4,7 +4,8 @@ Both functions return a figure to save or to show in a notebook. With a backend 
 makes a window with a slider over the views.
 """
 
-from collections.abc import Callable
+import reprlib
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import matplotlib
@@ -32,7 +33,10 @@ BLUE, RED, GREY = "#1f5fa8", "#c0392b", "#666666"
 
 
 def plot_projections(
-    scan: ScanWithTruth | Scan | NDArray[Any], views: tuple[int, ...] = (), *, slider: bool | None = None
+    scan: ScanWithTruth | Scan | NDArray[Any],
+    views: Sequence[int] | NDArray[np.integer] = (),
+    *,
+    slider: bool | None = None,
 ) -> Figure:
     """Draw views of a scan, −ln(signal/open), or of a stack [view, v, u] of any kind; row 0 is at the bottom.
 
@@ -43,19 +47,31 @@ def plot_projections(
     Raises
     ------
     InputError
-        For an array that is no stack of real numbers, and for a view that does not exist.
+        For an array that is no stack of real numbers, for `views` that are no whole numbers, and for a view that does
+        not exist.
     """
     n, view_of, pixel = _stack(scan)
-    for k in views:
-        if not 0 <= k < n:
-            raise InputError(f"view must be within 0 to {n - 1}, got {k}")
+    chosen = _views(views, n) or tuple(int(k) for k in few_views(n, SHOWN))
     if slider is None:
         slider = is_interactive()
-    chosen = views or tuple(int(k) for k in few_views(n, SHOWN))
     if slider:
         window = _window([view_of(int(k)) for k in few_views(n, SHOWN)])
         return _with_slider(n, view_of, chosen[0], window, pixel)
     return _still(chosen, [view_of(k) for k in chosen], pixel)
+
+
+def _views(views: Sequence[int] | NDArray[np.integer], n: int) -> tuple[int, ...]:
+    """Return the views that are asked for, of `n`."""
+    try:
+        found = np.asarray(views)
+    except ValueError:  # rows of unequal lengths
+        found = np.array(None)
+    if found.ndim != 1 or (found.size and found.dtype.kind not in "iu"):
+        raise InputError(f"views: expected whole numbers such as (0, 5), got {' '.join(reprlib.repr(views).split())}")
+    for k in (chosen := tuple(found.tolist())):
+        if not 0 <= k < n:
+            raise InputError(f"view must be within 0 to {n - 1}, got {k}")
+    return chosen
 
 
 def is_interactive() -> bool:

@@ -140,6 +140,43 @@ def test_volumes_that_cannot_be_scored_are_refused(simulated):
         score_volume(np.zeros(shape), simulated, variant="metalfree")  # pyright: ignore[reportArgumentType]
 
 
+WATER = 0.025  # 1/mm, about that at 90 kV
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (lambda v: v[:, :, ::-1], "looks flipped along x: correlation"),
+        (lambda v: v.transpose(0, 2, 1)[:, ::-1], "looks transposed .* and flipped along"),
+        (lambda v: v.transpose(1, 2, 0), r"has shape \(12, 12, 10\), expected \(10, 12, 12\) .*: it is transposed"),
+        (lambda v: (v / WATER - 1) * 1000, "looks like HU: its mean"),
+        (lambda v: np.round((v / WATER - 1) * 1000).astype(np.int16), "looks like HU: its mean"),
+        (lambda v: v * 10, "looks like 1/cm: its mean"),
+        (lambda v: -v, "looks like the negative of a volume"),
+        (np.zeros_like, "holds 0 in every voxel"),
+    ],
+    ids=["mirrored", "turned", "transposed", "hu", "whole-hu", "per-cm", "negative", "zero"],
+)
+def test_an_array_of_another_unit_or_orientation_is_refused(simulated, wrong, said):
+    right = reconstruct_scan(simulated).values.numpy()
+    with pytest.raises(InputError, match=f"^the volume {said}"):
+        score_volume(wrong(right), simulated, protocols="tissue")
+    with pytest.raises(InputError, match=f"^the twin's volume {said}"):
+        score_volume(right, simulated, twin=wrong(right), protocols="tissue")
+    if not said.startswith("looks flipped"):  # without its metal the body is that of its mirror image
+        with pytest.raises(InputError, match=f"^the volume {said}"):
+            own = reconstruct_scan(simulated.metal_free).values.numpy()
+            score_volume(wrong(own), simulated, variant="metal_free", protocols="tissue")
+    if wrong(right).shape == right.shape:  # a volume says that it is meant to be so
+        meant = Volume(values=torch.from_numpy(wrong(right).astype(np.float32)))
+        assert score_volume(meant, simulated, protocols="tissue")["tissue"].values
+
+
+def test_a_volume_of_another_kind_is_refused(simulated):
+    with pytest.raises(InputError, match=r"^Volume.values must be a torch.Tensor, got a numpy.ndarray"):
+        score_volume(Volume(values=np.ones(simulated.geometry.n_voxel)), simulated)  # pyright: ignore
+
+
 @pytest.mark.parametrize(
     ("call", "said"),
     [
@@ -162,6 +199,12 @@ def test_a_measured_scan_has_no_truth_to_score_with(tmp_path):
     own = open_scan(bring(Flags(scan=log, out=tmp_path / "data")))
     with pytest.raises(InputError, match="data/rods: is a measured scan, which has no truth"):
         ctsim.score_volume(np.zeros(own.geometry.n_voxel), own)
+    for scan in (own, own.scan):  # said the same way of both
+        with pytest.raises(InputError, match=r"^mask = 'oracle': the scan has no true metal mask; say 'auto' or name"):
+            ctsim.reconstruct_scan(scan, "nmar")
+    assert ctsim.reconstruct_scan(own, "nmar", mask="auto").details["mask"] == "auto"
+    with pytest.raises(InputError, match=r"was written without metal\.tif"):
+        ctsim.reconstruct_scan(own, "cmd:true {scan} {out} {mask}")
 
 
 @pytest.mark.parametrize("status", list(Status))
@@ -224,6 +267,18 @@ def test_a_scene_of_ones_own_is_that_of_a_file():
     assert new_scene(name="smallest", seed=5, phantom=keys, scanner=scanner) == parse_suite(SMALLEST)[0]
     with pytest.raises(InputError, match=r"scene: phantom\.metl"):
         new_scene(name="a", phantom={"recipe": "validation", "metl": "Al"})
+
+
+def test_a_scene_takes_what_numpy_gives():
+    ours = new_scene(name="a", seed=3, phantom={"recipe": "walnut", "n_voxel": [40, 41, 42], "size": 50.0})
+    for n in (np.array([40, 41, 42]), tuple(np.int64(k) for k in (40, 41, 42))):
+        size = np.float32(50)
+        assert new_scene(name="a", seed=np.int64(3), phantom={"recipe": "walnut", "n_voxel": n, "size": size}) == ours
+    for wrong, said in ((np.array([40, 40]), "phantom.n_voxel"), (np.array([40.5, 40, 40]), r"phantom.n_voxel\[0\]")):
+        with pytest.raises(InputError, match=f"^scene: {said}: "):
+            new_scene(name="a", phantom={"recipe": "walnut", "n_voxel": wrong})
+    with pytest.raises(InputError, match=r"^scene: scanner.tube: "):
+        new_scene(name="a", phantom={"recipe": "walnut"}, scanner={"tube": np.ones(2)})
 
 
 def test_a_method_that_knows_energies_is_read_at_50_kev(simulated):

@@ -3,6 +3,7 @@
 import hashlib
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from ctsim.geometry import Geometry
 from ctsim.materials import attenuation
 from ctsim.phantoms.bodies.volume import TISSUES, CtVolume
 from ctsim.phantoms.recipes import build_recipe
-from ctsim.phantoms.scene import parse_suite, scene_id, scene_to_toml, stream_id
+from ctsim.phantoms.scene import load_suite, parse_suite, scene_id, scene_to_toml, stream_id
 from ctsim.tracer.voxelise import attenuation_volume
 
 SPACING = (2.0, 1.5, 1.0)
@@ -119,6 +120,42 @@ scanner = {{ n_voxel = [16, 16, 16], n_detector = [24, 24], n_views = 4 }}
         build_recipe(stale.phantom, 0)
     same = build_recipe(recipe(tmp_path, path=str(tmp_path / "head.npy"), rescale=(1.0, 0.0)), 0)
     assert set(np.unique(same.labels)) == {0, 1, 2, 3, 4}
+
+
+@pytest.mark.parametrize("way", ["scene", "defaults", "vary", "split"])
+def test_a_relative_path_begins_at_the_scene_file(head, tmp_path, monkeypatch, way):
+    """And the scene is that of the absolute path, wherever it is read from and on whatever machine."""
+    ct = 'recipe = "ct_volume", spacing = [2.0, 1.5, 1.0], rescale = [1.0, -1024.0]'
+    text = {
+        "scene": '[[scene]]\nname = "a"\nphantom = {{ {ct}, path = "{path}" }}\n',
+        "defaults": '[defaults.phantom]\npath = "{path}"\n[[scene]]\nname = "a"\nphantom = {{ {ct} }}\n',
+        "vary": '[[scene]]\nname = "a"\ncount = 1\nphantom = {{ {ct} }}\nvary = {{ "phantom.path" = ["{path}"] }}\n',
+        "split": '[[scene]]\nname = "a"\ncount = 1\nsplit = {{ train = 1.0 }}\nphantom = {{ {ct} }}\n'
+        'vary.phantom = {{ path = ["{path}"] }}\n',
+    }[way]
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "elsewhere").mkdir()
+    (whole,) = parse_suite(text.format(ct=ct, path=tmp_path / "head.tif"))
+    (tmp_path / "elsewhere" / "own.toml").write_text(text.format(ct=ct, path="../head.tif"))
+    for file in (Path("elsewhere/own.toml"), tmp_path / "elsewhere" / "own.toml"):
+        (scene,) = load_suite(file)
+        assert scene == whole and scene_id(scene) == scene_id(whole)
+    (tmp_path / "elsewhere" / "own.toml").write_text(text.format(ct=ct, path="head.tif"))
+    with pytest.raises(InputError, match=rf"path: {tmp_path}/elsewhere/head\.tif cannot be read"):
+        load_suite(Path("elsewhere/own.toml"))  # where it is not, though it is in the working directory
+    (ours,) = parse_suite(text.format(ct=ct, path="head.tif"))
+    assert ours == whole  # without a file there is but the working directory
+
+
+def test_a_relative_path_is_kept_whole_where_a_scene_says_all(head, tmp_path):
+    """Else the scene.toml of a data folder would lead to another place from another working directory."""
+    digest = hashlib.sha256((tmp_path / "head.tif").read_bytes()).hexdigest()
+    (tmp_path / "own.toml").write_text(f'''
+name = "head"
+phantom = {{ recipe = "ct_volume", path = "head.tif", spacing = [2,1.5,1], rescale = [1, -1024], sha256 = "{digest}" }}
+''')
+    (scene,) = load_suite(tmp_path / "own.toml")
+    assert scene.phantom.path == str(tmp_path / "head.tif") and parse_suite(scene_to_toml(scene)) == (scene,)
 
 
 def test_a_scan_of_it_is_made_and_reopened(head, tmp_path):

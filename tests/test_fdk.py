@@ -208,7 +208,7 @@ def test_line_integrals_of_one_s_own_come_back():
     # counts are rounded to 2⁻²⁴ of themselves, their logarithm and that of the open field, up to 11.5, to 2⁻²¹
     torch.testing.assert_close(q[~clamped], p[~clamped], rtol=0, atol=2**-24 + 3 * 2**-21)
     assert clamped.sum() == 2 and clamped[0, 0, :2].all() and (scan.e_max, scan.i0) == (80.0, 1e5)
-    with pytest.raises(InputError, match="counts: shape"):
+    with pytest.raises(InputError, match="p: shape"):
         Scan.from_line_integrals(p[0], SMALL, e_max=80.0)
     with pytest.raises(InputError, match=r"i0 must be positive .*, got 0"):
         Scan.from_line_integrals(p, SMALL, e_max=80.0, i0=0.0)

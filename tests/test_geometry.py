@@ -97,6 +97,63 @@ def test_absurd_numbers_are_refused_by_name(changes: dict) -> None:
 
 
 @pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        *(({"n_views": v}, "a whole number") for v in (1.5, 3.0, "3", None, True, (3,), 0.5j)),
+        *(
+            ({"n_voxel": v}, r"3 whole numbers \(z, y, x\)")
+            for v in (8, (8, 8), (8.5, 8, 8), "abc", ((8, 8, 8),), None)
+        ),
+        *(({"n_detector": v}, r"2 whole numbers \(v, u\)") for v in (8, (8, 8.0), (8, 8, 8), [True, "8"])),
+        *(({name: v}, "a number") for name in ("dso", "dsd", "start_deg", "arc_deg") for v in ("1", (), (1.0,), 1j)),
+        ({"dso": None}, "a number"),
+        ({"dso": 10**400}, "a number"),
+        *(
+            ({name: v}, r"3 numbers \(z, y, x\)")
+            for name in ("d_voxel", "off_origin")
+            for v in (1.0, (1.0, 1.0), "abc")
+        ),
+        *(
+            ({name: v}, r"2 numbers \(v, u\)")
+            for name in ("d_detector", "off_detector")
+            for v in (1.0, (1.0,), [[1], [2]])
+        ),
+        *(
+            ({"angles_deg": v}, "a number for each view")
+            for v in (4.0, "abc", (0, "a", 1), (0.0, None, 1.0), ((1, 2),) * 3)
+        ),
+        *(({"poses": v}, "12 numbers for each view") for v in (4.0, "abc", (("a",) * 12,) * 3, (((1.0,),) * 12,) * 3)),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, dict) else None,
+)
+def test_a_wrong_type_or_length_is_refused_by_name(changes: dict, said: str) -> None:
+    with pytest.raises(InputError, match=f"^{next(iter(changes))}: expected {said}, got ") as caught:
+        with_(**changes)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 200
+
+
+def test_rows_of_poses_are_refused_by_their_view() -> None:
+    rows = posed({})
+    for row, said in ((3.0, "expected 12 numbers, got 3.0"), ("abc", "expected 12 numbers, got 'abc'")):
+        with pytest.raises(InputError, match=rf"^poses\[1\]: {said}"):
+            with_(poses=(rows[0], row, rows[2]))
+    with pytest.raises(InputError, match=r"^poses\[1\] has 11 numbers"):
+        with_(poses=(rows[0], rows[1][:11], rows[2]))
+
+
+def test_lists_and_numbers_of_numpy_are_those_of_python() -> None:
+    given = {name: np.array(getattr(GEOMETRY, name)) for name in ("n_voxel", "d_voxel", "n_detector", "d_detector")}
+    given |= {"n_views": np.int64(3), "dso": np.float32(200), "dsd": 400, "off_origin": [0, 0, 0]}
+    made = with_(**given)
+    assert made == GEOMETRY and hash(made) == hash(GEOMETRY)
+    assert msgspec.json.decode(msgspec.json.encode(made), type=Geometry) == GEOMETRY
+    angles = with_(angles_deg=np.arange(3.0))
+    assert angles == with_(angles_deg=[0, 1, 2]) == with_(angles_deg=(0.0, 1.0, 2.0)) and hash(angles)
+    poses = with_(poses=GEOMETRY.pose_array())
+    assert poses == with_(poses=[list(row) for row in posed({})]) == with_(poses=posed({})) and hash(poses)
+
+
+@pytest.mark.parametrize(
     "tube", [Tube(heel=True), Tube(bowtie=Bowtie(center=1.0, edge=20.0, half_angle_deg=20.0))], ids=["heel", "bowtie"]
 )
 def test_heel_and_bowtie_need_a_circular_orbit(tube: Tube) -> None:

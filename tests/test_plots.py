@@ -54,6 +54,26 @@ def test_a_still_picture_shows_the_views_that_were_asked_for():
     assert "view 6" in text_of(figure)
 
 
+@pytest.mark.parametrize("slider", [False, True])
+def test_views_may_be_an_array_of_whole_numbers(slider):
+    for views in (np.array([6, 0]), [6, 0], np.array([6, 0], np.uint8)):
+        try:
+            figure = plot_projections(STACK, views, slider=slider)
+            np.testing.assert_array_equal(images(figure)[0].get_array(), STACK[6])
+        finally:
+            pyplot.close("all")
+    assert len(images(plot_projections(STACK, np.array([], int)))) == 6
+
+
+@pytest.mark.parametrize(
+    "views", [3, 0.5, (0.5,), ("a",), "01", None, (None,), (True,), ((0, 1),), ((0,), 1), np.zeros((2, 40)), {0, 1}]
+)
+def test_views_of_another_kind_are_refused_in_one_sentence(views):
+    with pytest.raises(InputError, match=r"^views: expected whole numbers such as \(0, 5\), got ") as caught:
+        plot_projections(STACK, views)
+    assert "\n" not in str(caught.value)
+
+
 def test_six_views_from_the_first_to_the_last_are_shown_by_default(tmp_path):
     figure = plot_projections(STACK)
     shown = [int(image.get_array()[0, 0]) // 20 for image in images(figure)]

@@ -33,6 +33,9 @@ def part(fill: float) -> torch.Tensor:
     ("change", "said"),
     [
         *(({"dark": v}, "dark must be a finite number") for v in (math.nan, math.inf, "100", None, True)),
+        *(({"geometry": v}, "geometry: expected a ctsim.Geometry, got") for v in ("x", None, {})),
+        *(({"floor": v}, "floor: expected a number of counts above 0, got") for v in ("a", (1.0,), True, 0, math.inf)),
+        ({"name": 3}, "name: expected a text, got int"),
         *(({"i0": v}, "i0 must be positive") for v in (0, 0.0, -5, math.nan, math.inf, "1e5", True, None)),
         *(({"e_max": v}, "e_max must be positive") for v in (0, -1.0, math.nan, math.inf, "high")),
         *(({"flat": torch.full(GEOMETRY.n_detector, v)}, "flat: no pixel") for v in (0.0, 100.0, math.nan, math.inf)),
@@ -100,3 +103,23 @@ def test_counts_are_not_read():
     """A mapped stack of gigabytes opens at once: that no reading has signal is found where they are read."""
     counts = torch.empty(GEOMETRY.shape, device="meta")  # has no data to read
     assert dataclasses.replace(Scan(**GOOD), counts=counts).counts.is_meta
+
+
+@pytest.mark.parametrize(
+    ("p", "geometry", "said"),
+    [
+        ("x", GEOMETRY, r"p: expected real numbers \[view, v, u\], got str$"),
+        (None, GEOMETRY, r"p: expected real numbers \[view, v, u\], got NoneType$"),
+        (np.array([["a"]]), GEOMETRY, r"p: expected real numbers \[view, v, u\], got ndarray of <U1$"),
+        (np.zeros(GEOMETRY.shape, complex), GEOMETRY, "p must be real numbers .* got torch.complex128"),
+        (np.zeros(GEOMETRY.shape)[1:], GEOMETRY, r"p: shape \(5, 18, 20\), the geometry says \(6, 18, 20\)"),
+        (torch.zeros(GEOMETRY.shape).requires_grad_(), GEOMETRY, "p must not require gradients"),
+        (np.zeros(GEOMETRY.shape), "g", "geometry: expected a ctsim.Geometry, got str"),
+    ],
+)
+def test_line_integrals_that_are_none_are_refused_by_name(p, geometry, said):
+    for kept in (np.zeros(GEOMETRY.shape, np.float32), np.zeros(GEOMETRY.shape, int), torch.zeros(GEOMETRY.shape)):
+        assert bool((Scan.from_line_integrals(kept, GEOMETRY, e_max=90.0).counts == 1e5).all())
+    assert Scan.from_line_integrals(np.zeros(GEOMETRY.shape).tolist(), GEOMETRY, e_max=90.0)
+    with pytest.raises(InputError, match=f"^{said}"):
+        Scan.from_line_integrals(p, geometry, e_max=90.0)

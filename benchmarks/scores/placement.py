@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from ctsim.benchmarks.scores.protocol import Truth, tissue_range, truth_of
-from ctsim.dataset.store import StoredScan
+from ctsim.dataset.truth import ScanWithTruth
 from ctsim.errors import InputError
 from ctsim.reconstruct.fdk import reconstruct as fdk
 
@@ -89,7 +89,7 @@ def to_attenuation(values: NDArray[Any], unit: Unit, water: float | None) -> NDA
     return (water * (1 + np.asarray(values, np.float64) / 1000)).astype(np.float32)
 
 
-def reference_of(stored: StoredScan) -> NDArray[np.float32]:
+def reference_of(stored: ScanWithTruth) -> NDArray[np.float32]:
     """Return what volumes of a scan are compared with, [z, y, x] in 1/mm.
 
     It is a constant, with which nothing but the shape compares, where a measured scan has no FDK.

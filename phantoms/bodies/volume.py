@@ -40,7 +40,9 @@ class CtVolume(Recipe, frozen=True, kw_only=True, tag="ct_volume"):
     by_layers: ClassVar[bool] = False  # the file is read and resampled as a whole
 
     path: str
-    """A folder of DICOM slices, or a file: NIfTI, MetaImage, NRRD, a TIFF stack or .npy array [z, y, x], z upwards."""
+    """A folder of DICOM slices, or a file: NIfTI, MetaImage, NRRD, a TIFF stack or .npy array [z, y, x], z upwards.
+
+    A relative path begins at the scene file's folder, and in Python at the working directory."""
     spacing: tuple[Millimetres, Millimetres, Millimetres] | None = None
     """Size of its voxels (z, y, x) in mm; by default the file's. Needed for TIFF and .npy."""
     metal: str = "Ti"

@@ -20,7 +20,7 @@ from ctsim.materials import at_density
 from ctsim.phantoms import scene as scenes
 from ctsim.phantoms.recipes import AnyRecipe
 from ctsim.phantoms.scanners import ScannerSettings
-from ctsim.phantoms.suites import read_toml, scenes_of
+from ctsim.phantoms.suites import located, read_toml, scenes_of
 from ctsim.settings import Simulation
 from ctsim.solids import ELLIPSOID, Primitive, Solid
 from ctsim.tracer.voxelise import metal_mask
@@ -154,7 +154,8 @@ def metal_points(body: Phantom, geometry: Geometry) -> NDArray[np.float64]:
 def load(path: Path | None = None) -> tuple[DetectScene, ...]:
     """Read a file of scenes, by default the bundled one; raises InputError with file, key and expectation."""
     if path is not None:
-        return scenes_of(read_toml(path), DetectScene, str(path), lambda at, one, _: [(at, scenes.on_machine(one))])
+        tables = located(read_toml(path), path.parent)
+        return scenes_of(tables, DetectScene, str(path), lambda at, one, _: [(at, scenes.on_machine(one))])
     with resources.as_file(resources.files("ctsim.benchmarks.suites") / "detect.toml") as bundled:
         return load(bundled)
 
