@@ -83,7 +83,8 @@ def _filled(
         filling = Filling.of(~_finite(image)) if dead is None else known
         if filling is None:
             return image
-        image = np.array(image, np.float32, order="C")
+        with np.errstate(over="ignore"):
+            image = np.array(image, np.float32, order="C")
         filling.fill(image)
         return image
 
