@@ -47,6 +47,8 @@ class Scans(Dataset[dict[str, torch.Tensor]]):
         plane: str | None = None,
         split: str = "",
     ) -> None:
+        if isinstance(items, str):
+            raise InputError(f"items: expected a tuple of names, such as ({items!r},), got the text {items!r}")
         self.root, self.items, self.plane = Path(root), tuple(items), plane
         if not self.items:
             raise InputError(f"items: expected at least one of {', '.join(ITEMS)}")
@@ -102,8 +104,9 @@ class Scans(Dataset[dict[str, torch.Tensor]]):
             rows, layers = entry.shapes[item][1], entry.shapes.get("reference", (1,))[0]
             if self.plane != "z" or (rows, layers) != (1, 1):
                 raise InputError(
-                    f"{item}: {entry.name} has {rows} rows and {layers} slices, but projections go with plane = 'z' of "
-                    "a scan with one of each; expected plane = None"
+                    f"plane = {self.plane!r} cuts volumes, but {item!r} holds projections, and {entry.name} has {rows} "
+                    f"rows and {layers} slices: projections go with plane = 'z' where there is one of each; expected "
+                    "plane = None, or items without them"
                 )
         volumes = [item for item in self.items if item not in STACKS]
         return entry.shapes[volumes[0]][AXES[self.plane]] if volumes else 1

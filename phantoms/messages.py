@@ -41,6 +41,26 @@ def explain(error: msgspec.ValidationError, data: Any, kind: type[msgspec.Struct
     return f"{key}: {text}" if key else text
 
 
+def stray(kind: type[msgspec.Struct], path: str) -> tuple[str, str] | None:
+    """Return how far a path such as "scanner.tube.kv" can be followed, and what is expected at the key that is unknown.
+
+    The latter is empty where the path goes on below a value. None is a path that `kind` has.
+    """
+    spec: Any = inspect.type_info(kind)
+    names = path.split(".")
+    for k, name in enumerate(names):
+        if not (structs := _structs(spec)):
+            return None if isinstance(spec, inspect.AnyType | inspect.DictType) else (".".join(names[:k]), "")
+        known: dict[str, Any] = {f.encode_name: f.type for one in structs for f in one.fields}
+        known |= {one.tag_field: inspect.StrType() for one in structs if one.tag_field}
+        if name not in known:
+            return ".".join(names[: k + 1]), _one_of(known, name)
+        spec = known[name]
+        while isinstance(spec, inspect.Metadata):
+            spec = spec.type
+    return None
+
+
 def _join(key: str, text: str) -> str:
     return f"{key}.{text}" if key else text
 
@@ -48,7 +68,8 @@ def _join(key: str, text: str) -> str:
 def _one_of(names: Iterable[str], given: str) -> str:
     names = list(names)
     near = difflib.get_close_matches(given, names, n=1, cutoff=0.7)
-    return f"expected one of {', '.join(names)}" + (f"; did you mean {near[0]}?" if near else "")
+    near = near or [name for name in names if given in name.split("_")]  # mas of scan_mas
+    return f"expected one of {', '.join(names)}" + (f"; did you mean {near[0]}?" if len(near) == 1 else "")
 
 
 def _type_at(kind: type[msgspec.Struct], data: Any, path: str) -> inspect.Type:

@@ -180,7 +180,7 @@ def _scenes(data: dict[str, Any], where: str) -> tuple[Scene, ...]:
         data = {"scene": [data]} if "count" in data else data
         if "scene" not in data:
             return (read_scene(data, where),)
-    scenes = scenes_of(data, Scene, where, lambda *row: ((at, on_machine(one)) for at, one in expand(*row)))
+    scenes = scenes_of(data, Scene, where, lambda *row: ((at, on_machine(one)) for at, one in expand(*row, Scene)))
     _check_splits(scenes, where)
     return scenes
 

@@ -18,7 +18,7 @@ import msgspec
 from ctsim.dataset.manifest import is_name
 from ctsim.errors import InputError
 from ctsim.phantoms.ct_headers import digest_at, volume_at
-from ctsim.phantoms.messages import explain
+from ctsim.phantoms.messages import explain, stray
 
 Table = dict[str, Any]
 MOST = 100_000
@@ -64,10 +64,13 @@ class Drawn(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Split that the individual belongs to."""
 
 
-def expand(place: str, table: Table, where: str) -> Iterator[tuple[str, Table]]:
+def expand(
+    place: str, table: Table, where: str, kind: type[msgspec.Struct] | None = None
+) -> Iterator[tuple[str, Table]]:
     """Yield the scenes of a table as (place in the file, table); a table without `count` is its only scene.
 
-    `where` names the file in messages. Raises InputError for a `vary` or `split` that cannot be drawn from.
+    `where` names the file in messages. Raises InputError for a `vary` or `split` that cannot be drawn from, and for
+    drawn keys that a scene of this `kind` does not have.
     """
     given = {name: table[name] for name in Many.__struct_fields__ if name in table}
     if not given:
@@ -91,6 +94,8 @@ def expand(place: str, table: Table, where: str) -> Iterator[tuple[str, Table]]:
             raise InputError(f"{where}: {place}.vary.{key}: is drawn twice, {twice[0]} being drawn too")
         if not key.startswith(("phantom.", "scanner.")):
             raise InputError(f"{where}: {place}.vary.{key}: expected a key of phantom or scanner")
+        if kind is not None:
+            _check_key(f"{where}: {place}.vary", key, kind)
     for k in range(many.count):
         individual = k // many.scans_each
         scene = {"metal_in_view": True, **base, "name": f"{name}-{k:05d}", "seed": first + individual}
@@ -105,6 +110,17 @@ def expand(place: str, table: Table, where: str) -> Iterator[tuple[str, Table]]:
 def individual_of(recipe: str, seed: int, sha256: str) -> str:
     """Name the individual of a scene: the CT where it is from a file, else the recipe and the seed."""
     return f"ct-{sha256[:12]}" if sha256 else f"{recipe}-{seed}"
+
+
+def _check_key(place: str, key: str, kind: type[msgspec.Struct]) -> None:
+    """Refuse a key that no scene has. What goes on below a value was meant as a range."""
+    found = stray(kind, key)
+    if found is None:
+        return
+    known, expected = found
+    if expected:
+        raise InputError(f"{place}.{known}: unknown key; {expected}")
+    raise InputError(f"{place}.{known}: expected {_RULES}, got a table of {key.removeprefix(f'{known}.')}")
 
 
 def _by_scan(key: str) -> bool:
@@ -134,6 +150,7 @@ def _integers(low: float, high: float, share: float) -> int:
 
 
 _RANGES = {"uniform": _uniform, "log": _log, "integers": _integers}
+_RULES = "a list of values, or {uniform = [low, high]}, {log = [low, high]} or {integers = [low, high]} with low < high"
 
 
 def _rounded(value: float, low: float, high: float) -> float:
@@ -148,10 +165,7 @@ def _rule(place: str, rule: Any) -> Any:
     ends: list[Any] = given if isinstance(given, list) else []
     numbers = len(ends) == 2 and all(type(end) in (int, float) for end in ends)
     if kind not in _RANGES or not numbers or not (-math.inf < ends[0] < ends[1] < math.inf):
-        raise InputError(
-            f"{place}: expected a list of values, or {{uniform = [low, high]}}, {{log = [low, high]}} or "
-            f"{{integers = [low, high]}} with low < high, got {rule}"
-        )
+        raise InputError(f"{place}: expected {_RULES}, got {rule}")
     if kind == "log" and ends[0] <= 0:
         raise InputError(f"{place}: log needs positive ends, got {ends}")
     if kind == "integers" and any(type(end) is not int for end in ends):

@@ -2,15 +2,22 @@
 
 import itertools
 
+import msgspec
 import nibabel
 import numpy as np
 import pydicom
 import pytest
+import scan_files
 import SimpleITK as sitk
+from closed_scans import GEOMETRY, counts_of
+from closed_scans import line_integrals as projected
 from ct_files import SPACING, corner
 
 from ctsim.benchmarks import cli
+from ctsim.benchmarks.importing import Flags as Import
+from ctsim.benchmarks.importing.work import bring
 from ctsim.benchmarks.scores.artefact import effective_attenuation
+from ctsim.dataset.interop import Library, volume_to
 from ctsim.dataset.store import open_scan
 from ctsim.errors import InputError
 from ctsim.geometry import Geometry
@@ -18,6 +25,7 @@ from ctsim.io.volumes import dicomwrite, metaimage, nifti
 from ctsim.io.volumes.formats import open_volume
 from ctsim.io.volumes.placed import Placed
 from ctsim.materials import attenuation
+from ctsim.reconstruct.log import line_integrals
 
 CENTRE = (10.0, -20.0, 35.5)  # z, y, x
 GRID = Geometry(
@@ -172,10 +180,51 @@ def test_the_command_writes_references_labels_and_reconstructions(smallest, tmp_
             "--kev says at which energy water is 0 HU: expected --hu",
         ),
         (("{new}", "{new}.mha", "--to", "mha"), "no such scene folder"),
+        (
+            ("{scan}/metal_free", "{new}", "--to", "rtk"),
+            "metal_free is the twin of {scan}: expected that one, with --twin",
+        ),
+        (("{scan}", "{new}", "--to", "rtk", "--twin", "--hu"), "expected neither --volume, --hu nor --kev"),
+        (("{scan}", "{new}.nii", "--to", "nifti", "--twin"), "a volume of the twin is --volume metal_free/NAME"),
     ],
 )
 def test_a_wrong_call_is_one_sentence_and_writes_nothing(smallest, tmp_path, monkeypatch, capsys, words, sentence):
     filled = [word.format(scan=smallest / "smallest", new=tmp_path / "new") for word in words]
     assert run(monkeypatch, *filled) == 2
     said = capsys.readouterr().err
-    assert sentence in said and said.count("\n") == 1 and not list(tmp_path.iterdir())
+    assert (
+        sentence.format(scan=smallest / "smallest") in said and said.count("\n") == 1 and not list(tmp_path.iterdir())
+    )
+
+
+def test_the_twin_is_written_as_a_scan_of_its_own(smallest, tmp_path, monkeypatch, capsys):
+    stored = open_scan(smallest / "smallest")
+    twin = stored.metal_free
+    for name, of, words in (("a", stored, ()), ("b", twin, ("--twin",))):
+        assert run(monkeypatch, stored.folder, tmp_path / name, "--to", "rtk", *words) == 0
+        found = sitk.GetArrayFromImage(sitk.ReadImage(str(tmp_path / name / "projections.mha")))
+        assert np.array_equal(found, line_integrals(of.scan, slice(None))[0].numpy())
+    with_metal, without = ((tmp_path / name / "projections.mha").read_bytes() for name in "ab")
+    assert with_metal != without
+    assert all((tmp_path / "a" / n).read_bytes() == (tmp_path / "b" / n).read_bytes() for n in ("geometry.xml",))
+    assert run(monkeypatch, stored.folder, tmp_path / "c", "--to", "r2", "--twin") == 0
+    true = np.load(tmp_path / "c" / "vol_gt.npy")
+    assert np.array_equal(true, volume_to(Library.R2_GAUSSIAN, twin.reference("effective")))
+    assert not np.array_equal(true, volume_to(Library.R2_GAUSSIAN, stored.reference("effective")))
+
+
+def test_a_measured_scan_has_neither_twin_nor_true_volume(tmp_path, monkeypatch, capsys):
+    few = msgspec.structs.replace(GEOMETRY, n_views=6)
+    log = scan_files.skyscan(tmp_path / "scan", counts_of(projected(few)), few)
+    folder = bring(Import(scan=log, out=tmp_path / "data", center="0"))
+    capsys.readouterr()
+    for words, sentence in (
+        (
+            ("a.nii", "--to", "nifti"),
+            "--volume: reference_effective is no file, and a measured scan has no true volume",
+        ),
+        (("a", "--to", "rtk", "--twin"), "--twin: the scan 'rods' has no metal-free twin"),
+    ):
+        assert run(monkeypatch, folder, tmp_path / words[0], *words[1:]) == 2
+        said = capsys.readouterr().err
+        assert sentence in said and said.count("\n") == 1 and not (tmp_path / words[0]).exists()

@@ -257,3 +257,57 @@ def test_an_entry_of_nxtomo_may_lie_one_group_deeper(tmp_path):
         (name,) = (name for name in file if "instrument" in file[name])
         file.move(name, "entry1/tomo_entry")
     assert scans.open_scan(path).geometry.n_views == len(GEOMETRY.angles)
+
+
+@pytest.mark.parametrize(("turn", "refused"), [(0.0, True), (360.0, True), (1.0, False)])
+def test_views_from_one_side_are_refused(tmp_path, turn, refused):
+    source = in_units(tmp_path, 30 + turn * np.arange(24), "deg")
+    if not refused:
+        assert brought(tmp_path, source).geometry.n_views == 24
+        return
+    with pytest.raises(InputError, match=r"a.h5 has 24 views from one side, expected angles that differ"):
+        brought(tmp_path, source)
+    assert not (tmp_path / "data").exists()
+
+
+def test_one_view_is_imported(tmp_path):
+    one = msgspec.structs.replace(GEOMETRY, n_views=1)
+    source = scan_files.dxchange(tmp_path / "a.h5", COUNTS[:1], one, FLAT, DARK)
+    assert brought(tmp_path, source).geometry.n_views == 1
+
+
+@pytest.mark.parametrize("name", ["data", "data_white", "data_dark"])
+@pytest.mark.parametrize("value", [np.nan, 1e300])
+def test_images_of_hdf5_without_a_number_are_refused(tmp_path, name, value):
+    source = scan_files.dxchange(tmp_path / "a.h5", COUNTS.astype(float), GEOMETRY, FLAT.astype(float), DARK * 1.0)
+    with h5py.File(source, "r+") as file:
+        file[f"exchange/{name}"][...] = value
+    with pytest.raises(InputError, match=r"a.h5: every pixel has readings that are not finite, the first in"):
+        brought(tmp_path, source)
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_pixel_without_an_open_field_is_dead(tmp_path):
+    flat = FLAT.astype(np.float32)
+    flat[1, 4, 6] = np.nan
+    stored = brought(tmp_path, scan_files.dxchange(tmp_path / "a.h5", COUNTS, GEOMETRY, flat, DARK))
+    assert "the first in the open field at column 6 of row 4 from below" in " ".join(stored.info.notes)
+    assert np.argwhere(stored.scan.flat.numpy() == 0).tolist() == [[4, 6]]
+
+
+@pytest.mark.parametrize("write", [scan_files.naf, scan_files.r2])
+def test_line_integrals_that_nothing_holds_are_refused(tmp_path, write):
+    def with_value(where, value):
+        p = P.copy()
+        p[where] = value
+        return write(tmp_path / f"{len(list(tmp_path.iterdir()))}.pickle", p, GEOMETRY)
+
+    with pytest.raises(InputError, match=r"a line integral of view 5 is -1000, expected -50 or more"):
+        brought(tmp_path, with_value(5, -1e3))
+    with pytest.raises(InputError, match=r"every pixel has readings that are not finite"):
+        brought(tmp_path, with_value(slice(None), np.nan))
+    assert not (tmp_path / "data").exists()
+    stored = brought(tmp_path, with_value((5, 3, 7), np.nan))
+    between = np.exp(-(P[5, 3, 6] + P[5, 3, 8]) / 2)
+    assert stored.scan.counts[5, 3, 7] / stored.info.i0 == pytest.approx(between, rel=1e-5)
+    assert np.argwhere(stored.scan.flat.numpy() == 0).tolist() == [[3, 7]]

@@ -18,6 +18,7 @@ from ctsim.benchmarks.importing import Flags
 from ctsim.benchmarks.importing.settle import water_path
 from ctsim.benchmarks.importing.work import bring
 from ctsim.dataset.store import open_scan
+from ctsim.dataset.writer import SceneWriter
 from ctsim.errors import InputError
 from ctsim.io.scans import formats as scans
 from ctsim.io.scans.scanfile import filters_of
@@ -292,3 +293,90 @@ def test_an_import_goes_on_to_another_library(tmp_path):
     with pytest.raises(InputError, match="the scan comes without one"):
         export.export(export.Flags(scan=folder, out=tmp_path / "r2", to="r2"))
     assert not (tmp_path / "r2").exists()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
+def test_a_pixel_that_lacks_readings_is_dead_and_said(tmp_path, value):
+    """It is interpolated in every view, and a method that knows dead pixels knows it as one."""
+    counts = COUNTS.astype(np.float64 if value == 1e300 else np.float32)
+    counts[3, 2, 5] = value
+    stored = brought(tmp_path, scan_files.skyscan(tmp_path / "scan", counts, GEOMETRY))
+    assert "1 of 1280 pixels have readings that are not finite, the first in view 3 at column 5 of row 2" in " ".join(
+        stored.info.notes
+    )
+    found = stored.scan.counts.numpy()
+    np.testing.assert_allclose(found[:, 2, 5], (counts[:, 2, 4] + counts[:, 2, 6]) / 2, rtol=1e-6)
+    found[:, 2, 5] = counts[:, 2, 5] = 0
+    assert np.array_equal(found, counts)
+    assert stored.scan.flat[2, 5] == 0 and (stored.scan.flat > 0).sum() == 32 * 40 - 1
+    assert abs(stored.info.gain - LEVEL) < OPEN and 0.7 < stored.info.i0 / 2e5 < 1.4
+
+
+@pytest.mark.parametrize("moved", [False, True], ids=["stored", "moved"])
+@pytest.mark.parametrize(
+    ("where", "said"),
+    [
+        (np.s_[:], "every pixel has readings that are not finite, the first in view 0 at column 0 of row 0"),
+        (np.s_[7], "every pixel has readings that are not finite, the first in view 7"),
+        (np.s_[7, :8, :8], r"of 1280 pixels have readings that are not finite, .*; expected at most 1% of the pixels"),
+    ],
+)
+def test_more_than_a_few_pixels_without_readings_are_refused(tmp_path, where, said, moved):
+    counts = COUNTS.astype(np.float32)
+    counts[where] = np.nan
+    log = scan_files.skyscan(tmp_path / "scan", counts, GEOMETRY)
+    if moved:
+        scan_files.shifts(log, np.zeros((24, 2)))
+    with pytest.raises(InputError, match=said):
+        brought(tmp_path, log)
+    assert not (tmp_path / "data").exists()
+
+
+def test_an_image_that_is_moved_off_the_panel_is_refused(tmp_path):
+    log = scan_files.skyscan(tmp_path / "scan", COUNTS, GEOMETRY)
+    moves = np.zeros((24, 2))
+    moves[4, 1] = -31.5
+    scan_files.shifts(log, moves)
+    assert scans.open_scan(log)
+    moves[4, 1] = -32
+    scan_files.shifts(log, moves)
+    with pytest.raises(InputError, match=r"rods_TS.csv moves image 4 by -32 pixels in y, off the panel of 32 × 40"):
+        scans.open_scan(log)
+
+
+def test_a_negative_voltage_is_no_voltage(tmp_path):
+    log = scan_files.skyscan(tmp_path / "scan", COUNTS, GEOMETRY, kv=-90)
+    notes = " ".join(brought(tmp_path, log).info.notes)
+    assert "Source Voltage (kV) = -90 is no voltage" in notes and "the tube voltage is unknown" in notes
+    assert brought(tmp_path, log, kv=90.0, name="stated").info.e_max == 90
+
+
+def test_a_log_ends_with_the_last_view(tmp_path, capsys):
+    log = scan_files.skyscan(tmp_path / "scan", COUNTS, GEOMETRY)
+    brought(tmp_path, log)
+    assert capsys.readouterr().err == "24/24 views: rods\n"
+
+
+def test_an_import_that_goes_on_says_from_where(tmp_path, capsys, monkeypatch):
+    log = scan_files.skyscan(tmp_path / "scan", COUNTS, GEOMETRY)
+    put = SceneWriter.put
+
+    def stopped(self, view, arrays):
+        if view == 9:
+            raise KeyboardInterrupt
+        put(self, view, arrays)
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(SceneWriter, "put", stopped)
+        brought(tmp_path, log)
+    assert capsys.readouterr().err == ""
+    assert np.array_equal(brought(tmp_path, log).scan.counts.numpy(), COUNTS)
+    assert capsys.readouterr().err == "rods: goes on from view 9 of 24\n24/24 views: rods\n"
+
+
+@pytest.mark.parametrize("name", ["..", "a/b", ".hidden", "index.jsonl"])
+def test_a_name_is_that_of_a_folder(tmp_path, name):
+    log = scan_files.skyscan(tmp_path / "scan", COUNTS, GEOMETRY)
+    with pytest.raises(InputError, match=f"--name '{re.escape(name)}': expected a plain folder name"):
+        brought(tmp_path, log, name=name)
+    assert not (tmp_path / "data").exists()

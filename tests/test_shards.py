@@ -260,6 +260,14 @@ def test_what_is_not_there_is_one_sentence(folder, tmp_path):
     for call, said in (
         (lambda: Scans(tmp_path), "holds no shards"),
         (lambda: Scans(folder / "out", ("fdkk",)), "items: 'fdkk' is unknown"),
+        (
+            lambda: Scans(folder / "out", "fdk"),
+            r"items: expected a tuple of names, such as \('fdk',\), got the text 'fdk'",
+        ),
+        (
+            lambda: Scans(folder / "out", ("p",), plane="y"),
+            r"plane = 'y' cuts volumes, but 'p' holds projections, .*; expected plane = None, or items without them",
+        ),
         (lambda: Scans(folder / "out", ()), "items: expected at least one"),
         (lambda: Scans(folder / "out", plane="w"), "plane must be 'z', 'y', 'x' or None"),
         (lambda: Scans(folder / "out", split="val"), "no scan in split 'val', expected test, train"),

@@ -146,3 +146,11 @@ def test_table_is_small_and_carries_its_licence() -> None:
     data = Path(ctsim.beam.spectrum.__file__).parent
     assert (data / "tungsten_spectra.npz").stat().st_size < 150_000
     assert "Copyright (c) 2019 Robert Bujila and Gavin Poludniowski" in (data / "NOTICE.txt").read_text()
+
+
+@pytest.mark.parametrize("kvp", [5.0, 19.0, 301.0, 501.0, float("nan")])
+def test_the_table_names_one_range_of_voltages(kvp: float) -> None:
+    with pytest.raises(InputError, match="kvp must be within 20 to 300 kVp, as the bundled table is, got"):
+        Tube(kvp=kvp)
+    with pytest.raises(InputError, match=r"kvp must be within \[10, 500\] for model 'finkelshtein-pavlova'"):
+        Tube(kvp=kvp if not 10 <= kvp <= 500 else 9.0, model="finkelshtein-pavlova")

@@ -99,6 +99,15 @@ def test_wrong_flags_are_one_sentence(smallest, fdk, tmp_path, change, said):
     assert said in str(caught.value)
 
 
+def test_results_are_a_folder(smallest, tmp_path, capsys, monkeypatch):
+    volume = tmp_path / "v.npy"
+    volume.write_bytes(b"1")
+    words = ["score", smallest, volume, volume, "--scene", "smallest", "--name", "mine"]
+    monkeypatch.setattr("sys.argv", ["run-benchmark", *map(str, words)])
+    assert cli.run_benchmark() == 2
+    assert f"RESULTS: {volume} is a file, expected a folder" in " ".join(capsys.readouterr().err.split())
+
+
 @pytest.mark.slow
 def test_another_spacing_is_refused(smallest, fdk, tmp_path):
     stored, path = open_scan(smallest / "smallest"), tmp_path / "v.mha"

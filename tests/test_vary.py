@@ -106,7 +106,16 @@ def test_another_split_keeps_the_noise():
         ("{ log = [1e4, 1e6] }", "3", "vary.scanner.i0: expected a list"),
         ("{ integers = [0, 3] }", "{ integers = [0.5, 3] }", "integers needs integer ends"),
         ("scanner.i0", "truth.twin", "vary.truth.twin: expected a key of phantom or scanner"),
-        ("scanner.i0", "scanner.io", "scene[0].scanner.io: unknown key"),
+        ("scanner.i0", "scanner.io", "scene[0].vary.scanner.io: unknown key"),
+        ("scanner.i0", "scanner.mas", "scene[0].vary.scanner.mas: unknown key; expected one of preset, n_views"),
+        ("scanner.i0", "scanner.mas", "; did you mean scan_mas?"),
+        ('"phantom.size"', '"phantom.sice"', "did you mean size?"),
+        (
+            "scanner.tube.kvp = { uniform",
+            "scanner.tube.kvp = { normal",
+            "scene[0].vary.scanner.tube.kvp: expected a list of values, or {uniform = [low, high]}, "
+            "{log = [low, high]} or {integers = [low, high]} with low < high, got a table of normal",
+        ),
         ('"Au"]', '"Aurum"]', "scene[0].phantom.metal"),
         ("train = 0.8", "train = 0.9", "scene[0].split must be positive shares that sum to 1"),
         ("train = 0.8", '"../train" = 0.8', "scene[0].split '../train': expected a name"),

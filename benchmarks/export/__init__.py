@@ -25,6 +25,8 @@ class Flags:
     volume: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "reference_effective"
     """A volume of the scan (reference_effective, reference_50kev, labels, metal, metal_free/…), or a TIFF stack or .npy
     array on the scan's grid, such as a reconstruction in results/volumes."""
+    twin: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Write the metal-free twin of the scan, in a library's layout."""
     hu: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Write HU instead of 1/mm."""
     kev: float | None = None

@@ -12,6 +12,7 @@ from ctsim.benchmarks.export import Flags
 from ctsim.benchmarks.export.scans import LAYOUTS, Measured, write_scan
 from ctsim.benchmarks.scores.artefact import effective_attenuation
 from ctsim.dataset.arrayfile import read_array
+from ctsim.dataset.manifest import MANIFEST
 from ctsim.dataset.store import StoredScan, open_scan
 from ctsim.errors import InputError
 from ctsim.io.extra import load
@@ -19,6 +20,7 @@ from ctsim.io.volumes.formats import FORMATS
 from ctsim.io.volumes.placed import Placed
 from ctsim.materials import attenuation
 from ctsim.reconstruct.log import line_integrals
+from ctsim.scaninfo import TWIN
 
 REFERENCE_50KEV = "reference_50kev"
 
@@ -39,10 +41,14 @@ def export(given: Flags) -> None:
     _check_out(given.out, given.to)
     if given.kev is not None and not given.hu and given.to in FORMATS and given.to != "dicom":
         raise InputError("--kev says at which energy water is 0 HU: expected --hu with it")
+    if given.scan.name == TWIN.rstrip("/") and (given.scan.parent / MANIFEST).is_file():
+        raise InputError(f"SCAN: {given.scan} is the twin of {given.scan.parent}: expected that one, with --twin")
     stored = open_scan(given.scan)
     if given.to in LAYOUTS:
         _export_scan(given, stored)
         return
+    if given.twin:
+        raise InputError(f"--twin goes with the layouts of scans: a volume of the twin is --volume {TWIN}NAME")
     values = _volume(stored, given.volume)
     unit = "1/mm" if values.dtype.kind == "f" else str(values.dtype)
     if given.hu or given.to == "dicom":
@@ -65,12 +71,16 @@ def export(given: Flags) -> None:
 
 
 def _export_scan(given: Flags, stored: StoredScan) -> None:
-    plain = Flags(scan=given.scan, out=given.out, to=given.to)
+    plain = Flags(scan=given.scan, out=given.out, to=given.to, twin=given.twin)
     if given != plain:
         raise InputError(f"--to {given.to} writes the scan: expected neither --volume, --hu nor --kev")
+    if given.twin:
+        if stored.metal_free is None:
+            raise InputError(f"--twin: the scan {stored.name!r} has no metal-free twin")
+        stored = stored.metal_free
     scan = stored.scan
     p, _ = line_integrals(scan, slice(None))
-    truth = LAYOUTS[given.to].truth and "reference_effective.tif" in stored.files
+    truth = LAYOUTS[given.to].truth and f"{stored.prefix}reference_effective.tif" in stored.files
     content = Measured(
         geometry=stored.geometry,
         p=p.numpy(),
@@ -114,6 +124,8 @@ def _volume(stored: StoredScan, name: str) -> NDArray[Any]:
         known = ", ".join(
             sorted(file.removesuffix(".tif") for file, entry in stored.files.items() if entry.shape == shape)
         )
+        if not known:
+            raise InputError(f"--volume: {name} is no file, and a measured scan has no true volume: expected a file")
         raise InputError(f"--volume: {name} is no file and none of {known}")
     return values.astype(np.float32) if values.dtype.kind == "f" else values
 

@@ -25,6 +25,7 @@ I0, E_MAX = 1e5, 90.0  # where nothing says better
 HOLD_ONE_OF, MOST_HELD = 40, 12
 SHADOW = 0.02  # P of a millimetre of water: more is the object's shadow
 OFF_CENTRE = 0.1  # of the columns: a detector that is shifted so far misses rays where a view is held out
+SAME = 1e-9  # of the source's distance, by which poses differ in rounding
 DEEPEST = 500.0  # mm of water behind which the effective spectrum is sought
 
 
@@ -81,10 +82,13 @@ def settle(scan: ScanFile, given: Flags) -> Settled:
     Raises InputError where a flag cannot be followed.
     """
     notes = list(scan.notes)
+    _check_sides(scan)
     geometry = _turned(_gridded(scan.geometry, given), given)
     first = scan.read(0)
     whole = scan.dtype == "uint16" and first.dtype in (np.uint8, np.uint16)
     flat, level, i0 = _opened(scan, geometry, given, notes)
+    if scan.dead is not None:
+        flat = np.where(scan.dead, np.float32(scan.dark), flat)  # as line integrals know a dead pixel
     axis = _axis(scan, geometry, flat, i0, given, notes)
     geometry = msgspec.structs.replace(
         geometry, off_detector=(geometry.off_detector[0], -axis * geometry.d_detector[1])
@@ -109,6 +113,13 @@ def settle(scan: ScanFile, given: Flags) -> Settled:
         axis=axis,
         notes=tuple(notes),
     )
+
+
+def _check_sides(scan: ScanFile) -> None:
+    """Refuse several views of one pose, of which nothing can be reconstructed."""
+    poses = scan.geometry.pose_array()
+    if len(poses) > 1 and np.ptp(poses, axis=0).max() <= SAME * scan.geometry.dso:
+        raise InputError(f"{scan.path} has {len(poses)} views from one side, expected angles that differ")
 
 
 def _gridded(geometry: Geometry, given: Flags) -> Geometry:

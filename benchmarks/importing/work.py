@@ -13,8 +13,9 @@ import tyro
 from ctsim.beam.spectrum import Tube
 from ctsim.benchmarks.engine.terminal import Bar
 from ctsim.benchmarks.importing import Flags
+from ctsim.benchmarks.importing.readings import sound
 from ctsim.benchmarks.importing.settle import Settled, settle
-from ctsim.dataset.manifest import file_sha256
+from ctsim.dataset.manifest import file_sha256, is_name
 from ctsim.dataset.writer import SceneWriter, Stack, is_complete
 from ctsim.errors import InputError
 from ctsim.geometry import FARTHEST
@@ -49,6 +50,8 @@ def bring(given: Flags) -> Path:
     """
     scan = open_scan(given.scan, given.format, _stated(given))
     name = given.name or _name(given.scan)
+    if not is_name(name):
+        raise InputError(f"--name {name!r}: expected a plain folder name, of letters, digits and ._+-")
     digests = {path.relative_to(scan.path.parent).as_posix(): file_sha256(path) for path in scan.files}
     identity = _identity(scan, digests, given)
     if not given.force:
@@ -56,6 +59,7 @@ def bring(given: Flags) -> Path:
     if not given.force and is_complete(given.out, name, identity):
         sys.stdout.write(f"{given.out / name}: already complete\n")
         return given.out / name
+    scan = sound(scan)
     settled = settle(scan, given)
     folder = _write(scan, settled, name, identity, given, digests)
     sys.stdout.write(f"{folder}: {settled.text()}\n")
@@ -106,10 +110,12 @@ def _write(scan: ScanFile, settled: Settled, name: str, identity: str, given: Fl
     with SceneWriter(
         given.out, name, scene_id=identity, plan_hash=identity, stacks=(stack,), force=given.force
     ) as writer:
-        with Bar(len(kept), "view") as bar:
-            bar.at(writer.first_view, name)
+        if writer.first_view:
+            sys.stderr.write(f"{name}: goes on from view {writer.first_view} of {len(kept)}\n")
+        with Bar(len(kept), "view", writer.first_view) as bar:
             for view in bar.over(range(writer.first_view, len(kept)), name):
                 writer.put(view, {"counts": settled.counts(scan, int(kept[view]))})
+            bar.at(len(kept), name)
         writer.write_image("flat", settled.flat, pixel)
         if len(held):
             writer.write_image("held", np.stack([settled.counts(scan, int(k)) for k in held]), (1.0, *pixel))

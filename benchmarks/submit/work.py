@@ -66,6 +66,8 @@ def submit(given: Flags) -> list[RunRecord]:
 
 
 def _check(given: Flags) -> None:
+    if given.results.exists() and not given.results.is_dir():
+        raise InputError(f"RESULTS: {given.results} is a file, expected a folder; the volume is named after it")
     if not NAME.fullmatch(given.name):
         raise InputError(f"--name {given.name!r}: expected up to 60 letters, digits, spaces and _.+-")
     if given.name in TABLE or given.name in EXTERNAL:

@@ -97,7 +97,7 @@ class Tube(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
                 f"tube: model must be 'table', 'finkelshtein-pavlova', 'spekpy' or 'mono', got {self.model!r}"
             )
         low, high = (2.0, 500.0) if self.model == "mono" else (10.0, 500.0)
-        if not (math.isfinite(self.kvp) and low <= self.kvp <= high):
+        if self.model != "table" and not low <= self.kvp <= high:  # nor is NaN
             raise InputError(f"tube: kvp must be within [{low:g}, {high:g}] for model {self.model!r}, got {self.kvp}")
         if self.model == "table" and not TABLE_KVP[0] <= self.kvp <= TABLE_KVP[1]:
             raise InputError(

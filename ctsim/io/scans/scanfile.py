@@ -29,7 +29,8 @@ class ScanFile:
     the open field `flat` [v, u]; without one the air next to the object is measured. With `integrals` views are −ln of
     transmissions. `axis_known` says that the file states where the axis is; `filters` is None where they are unknown.
     `stored` decodes a view as it was read out, where `read` turns or moves it; it may have another order of pixels.
-    `held` numbers the views that the format sets apart for testing. `files` is all that is read, with `path`.
+    `held` numbers the views that the format sets apart for testing. `files` is all that is read, with `path`. Pixels
+    that are `dead` [v, u] tell nothing; no format states them, an import finds them.
     """
 
     path: Path
@@ -45,6 +46,7 @@ class ScanFile:
     filters: tuple[Filter, ...] | None = None
     stored: Callable[[int], NDArray[Any]] | None = None
     held: tuple[int, ...] = ()
+    dead: NDArray[np.bool_] | None = None
     notes: tuple[str, ...] = ()
 
 

@@ -41,11 +41,12 @@ def open_scan(path: Path, stated: Stated) -> ScanFile:
     geometry = _geometry(log, found, (n_v, n_u), len(images), stated)
     angle = number(log, found, "image rotation", default=0.0)
     table = _table(log)
-    shifts = None if table is None else _shifts(table, len(images))
+    shifts = None if table is None else _shifts(table, len(images), (n_v, n_u))
     kvp = number(log, found, "source voltage (kv)", "source voltage (kvp)", default=0.0)
     text = found.get("filter", "")
     sheets = filters_of(text)
     notes = [f"{len(images)} images, the log declares {declared}"] if len(images) > declared else []
+    notes += [f"Source Voltage (kV) = {kvp:g} is no voltage, so it counts as unknown"] if kvp < 0 else []
     notes += [f"the filter {quoted(text)} is not understood"] if sheets is None else []
     notes += [f"images were turned back by {angle:g}° (Image Rotation)"] if abs(angle) > TURN else []
     notes += ["images were moved back by the shifts of _TS.csv"] if shifts is not None else []
@@ -58,7 +59,7 @@ def open_scan(path: Path, stated: Stated) -> ScanFile:
         stored=_reader(images, (n_v, n_u), 0.0, None) if resample else None,
         dtype="float32" if resample else "uint16",
         axis_known=False,
-        kvp=kvp or None,
+        kvp=kvp if kvp > 0 else None,
         filters=sheets,
         notes=tuple(notes),
     )
@@ -147,7 +148,7 @@ def _table(log: Path) -> Path | None:
     return None if found is None else beside(log, found.name)
 
 
-def _shifts(path: Path, n_views: int) -> NDArray[np.float64]:
+def _shifts(path: Path, n_views: int, shape: tuple[int, int]) -> NDArray[np.float64]:
     """Return how far each image moved, [view, (right, down)] in pixels.
 
     The table's first line names the columns; those that contain "x" and "y" count.
@@ -160,8 +161,14 @@ def _shifts(path: Path, n_views: int) -> NDArray[np.float64]:
         values = np.array([[float(row[k]) for k in columns] for row in rows[1:]]).reshape(-1, 2)
     except (ValueError, IndexError):
         values = np.full((0, 2), np.nan)
-    if -1 in columns or columns[0] == columns[1] or len(values) != n_views or not np.all(np.abs(values) < MOST_PIXELS):
+    if -1 in columns or columns[0] == columns[1] or len(values) != n_views or not np.isfinite(values).all():
         raise InputError(f"{path} is no table of {n_views} shifts with columns x and y in pixels")
+    if (out := np.abs(values) >= shape[::-1]).any():
+        view, axis = np.argwhere(out)[0]
+        raise InputError(
+            f"{path} moves image {view} by {values[view, axis]:g} pixels in {'xy'[axis]}, off the panel of "
+            f"{shape[0]} × {shape[1]}; expected less"
+        )
     return values
 
 
