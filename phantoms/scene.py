@@ -3,7 +3,7 @@
 import functools
 import hashlib
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -180,9 +180,13 @@ def _scenes(data: dict[str, Any], where: str) -> tuple[Scene, ...]:
         data = {"scene": [data]} if "count" in data else data
         if "scene" not in data:
             return (read_scene(data, where),)
-    scenes = scenes_of(data, Scene, where, lambda *row: ((at, on_machine(one)) for at, one in expand(*row, Scene)))
+    scenes = scenes_of(data, Scene, where, _expanded)
     _check_splits(scenes, where)
     return scenes
+
+
+def _expanded(place: str, table: dict[str, Any], where: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    return ((at, on_machine(one)) for at, one in expand(place, table, where, Scene))
 
 
 def read_scene(table: Mapping[str, Any], where: str) -> Scene:
