@@ -131,13 +131,11 @@ class Geometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             msgspec.structs.force_setattr(self, name, tuple(found.tolist()) if axes else found.item())
         for name, wanted in _LISTS.items():
             given = getattr(self, name)
-            if given is None or type(given) is tuple:
+            if given is None or (type(given) is tuple and all(map(_is_plain, given))):
                 continue
-            rows = given.tolist() if isinstance(given, np.ndarray) else given
-            if not isinstance(rows, tuple | list):
+            if not isinstance(given, tuple | list | np.ndarray):
                 raise InputError(f"{name}: expected {wanted}, got {_brief(given)}")
-            rows = tuple(tuple(row) if isinstance(row, list) else row for row in rows)
-            msgspec.structs.force_setattr(self, name, rows)
+            msgspec.structs.force_setattr(self, name, _plain(given))
 
     @property
     def angles(self) -> NDArray[np.float64]:
@@ -231,6 +229,17 @@ def _numbers(given: Any) -> NDArray[Any] | None:
     except (TypeError, ValueError, RuntimeError, OverflowError):  # the third of a tensor that needs a gradient
         return None
     return found if found.dtype.kind in "iuf" else None
+
+
+def _is_plain(given: Any) -> bool:
+    """Whether something is a number of Python or a tuple of such."""
+    return type(given) in (float, int) or (type(given) is tuple and all(type(x) in (float, int) for x in given))
+
+
+def _plain(given: Any) -> Any:
+    """Return numbers and arrays of NumPy as Python's, lists as tuples, and what is none of these as it is."""
+    known = given.tolist() if isinstance(given, np.ndarray | np.generic) else given
+    return tuple(map(_plain, known)) if isinstance(known, tuple | list) else known
 
 
 def _brief(given: Any) -> str:

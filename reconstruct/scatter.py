@@ -186,4 +186,4 @@ def laid(blocks: Image, rows: sparse.csr_array, columns: sparse.csr_array) -> Im
 
     Dense products would be slower, and their last bits would depend on how many threads NumPy's BLAS has.
     """
-    return np.asarray((columns @ (rows @ blocks).T).T, np.float32)
+    return np.ascontiguousarray((columns @ (rows @ blocks).T).T, np.float32)

@@ -151,6 +151,13 @@ def test_lists_and_numbers_of_numpy_are_those_of_python() -> None:
     assert angles == with_(angles_deg=[0, 1, 2]) == with_(angles_deg=(0.0, 1.0, 2.0)) and hash(angles)
     poses = with_(poses=GEOMETRY.pose_array())
     assert poses == with_(poses=[list(row) for row in posed({})]) == with_(poses=posed({})) and hash(poses)
+    for one in (tuple(np.arange(3.0)), list(np.arange(3.0, dtype=np.float32)), tuple(np.arange(3)), [0, 1.0, 2]):
+        made = with_(angles_deg=one)
+        assert made == angles and hash(made) and msgspec.json.decode(msgspec.json.encode(made), type=Geometry) == angles
+    rows = GEOMETRY.pose_array()
+    for many in (list(rows), tuple(map(tuple, rows)), tuple(rows), [list(row) for row in rows]):
+        made = with_(poses=many)
+        assert made == poses and hash(made) and msgspec.json.decode(msgspec.json.encode(made), type=Geometry) == poses
 
 
 @pytest.mark.parametrize(

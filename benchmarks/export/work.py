@@ -42,7 +42,8 @@ def export(given: Flags) -> None:
     if given.kev is not None and not given.hu and given.to in FORMATS and given.to != "dicom":
         raise InputError("--kev says at which energy water is 0 HU: expected --hu with it")
     if given.scan.name == TWIN.rstrip("/") and (given.scan.parent / MANIFEST).is_file():
-        raise InputError(f"SCAN: {given.scan} is the twin of {given.scan.parent}: expected that one, with --twin")
+        how = "with --twin" if given.to in LAYOUTS else f"with --volume {TWIN}NAME"
+        raise InputError(f"SCAN: {given.scan} is the twin of {given.scan.parent}: expected that one, {how}")
     stored = open_scan(given.scan)
     if given.to in LAYOUTS:
         _export_scan(given, stored)

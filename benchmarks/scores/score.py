@@ -284,7 +284,7 @@ def error(metric: str, value: float) -> float:
 
 
 def anchored(e: float, e_reference: float, e_fdk: float) -> float | None:
-    """Return (e − e_ref) / (e_FDK − e_ref); None where the metal costs FDK less than a quarter of its error without."""
+    """Return (e − e_ref) / (e_FDK − e_ref); None where metal costs FDK no more than a quarter of that without."""
     loss = e_fdk - e_reference
     return (e - e_reference) / loss if loss > LEAST_LOSS * e_reference else None
 

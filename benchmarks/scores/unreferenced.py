@@ -138,7 +138,7 @@ class Unreferenced:
         0 that noise may make counts as 0; a larger one says that the regions hold different things.
         """
         if self.near.sum() < MIN_VOXELS or self.far.sum() < MIN_VOXELS or not self.water > 0:
-            return None, ""
+            return None, f"no artefact index: fewer than {MIN_VOXELS} voxels of soft tissue near the metal or beyond"
         near, far = (float(values[mask].astype(np.float64).std()) * 1000 / self.water for mask in (self.near, self.far))
         if near < QUIETER * far:
             return None, f"no artefact index: the body varies by {near:.0f} HU near the metal, by {far:.0f} HU beyond"

@@ -136,7 +136,7 @@ def caption(records: Sequence[RunRecord], protocol: str) -> str:
             "Anchored scores s = (e − e_ref)/(e_FDK − e_ref), e_ref from the metal-free scan reconstructed by FDK: "
             "0 as if the metal had never been there, 1 uncorrected. Harm rate: share of scenes with s > 1, "
             "and how many of how many scenes that have a score. There is no score where the metal raises FDK's "
-            f"error by less than {LEAST_LOSS:.0%}; of artefacts, its RMSE in tissue."
+            f"error by no more than {LEAST_LOSS:.0%}; for artefacts the error that counts is the RMSE under tissue."
         )
     found = [(r, r.scores[protocol]) for r in records if protocol in r.scores and r.run.variant == METAL]
     if not found:

@@ -167,7 +167,7 @@ def _shifts(path: Path, n_views: int, shape: tuple[int, int]) -> NDArray[np.floa
         view, axis = np.argwhere(out)[0]
         raise InputError(
             f"{path} moves image {view} by {values[view, axis]:g} pixels in {'xy'[axis]}, off the panel of "
-            f"{shape[0]} × {shape[1]}; expected less"
+            f"{shape[0]} × {shape[1]}; expected a shift that leaves some of it there"
         )
     return values
 
