@@ -94,6 +94,45 @@ def test_auc_counts_ties_half_and_weights_as_repeats():
     assert known_background(silent, DRAWS).auc == varying_background(silent, DRAWS).auc == 0.5
 
 
+def one_value(n, locations, relative):
+    """Return responses to volumes of one value, of which noise and all lesions together change `relative`."""
+    rng, weights = np.random.default_rng(3), np.random.default_rng(4).normal(size=(locations, N_CHANNELS))
+    values = [0.02 * (1 + relative * (shift + rng.normal(size=n))) for shift in (1.0, 0.0)]
+    present, absent = (np.float32(v).astype(float)[:, None, None] * weights for v in values)
+    # the nine digits of a record
+    rounded = [np.array([float(f"{r:.9g}") for r in x.ravel()]).reshape(x.shape) for x in (present, absent)]
+    return values, Responses(present=rounded[0], absent=rounded[1], pairs=np.arange(n))
+
+
+@pytest.mark.parametrize("relative", [1e-3, 1e-4, 1e-5])
+def test_volumes_of_one_value_are_told_by_that_value_alone(relative):
+    """Four of five directions hold only rounding: no template may follow them, and all locations say the same."""
+    (with_lesions, without), found = one_value(100, 3, relative)
+    folds = [np.arange(100) % 5 == f for f in range(5)]
+    expected = np.mean([auc(with_lesions[f], without[f]) for f in folds])
+    for k in range(3):
+        here = found.at(np.array([k]))
+        assert known_background(here, DRAWS).auc == pytest.approx(expected, abs=5e-3)  # float32 ties some pairs
+        value, low, high = normal_theory(here.present[:, 0], here.absent[:, 0])
+        assert low < ndtr(1 / np.sqrt(2)) < high and value == pytest.approx(expected, abs=0.05)
+
+
+def test_volumes_that_do_not_vary_tie_or_are_told_apart_for_certain():
+    rng = np.random.default_rng(6)
+    steady, anything = 0.02 * rng.normal(size=(3, N_CHANNELS)) + np.zeros((20, 1, 1)), gaussian(rng, 1.5, n=20)
+    other = known_background(anything, DRAWS)
+    for silent in (0 * steady, steady):
+        same = Responses(present=silent, absent=silent, pairs=np.arange(20))
+        for area in (known_background(same, DRAWS), varying_background(same, DRAWS)):
+            assert (area.auc, area.low, area.high) == (0.5, 0.5, 0.5)  # no other scans would say another thing
+            # so that the whole interval of a difference is the other's
+            assert difference(area, other) == pytest.approx((0.5 - other.auc, 0.5 - other.high, 0.5 - other.low))
+        assert normal_theory(silent[:, 0], silent[:, 0]) == (0.5, 0.5, 0.5)
+    noise_free = Responses(present=1.01 * steady, absent=steady, pairs=np.arange(20))
+    assert known_background(noise_free, DRAWS).auc == 1.0
+    assert normal_theory(noise_free.present[:, 0], noise_free.absent[:, 0]) == (1.0, 1.0, 1.0)
+
+
 def test_an_interval_at_1_is_wilsons():
     z = 1.959964
     assert wilson(1.0, 0.0, 50) == (pytest.approx(50 / (50 + z**2)), pytest.approx(1.0))

@@ -9,6 +9,9 @@ scores put in the right order, a tie counting one half (Mann–Whitney), within 
 - Background varying: one template for all locations, trained at the other ones, and scores of all locations compared
   with each other. What artefacts make differ from place to place hides the lesion, too.
 
+Volumes are float32. A direction in which responses vary by less than that rounding has the rounding's variance instead:
+where one value fills a volume, four of five directions hold nothing else, and a template must not follow them.
+
 Intervals: scans are drawn again with replacement, with and without lesion apart and within folds, and the observer is
 trained anew. A scan brings all its locations along. The same draws serve all methods, so that differences are paired.
 """
@@ -27,7 +30,7 @@ FOLDS = 5
 LEAST = 2 * FOLDS  # scans of a class
 DRAWS = 500
 Z95 = float(ndtri(0.975))
-_RANK = 1e-10  # of the covariance's eigenvalues, relative to the largest
+ROUNDING = 1e-7  # of the largest response: the least deviation in any direction, for volumes are float32
 _CHUNK = 2**22  # comparisons at once
 
 Array = NDArray[np.float64]
@@ -105,13 +108,18 @@ def normal_theory(present: Array, absent: Array) -> tuple[float, float, float]:
 
     No scans are set apart: the bias of training on the tested scans is known and taken off, and the interval follows
     from the noncentral F distribution (Wunderlich et al. 2015, doi:10.1109/TMI.2014.2360496). It is that of an observer
-    trained on infinitely many scans.
+    trained on infinitely many scans. Directions in which responses vary by rounding alone are left out.
     """
-    n1, n0, p = len(present), len(absent), present.shape[1]
+    n1, n0 = len(present), len(absent)
     n, share = n1 + n0, n1 * n0 / (n1 + n0)
     signal = present.mean(0) - absent.mean(0)
     pooled = (_scatter(present) + _scatter(absent)) / (n - 2)
-    squared = float(signal @ np.linalg.pinv(pooled, rcond=_RANK, hermitian=True) @ signal)
+    values, vectors = np.linalg.eigh(pooled)
+    varies = values > _least(present, absent)
+    if not varies.any():  # nothing hides a difference
+        return (1.0, 1.0, 1.0) if float(signal @ signal) > _least(present, absent) else (0.5, 0.5, 0.5)
+    p = int(varies.sum())
+    squared = float(((signal @ vectors[:, varies]) ** 2 / values[varies]).sum())
     best = max((n - p - 3) / (n - 2) * squared - p / share, 0.0)
     value = (n - p - 1) / (p * (n - 2)) * share * squared
 
@@ -138,6 +146,11 @@ def wilson(share: float, error: float, n: int) -> tuple[float, float]:
     return middle - half, middle + half
 
 
+def _least(*responses: Array) -> float:
+    """Return the variance that rounding alone has, in units of the responses squared."""
+    return (ROUNDING * max(float(np.abs(kind).max()) for kind in responses)) ** 2
+
+
 def _auc_of(squared_d: float) -> float:
     return float(ndtr(math.sqrt(squared_d / 2)))
 
@@ -153,6 +166,8 @@ def _area(found: Responses, draws: int, observer: Callable[..., Array]) -> Area:
     value = float(observer(found, folds, ones, ones)[0])
     w1, w0 = _drawn(found.pairs, draws, 1), _drawn(found.pairs, draws, 0)
     again = observer(found, folds, w1, w0)
+    if np.abs(np.append(again, value) - 0.5).max() < 1e-12:  # all pairs tie in all draws: that is not by chance
+        return Area(auc=0.5, low=0.5, high=0.5, draws=again)
     low, high = wilson(value, float(again.std(ddof=1)), len(found.pairs))
     return Area(auc=value, low=low, high=high, draws=again)
 
@@ -179,11 +194,15 @@ def _moments(x: Array, w: Array) -> tuple[Array, Array]:
     return mean, squared - mean[:, :, None] * mean[:, None, :]
 
 
-def _template(x1: Array, x0: Array, w1: Array, w0: Array) -> tuple[Array, Array]:
-    """Return Hotelling's template [draw, channel] and the score halfway between the classes [draw]."""
+def _template(x1: Array, x0: Array, w1: Array, w0: Array, least: float) -> tuple[Array, Array]:
+    """Return Hotelling's template [draw, channel] and the score halfway between the classes [draw].
+
+    `least` is the least variance in any direction; where that is 0, all responses are 0, and the template is, too.
+    """
     (m1, s1), (m0, s0) = _moments(x1, w1), _moments(x0, w0)
-    inverse = np.linalg.pinv((s1 + s0) / 2, rcond=_RANK, hermitian=True)
-    template = np.einsum("bcd,bd->bc", inverse, m1 - m0)
+    values, vectors = np.linalg.eigh((s1 + s0) / 2)
+    along = np.einsum("bcd,bc->bd", vectors, m1 - m0)
+    template = np.einsum("bcd,bd->bc", vectors, along / np.maximum(values, least or 1.0))
     return template, ((m1 + m0) / 2 * template).sum(1)
 
 
@@ -210,9 +229,10 @@ def _cross_fitted(
         for p in tested:
             where = np.array(trained if trained is not None else [q for q in tested if q != p])
             x1, x0 = (kind[np.ix_(train, where)] for kind in (found.present, found.absent))
-            template, middle = _template(x1, x0, w1[:, train], w0[:, train])
+            centre = (x1.mean((0, 1)) + x0.mean((0, 1))) / 2  # a score is the same, but its digits do not cancel
+            template, middle = _template(x1 - centre, x0 - centre, w1[:, train], w0[:, train], _least(x1, x0))
             for kind, x in zip(scores, (found.present, found.absent), strict=True):
-                kind.append(template @ x[test, p].T - middle[:, None])
+                kind.append(template @ (x[test, p] - centre).T - middle[:, None])
         total += _compared(scores, np.tile(w1[:, test], len(tested)), np.tile(w0[:, test], len(tested)))
     return total / len(folds)
 
