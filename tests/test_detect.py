@@ -9,9 +9,9 @@ import torch
 
 from ctsim.benchmarks import cli
 from ctsim.benchmarks.engine.record import latest
-from ctsim.benchmarks.methods import find
+from ctsim.benchmarks.methods import CONTROLS, TABLE, find
 from ctsim.benchmarks.oracles import central_rays
-from ctsim.benchmarks.studies.detect import Flags, measure, suite, tables
+from ctsim.benchmarks.studies.detect import DEFAULT, Flags, measure, suite, tables
 from ctsim.benchmarks.studies.detect.records import Pair, Seen, Site
 from ctsim.benchmarks.studies.detect.study import Detect
 from ctsim.errors import InputError
@@ -81,6 +81,9 @@ def test_the_contrast_to_noise_of_lesions_counts_noise_and_artefacts():
     one = tables.Series(**told, pairs=tuple(range(n)), found=pairs)
     assert one.cnr(range(sites)) == pytest.approx(0.8 / 0.5, rel=0.02)  # 20 000 numbers: 0.5 %, and their mean 0.4 %
     assert one.cnr([0]) == pytest.approx(0.8 / 0.3, rel=0.25)
+    # less than 0.01 HU is rounding, of which no contrast is a multiple
+    fainter = tuple(msgspec.structs.replace(site, contrast_hu=0.019) for site in at)
+    assert tables.Series(**(told | {"sites": fainter}), pairs=tuple(range(n)), found=pairs).cnr(range(sites)) is None
 
 
 def test_lesions_change_only_the_rays_through_them(setup, small):
@@ -191,6 +194,37 @@ def test_the_command_measures_and_continues(small, tmp_path, capsys):
     assert run(tmp_path, small, *asked) == 0
     assert "20 of 20 pairs are recorded already" in capsys.readouterr().err
     assert run(tmp_path, small, *asked, "--table") == 0
+
+
+def rows_of(text: str, title: str) -> dict[tuple[str, ...], list[str]]:
+    """Return the rows of the table under a title by scene, lesions and method."""
+    lines = text.partition(f"## {title}\n")[2].partition("\n## ")[0].splitlines()
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if line.startswith("| small-hip")]
+    return {tuple(row[:3]): row[3:] for row in cells}
+
+
+def test_controls_stand_in_the_default_table():
+    assert [name for name in DEFAULT if TABLE[name][1] in CONTROLS] == ["zero", "hull", "twin-fdk"]
+
+
+def test_controls_see_no_lesion_and_corrected_rows_are_rows_of_their_own(small, tmp_path):
+    corrected = ("--method", "nmar", "--set", "nmar.panel=found", "--set", "nmar.scatter=found")
+    named = ("fdk", "zero", "hull", "nmar")
+    assert run(tmp_path, small, "--repeats", "10", *corrected) == 0  # before the plain row, which it follows in tables
+    assert run(tmp_path, small, "--repeats", "10", *(part for name in named for part in ("--method", name))) == 0
+    text = (tmp_path / "detect.md").read_text()
+    rows = rows_of(text, "Detection of lesions")
+    label, tie = "nmar[panel=found, scatter=found]", "0.500 [0.500, 0.500]"
+    assert list(rows) == [("small-hip", group, name) for group in ("near", "far") for name in (*named, label)]
+    for group in ("near", "far"):
+        inputs, varying, _, known, _, recovered, cnr, _ = rows["small-hip", group, "zero"]
+        assert (inputs, known, recovered, cnr) == ("control", tie, "0.00", "–")
+        assert varying == (tie if group == "near" else "–")  # far from metal is one location alone
+        # one value holds no lesion; whether it is told of them is the noise's to say
+        inputs, *_, recovered, _, _ = rows["small-hip", group, "hull"]
+        assert inputs == "control" and abs(float(recovered)) < 0.1
+        assert rows["small-hip", group, label] != rows["small-hip", group, "nmar"]
+    assert "nan" not in text and "all pairs tie" in text and "a label says panel=found, scatter=found" in text
 
 
 def test_a_method_that_fails_is_a_finding(small, tmp_path, capsys, monkeypatch):

@@ -54,6 +54,11 @@ def _of(study: str, title: str, explained: str, *sources: str, words: str = "res
     return Page(title=title, command=command, sources=sources, file=f"{study}.md", explained=explained)
 
 
+CORRECTED = " ".join(
+    [f"--method {name}" for name in ("fdk", "limar", "nmar")]
+    + [f"--set {name}.{light}=found" for name in ("fdk", "limar", "nmar") for light in ("panel", "scatter")]
+)
+"""Methods that get of scatter, lag and glare what `splat` takes off by itself."""
 STUDIES, SUITES = "benchmarks/studies/", "benchmarks/suites/"
 PAGES: dict[str, Page] = {
     "results": Page(
@@ -99,7 +104,7 @@ PAGES: dict[str, Page] = {
     "detect": _of(
         "detect", "Detection of lesions near metal", "protocols.md",
         *METHODS, "benchmarks/scores/channels.py", "benchmarks/scores/observer.py", f"{STUDIES}detect/",
-        f"{SUITES}detect.toml",
+        f"{SUITES}detect.toml", words=f"results/; run-benchmark detect results/ {CORRECTED}",
     ),
     "skipping": _of(
         "skipping", "What is left out", "skipping.md",

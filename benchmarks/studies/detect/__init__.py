@@ -8,7 +8,7 @@ import tyro
 
 from ctsim.benchmarks.engine.study import Options
 
-DEFAULT = ("fdk", "limar", "nmar", "splat", "twin-fdk")
+DEFAULT = ("fdk", "zero", "hull", "twin-fdk", "limar", "nmar", "splat")
 PAIRS = 100
 
 
@@ -26,7 +26,7 @@ class Flags(Options):
     """Pairs of scans of each scene, one with and one without lesions; at least 10."""
     method: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
     """A method's name, such as fdk, or module:function of your own; may be given several times (default: fdk, limar,
-    nmar, splat, and the control twin-fdk, FDK of the scans without metal)."""
+    nmar, splat, and the controls zero, hull and twin-fdk)."""
     set: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="METHOD.PARAMETER=VALUE")] = ()
     """A method's parameter, one of those that `run-benchmark methods` lists; may be given several times."""
     suite: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None
