@@ -3,6 +3,7 @@
 import math
 
 import msgspec
+import numpy as np
 import pytest
 
 from ctsim.beam.spectrum import Filter, Tube
@@ -39,10 +40,16 @@ def test_a_row_says_what_was_found_and_how_it_fares(monkeypatch):
     scanner = msgspec.convert({**msgspec.to_builtins(scene.scanner), **small}, type(scene.scanner))
     text = beams.page([msgspec.structs.replace(scene, scanner=scanner)])
     assert asked == [("tube", 0.5, False), ("tube", None, False), ("known", None, True), ("tube", None, True)]
-    cells = [cell.strip() for cell in text.splitlines()[-1].split("|")[1:-1]]
+    lines = [line for line in text.splitlines() if line.startswith(f"| {scene.name} ")]
+    cells, controls = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines)
     assert len(cells) == len(beams.HEAD) and cells[:2] == [scene.name, "1.9"]
     numbers = [float(cell) for cell in cells[3:15]]
     assert all(math.isfinite(number) for number in numbers)
+    assert [title.split(":")[0] for title in beams.FARED[1::3]] == ["zero", "hull", "twin-fdk", "fdk"]
+    zero, hull, twin, fdk = np.array([float(cell) for cell in controls[1:]]).reshape(4, 3)
+    # one value is better than none, and FDK best where the metal never was, of which it then has nothing
+    assert zero[0] < hull[0] < twin[0] > fdk[0] and zero[1] > hull[1] > twin[1] < fdk[1]
+    assert zero[2] == 0 and hull[2] < 0.1 and twin[2] < 0.1 < fdk[2]
 
 
 def test_more_than_a_folder_is_refused():

@@ -3,8 +3,8 @@
     python -m ctsim.benchmarks.tools.beams docs/measured
 
 Each scene of the suite `beams` is simulated and reconstructed four times: behind the usual filtration, behind the one
-that is found, behind the one that is found by a fit that is told the detector, and with the true tube and detector. The
-page is written to the folder, or printed without one.
+that is found, behind the one that is found by a fit that is told the detector, and with the true tube and detector. FDK
+and the controls stand in a table of their own. The page is written to the folder, or printed without one.
 """
 
 import math
@@ -22,14 +22,18 @@ from ctsim import score_volume, simulate_scene
 from ctsim.beam.quadrature import full_rule
 from ctsim.beam.spectrum import spectrum
 from ctsim.benchmarks.cli import guarded
-from ctsim.benchmarks.engine.table import Table, simple
+from ctsim.benchmarks.engine.table import simple
+from ctsim.benchmarks.methods import find
+from ctsim.benchmarks.studies.methods.attempt import scan_for
+from ctsim.benchmarks.studies.methods.records import METAL
 from ctsim.benchmarks.tools.page import headed, of_suite, rows_of
+from ctsim.dataset.truth import ScanWithTruth
 from ctsim.materials import attenuation
 from ctsim.phantoms.scene import Scene
 from ctsim.reconstruct.splat.fast import Settings, reconstruct
 from ctsim.reconstruct.splat.filtration import TRIED, USUAL, from_scale, scale
 from ctsim.reconstruct.splat.response import make_response
-from ctsim.types import Scanner
+from ctsim.types import Scanner, Volume
 
 NAME = "beams.md"
 TITLE = "Beams that splats are not told"
@@ -49,6 +53,12 @@ HEAD = (
     *("found: PSNR3D", "HU", "core", "detector told: PSNR3D", "HU", "core"),
     *("known: PSNR3D", "HU", "core", "limit said"),
 )
+CONTROLS = ("zero", "hull", "twin-fdk", "fdk")
+CONTROL = (
+    "The same scores of zeros (zero), of one value within the object's shadows (hull), and of FDK by its defaults: of "
+    "the same scan without the metal (twin-fdk) and of the scan itself (fdk). None takes scatter off, as splats do."
+)
+FARED = ("scene", *(title for name in CONTROLS for title in (f"{name}: PSNR3D", "HU", "core")))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,26 +81,20 @@ def main(arguments: list[str]) -> int:
 
 
 def page(scenes: Sequence[Scene]) -> str:
-    """Return the page: how it was made, and a row for each scene."""
-    return headed(TITLE, __doc__, CAPTION, table(rows_of(scenes, row)).markdown())
-
-
-def table(rows: Sequence[Sequence[str]]) -> Table:
-    """Return the table of rows of cells."""
-    return simple(HEAD, [list(cells) for cells in rows], numbers=HEAD[1:-1])
+    """Return the page: how it was made, and a row for each scene, in the table of splats and in that of controls."""
+    rows = rows_of(scenes, row)
+    splats = simple(HEAD, [cells[: len(HEAD)] for cells in rows], numbers=HEAD[1:-1])
+    controls = simple(FARED, [[cells[0], *cells[len(HEAD) :]] for cells in rows], numbers=FARED[1:])
+    text = f"{splats.markdown()}\n## Controls\n\n{CONTROL}\n\n{controls.markdown()}"
+    return headed(TITLE, __doc__, CAPTION, text)
 
 
 def row(scene: Scene) -> list[str]:
-    """Simulate a scene, reconstruct it four times, and return its cells."""
+    """Simulate a scene, reconstruct it by splats and as the controls do, and return the cells of both tables."""
     stored, scanner = simulate_scene(scene), scene.resolve()
 
     def fared(**settings: Any) -> Fared:
-        volume = reconstruct(stored.scan, Settings(**settings))
-        scores = score_volume(volume, stored, protocols=("tissue", "soft", "metal"))
-        told = [scores[protocol].values[metric] for protocol, metric in
-                (("tissue", "psnr3d"), ("soft", "rmse"), ("metal", "core_ratio"))]  # fmt: skip
-        psnr, rmse, core = (math.nan if value is None else float(value) for value in told)
-        return Fared(psnr=psnr, rmse=rmse, core=core, details=volume.details)
+        return scored(reconstruct(stored.scan, Settings(**settings)), stored)
 
     tables = {"tube": msgspec.to_builtins(scanner.tube), "detector": msgspec.to_builtins(scanner.detector)}
     usual, found, known = fared(filtration=USUAL), fared(), fared(response="known", **tables)
@@ -102,7 +106,23 @@ def row(scene: Scene) -> list[str]:
         f"{filtration['value']:.2g} ({filtration['low']:.2g} to {filtration['high']:.2g})",
         *(cell for one in (usual, found, told, known) for cell in one.cells()),
         found.details.get("limitation", ""),
+        *(cell for name in CONTROLS for cell in scored(by(name, stored), stored).cells()),
     ]
+
+
+def by(name: str, stored: ScanWithTruth) -> Volume:
+    """Reconstruct a scan, or for a control that is told it the twin, by a method's defaults."""
+    method = find(name)
+    return method.reconstruct(scan_for(method, stored, METAL))
+
+
+def scored(volume: Volume, stored: ScanWithTruth) -> Fared:
+    """Return how a volume fares."""
+    scores = score_volume(volume, stored, protocols=("tissue", "soft", "metal"))
+    told = [scores[protocol].values[metric] for protocol, metric in
+            (("tissue", "psnr3d"), ("soft", "rmse"), ("metal", "core_ratio"))]  # fmt: skip
+    psnr, rmse, core = (math.nan if value is None else float(value) for value in told)
+    return Fared(psnr=psnr, rmse=rmse, core=core, details=volume.details)
 
 
 def equivalent(scanner: Scanner) -> float:

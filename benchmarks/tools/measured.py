@@ -79,7 +79,7 @@ PAGES: dict[str, Page] = {
     "beams": Page(
         title="Beams that splats are not told",
         command="python -m ctsim.benchmarks.tools.beams docs/measured",
-        sources=(*SIMULATOR, "reconstruct/splat/", "benchmarks/scores/", f"{SUITES}beams.toml"),
+        sources=(*METHODS, "benchmarks/scores/", f"{SUITES}beams.toml"),
         explained="splats.md",
     ),
     "scatter": Page(

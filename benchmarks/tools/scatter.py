@@ -4,18 +4,21 @@
 
 Each scene of the suite `scatter` is simulated with its scatter stored, and reconstructed by splats, FDK, LIMAR and NMAR
 four times: with scatter left in the readings, less one constant, less what is found, and less the true scatter. Lag and
-glare of the panel are found and taken off for all of them. The page is written to the folder, or printed without one.
+glare of the panel are found and taken off for all of them. Controls stand in a table of their own. The page is written
+to the folder, or printed without one.
 """
 
 import dataclasses
 import sys
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ctsim import score_volume, simulate_scene
+from ctsim.baselines.control import hull, zero
 from ctsim.benchmarks.cli import guarded
 from ctsim.benchmarks.engine.table import simple
 from ctsim.benchmarks.methods import find
@@ -25,9 +28,9 @@ from ctsim.benchmarks.tools.page import headed, of_suite, rows_of
 from ctsim.dataset.truth import ScanWithTruth
 from ctsim.phantoms.scene import Scene
 from ctsim.reconstruct.panel import panel_of, without_panel
-from ctsim.reconstruct.primary import scatter_in, without_scatter
+from ctsim.reconstruct.primary import Readings, primary, scatter_in, without_scatter
 from ctsim.reconstruct.scatter import Scatter
-from ctsim.types import Scan
+from ctsim.types import Scan, Volume
 
 Image = NDArray[np.float32]
 NAME = "scatter.md"
@@ -48,9 +51,15 @@ FARED = (
     "By what is taken off the readings: nothing (0), the constant, what is found, and the true mean scatter. Noise "
     "stays. Splats model what is left of a reading; for the others at least a tenth of each reading is kept."
 )
+CONTROL = (
+    "PSNR3D of tissue (dB) of what is no method: zeros (zero), one value within the object's shadows (hull), and FDK "
+    "of the same scan without the metal (twin-fdk). As for the methods, lag and glare are taken off the readings of "
+    "hull and twin-fdk, and of scatter nothing (0) or what is found."
+)
 CORE = "Attenuation in the metal's core over the true one, for the methods that do not copy it from FDK."
 HEAD = ("scene", "true (1e-3)", "found (1e-3)", "constant (1e-3)", *(name for name, *_ in BANDS))
 PSNR = ("scene", *(f"{method}: {told}" for method in METHODS for told in TOLD))
+CONTROLS = ("scene", "zero", "hull: 0", "hull: found", "twin-fdk: 0", "twin-fdk: found")
 CORES = PSNR[: 1 + 2 * len(TOLD)]
 
 
@@ -66,6 +75,7 @@ def page(scenes: Sequence[Scene]) -> str:
     for head, above in (
         (HEAD, ""),
         (PSNR, f"## PSNR3D of tissue (dB)\n\n{FARED}\n\n"),
+        (CONTROLS, f"## Controls\n\n{CONTROL}\n\n"),
         (CORES, f"## Core\n\n{CORE}\n\n"),
     ):
         end = start + len(head) - 1
@@ -90,6 +100,7 @@ def row(scene: Scene) -> list[str]:
         *(f"{1e3 * mean:.2f}" for mean in (true.mean(), found.mean(), constant)),
         *(off(found, true, (primary > low) & (primary <= high)) for _, low, high in BANDS),
         *(psnr for psnr, _ in fared),
+        *controls(stored),
         *(core for _, core in fared[: len(CORES) - 1]),
     ]
 
@@ -101,7 +112,24 @@ def fares(stored: ScanWithTruth, name: str, told: str, constant: float, true: Im
     if told == TRUE:
         field = Scatter(floor=0, gain=1, source=true)
         scan = unfloored(scan, true) if name == "splat" else without_scatter(scan, field)
-    scores = score_volume(method.reconstruct(scan), stored, protocols=("tissue", "metal"))
+    return scored(method.reconstruct(scan), stored)
+
+
+def controls(stored: ScanWithTruth) -> list[str]:
+    """Return the cells of the controls."""
+    readings = [Readings(panel="found", scatter=scatter) for scatter in (0.0, FOUND)]
+    twins = [find("twin-fdk", msgspec.to_builtins(one)) for one in readings]
+    volumes = [
+        zero(stored.scan),
+        *(primary(lambda scan, _: hull(scan))(stored.scan, one) for one in readings),
+        *(twin.reconstruct(scan_for(twin, stored, METAL)) for twin in twins),
+    ]
+    return [scored(volume, stored)[0] for volume in volumes]
+
+
+def scored(volume: Volume, stored: ScanWithTruth) -> tuple[str, str]:
+    """Return PSNR3D and the core's ratio of a volume as a table shows them."""
+    scores = score_volume(volume, stored, protocols=("tissue", "metal"))
     psnr, core = scores["tissue"].values["psnr3d"], scores["metal"].values["core_ratio"]
     return f"{psnr:.2f}", "n/a" if core is None else f"{core:.2f}"
 
