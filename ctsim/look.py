@@ -4,13 +4,14 @@ A short survey (`ctsim.tracer.survey`) tells how thick the materials are that ar
 reach the tolerance, how long a view takes on this machine and how good the edges of the inserts are.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.beam.quadrature import EnergyRule, energy_rule, full_rule
-from ctsim.beam.spectrum import Spectrum, spectrum
+from ctsim.beam.spectrum import spectrum
 from ctsim.beam.spot import SubSources, magnification, sub_sources
 from ctsim.detector.response import response
 from ctsim.errors import InputError
@@ -47,35 +48,35 @@ class Looked:
     notes: tuple[str, ...]
 
 
-def look(phantom: Phantom, scanner: Scanner, simulation: Simulation, *, twin: bool) -> Looked:
-    """Find out what the rays of a scan, and of its metal-free twin if there is to be one, meet.
+def look(phantom: Phantom, scanners: Sequence[Scanner], simulation: Simulation, *, twin: bool) -> list[Looked]:
+    """Find out what the rays of scans, and of their metal-free twins if there are to be such, meet.
 
-    Raises InputError where there is nothing to see, or nothing that sees it.
+    The scanners differ in beam, dose and noise alone, not in `all_rays`; each scan is told to the last bit what it is
+    alone. Raises InputError where there is nothing to see, or nothing that sees it.
     """
     present = present_materials(phantom) if simulation.skip else phantom.materials
     if len(present) == 1 and not phantom.solids:
         raise InputError("the scene is empty: its labels are all air and it has no solids")
-    source, tracer = spectrum(scanner.tube), Tracer.of(phantom, geometry=all_rays(scanner))
-    found = survey(tracer, scanner.geometry)
-    a1, _ = response(scanner.detector, source.energies)
-    if not (source.weights * a1).any():
-        raise InputError("detector: no photon of the tube's spectrum is detected; check threshold, thickness and kvp")
-    mean_energy = float(np.average(source.energies, weights=source.weights * a1))
-    rule = _rule(phantom, scanner, simulation, source, found.lengths)
-    _check_bowtie(scanner, rule)
-    seen = Response.of(rule, tracer.materials)
-    tried = trial(tracer, scanner.geometry, seen, settings=simulation, twin=twin)
-    levels = density_levels(phantom)
-    return Looked(
-        materials=present,
-        tissues=tuple(levels[m][0] for m in present),
-        rule=rule,
-        l0=found.median_path(phantom.materials, mean_energy),
-        edge_error=tried.edge_error,
-        view_seconds=tried.seconds,
-        spot=_spot(tracer, scanner, simulation),
-        notes=metal_notes(phantom, scanner.geometry, seen, simulation.subrays),
-    )
+    geometry, levels = scanners[0].geometry, density_levels(phantom)
+    tracer = Tracer.of(phantom, geometry=all_rays(scanners[0]))
+    found = survey(tracer, geometry)
+    energies = [_mean_energy(scanner) for scanner in scanners]
+    rules = [_rule(phantom, scanner, simulation, found.lengths) for scanner in scanners]
+    seen = [Response.of(rule, tracer.materials) for rule in rules]
+    tried = trial(tracer, geometry, seen, settings=simulation, twin=twin)
+    return [
+        Looked(
+            materials=present,
+            tissues=tuple(levels[m][0] for m in present),
+            rule=rules[k],
+            l0=found.median_path(phantom.materials, energies[k]),
+            edge_error=tried[k].edge_error,
+            view_seconds=tried[k].seconds,
+            spot=_spot(tracer, scanner, simulation),
+            notes=metal_notes(phantom, geometry, seen[k], simulation.subrays),
+        )
+        for k, scanner in enumerate(scanners)
+    ]
 
 
 def all_rays(scanner: Scanner) -> Geometry | None:
@@ -84,12 +85,20 @@ def all_rays(scanner: Scanner) -> Geometry | None:
     return None if spread else scanner.geometry
 
 
-def _rule(
-    phantom: Phantom, scanner: Scanner, simulation: Simulation, source: Spectrum, lengths: NDArray[np.float32]
-) -> EnergyRule:
+def _mean_energy(scanner: Scanner) -> float:
+    """Return the mean energy (keV) of what is detected of the open beam."""
+    source = spectrum(scanner.tube)
+    a1, _ = response(scanner.detector, source.energies)
+    if not (source.weights * a1).any():
+        raise InputError("detector: no photon of the tube's spectrum is detected; check threshold, thickness and kvp")
+    return float(np.average(source.energies, weights=source.weights * a1))
+
+
+def _rule(phantom: Phantom, scanner: Scanner, simulation: Simulation, lengths: NDArray[np.float32]) -> EnergyRule:
     """Return the energies for the thickest rays of the survey, `lengths` [material, view, v, u]."""
+    source = spectrum(scanner.tube)
     if not simulation.skip:
-        return full_rule(source, scanner.detector)
+        return _checked(full_rule(source, scanner.detector), scanner)
     levels, along = density_levels(phantom), dict[str, NDArray[np.float64]]()
     for k, m in enumerate(phantom.materials):
         base, share = levels[m]
@@ -99,7 +108,8 @@ def _rule(
     if bowtie is not None:
         thickest[bowtie.material] = thickest.get(bowtie.material, 0.0) + max(bowtie.center, bowtie.edge)
     met = [m for m in thickest if m != "air"]
-    return energy_rule(source, scanner.detector, met, [thickest[m] for m in met], simulation.tolerance)
+    rule = energy_rule(source, scanner.detector, met, [thickest[m] for m in met], simulation.tolerance)
+    return _checked(rule, scanner)
 
 
 def _spot(tracer: Tracer, scanner: Scanner, simulation: Simulation) -> SubSources | None:
@@ -113,14 +123,15 @@ def _spot(tracer: Tracer, scanner: Scanner, simulation: Simulation) -> SubSource
     return sub_sources(tube.focal_spot, magnification(scanner.geometry, points), tolerance, tube.off_focal)
 
 
-def _check_bowtie(scanner: Scanner, rule: EnergyRule) -> None:
+def _checked(rule: EnergyRule, scanner: Scanner) -> EnergyRule:
+    """Return the energies, or raise InputError where the bow-tie lets nothing through."""
     bowtie = scanner.tube.bowtie
-    if bowtie is None:
-        return
-    # rays slant through it; nothing may vanish in float32, which ends at 1e-38
-    thickest = 2 * max(bowtie.center, bowtie.edge)
-    if np.exp(-attenuation(bowtie.material, rule.energies) * thickest) @ rule.w1 < 1e-30:
-        raise InputError(f"tube.bowtie: {thickest / 2} mm of {bowtie.material} let nothing through")
+    if bowtie is not None:
+        # rays slant through it; nothing may vanish in float32, which ends at 1e-38
+        thickest = 2 * max(bowtie.center, bowtie.edge)
+        if np.exp(-attenuation(bowtie.material, rule.energies) * thickest) @ rule.w1 < 1e-30:
+            raise InputError(f"tube.bowtie: {thickest / 2} mm of {bowtie.material} let nothing through")
+    return rule
 
 
 def present_materials(phantom: Phantom) -> tuple[str, ...]:

@@ -301,6 +301,12 @@ def photoelectric(which: str | Material, energies: ArrayLike) -> NDArray[np.floa
     return 0.1 * m.density * _mixture(m, "CS_Photo", _as_energies(energies))
 
 
+def incoherent(which: str | Material, energies: ArrayLike) -> NDArray[np.float64]:
+    """Return the incoherent part of the attenuation (1/mm) [n]."""
+    m = _as_material(which)
+    return 0.1 * m.density * _mixture(m, "CS_Compt", _as_energies(energies))
+
+
 def compton(which: str | Material, energies: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the incoherent part of the attenuation (1/mm) [n] and the mean share of E given to the electron [n]."""
     m, e = _as_material(which), _as_energies(energies)

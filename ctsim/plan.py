@@ -4,6 +4,7 @@ What the rays meet, hence how many energies reach the tolerance and how long a v
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import msgspec
@@ -141,20 +142,32 @@ class Plan(Looked):
         return "\n".join(f"  {key:7s} {value}" for key, value in told)
 
 
-def make_plan(
-    phantom: Phantom,
-    scanner: Scanner,
-    simulation: Simulation,
-    truth: Truth,
-    stream_id: str,
-    like: Looked | None = None,
-) -> Plan:
-    """Decide what simulating this scan takes; `stream_id` names its noise streams.
+def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth: Truth, stream_id: str) -> Plan:
+    """Decide what simulating this scan takes; `stream_id` names its noise streams."""
+    return make_plans(phantom, [scanner], simulation, truth, [stream_id])[0]
 
-    `like` is the plan of a scan that differs in dose, noise and name alone: what was found for it holds here, too.
+
+def make_plans(
+    phantom: Phantom, scanners: Sequence[Scanner], simulation: Simulation, truth: Truth, stream_ids: Sequence[str]
+) -> list[Plan]:
+    """Plan scans of a phantom, as `make_plan` does, that differ in beam, dose and noise alone.
+
+    What does not depend on the beam is found once for all of them, and what depends on nothing else once a beam.
     """
+    beams = list(dict.fromkeys((scanner.tube, scanner.detector) for scanner in scanners))
+    first = [next(s for s in scanners if (s.tube, s.detector) == beam) for beam in beams]
+    looked = dict(zip(beams, look(phantom, first, simulation, twin=_has_twin(phantom, truth)), strict=True))
+    return [
+        _plan(phantom, scanner, simulation, truth, stream_id, looked[scanner.tube, scanner.detector])
+        for scanner, stream_id in zip(scanners, stream_ids, strict=True)
+    ]
+
+
+def _plan(
+    phantom: Phantom, scanner: Scanner, simulation: Simulation, truth: Truth, stream_id: str, looked: Looked
+) -> Plan:
+    """Decide what a scan takes that was looked at."""
     twin = _has_twin(phantom, truth)
-    looked = like or look(phantom, scanner, simulation, twin=twin)
     present, tissues = looked.materials, looked.tissues
     outputs = _outputs(any(s.metal for s in phantom.solids), scanner, truth, len(set(tissues)))
     n_rays, n_voxels = int(np.prod(scanner.geometry.shape)), int(np.prod(scanner.geometry.n_voxel))

@@ -20,11 +20,12 @@ from ctsim.dataset.truth import ScanWithTruth
 from ctsim.dataset.writer import SceneWriter, Stack
 from ctsim.detector.response import response
 from ctsim.errors import InputError, check_kind
+from ctsim.look import all_rays
 from ctsim.notes import metal_share
 from ctsim.phantoms.scene import Scene, build, individual, parse_suite, scene_id, scene_to_toml, stream_id
 from ctsim.phantoms.variants import build_all
 from ctsim.phantoms.vary import Drawn
-from ctsim.plan import Plan, disk_estimate, make_plan
+from ctsim.plan import Plan, disk_estimate, make_plan, make_plans
 from ctsim.signals import Signals, share_rays
 from ctsim.simulate import Scattered, SharedTruth, part_of, scan_info, scatter_of, simulate_views, truth_volumes
 from ctsim.types import Phantom, Scanner
@@ -47,14 +48,6 @@ class _Job:
     plan: Plan
     writer: Writer = field(init=False)
 
-    @staticmethod
-    def of(scene: Scene, phantom: Phantom, before: "Sequence[_Job]" = ()) -> "_Job":
-        """Plan a scene; what was found for one `before` holds if they differ in dose and noise alone."""
-        scanner = scene.resolve()
-        same = (job.plan for job in before if job.phantom is phantom and _same_beam(job, scene, scanner))
-        like = next(same, None)
-        return _Job(scene=scene, phantom=phantom, scanner=scanner, plan=_plan(scene, phantom, scanner, like))
-
     @property
     def n_views(self) -> int:
         return self.scanner.geometry.n_views
@@ -69,18 +62,32 @@ class _Job:
 def plan_scene(scene: Scene) -> Plan:
     """Plan a scene's simulation. Raises InputError where memory is short."""
     with _memory(scene.name):
-        return _plan(scene, build(scene, whole=False), scene.resolve())
+        phantom = build(scene, whole=False)
+        return make_plan(phantom, scene.resolve(), scene.simulation, scene.truth, stream_id(scene))
 
 
-def _plan(scene: Scene, phantom: Phantom, scanner: Scanner, like: Plan | None = None) -> Plan:
-    return make_plan(phantom, scanner, scene.simulation, scene.truth, stream_id(scene), like)
+def _jobs(scenes: Sequence[Scene], phantoms: Sequence[Phantom]) -> list[_Job]:
+    """Plan scenes; those of one phantom that differ in beam, dose and noise alone are looked at together."""
+    scanners = [scene.resolve() for scene in scenes]
+    plans: dict[int, Plan] = {}
 
+    def asked(k: int) -> tuple[Any, ...]:
+        return scenes[k].simulation, scenes[k].truth, scanners[k].geometry, all_rays(scanners[k])
 
-def _same_beam(job: _Job, scene: Scene, scanner: Scanner) -> bool:
-    """Say whether a scene differs from another one of its body in dose and noise alone."""
-    parts = operator.attrgetter("geometry", "tube", "detector", "scatter")
-    settings = (job.scene.simulation, job.scene.truth) == (scene.simulation, scene.truth)
-    return settings and parts(job.scanner) == parts(scanner)
+    def together(k: int, other: int) -> bool:
+        return phantoms[k] is phantoms[other] and asked(k) == asked(other)
+
+    for k in range(len(scenes)):
+        if k not in plans:
+            group = [other for other in range(k, len(scenes)) if other not in plans and together(k, other)]
+            streams = [stream_id(scenes[other]) for other in group]
+            those = [scanners[other] for other in group]
+            made = make_plans(phantoms[k], those, scenes[k].simulation, scenes[k].truth, streams)
+            plans |= dict(zip(group, made, strict=True))
+    return [
+        _Job(scene=scene, phantom=phantom, scanner=scanners[k], plan=plans[k])
+        for k, (scene, phantom) in enumerate(zip(scenes, phantoms, strict=True))
+    ]
 
 
 def make_scene(
@@ -123,9 +130,7 @@ def make_scenes(
     """
     with contextlib.ExitStack() as stack:
         stack.enter_context(_memory(" to ".join(dict.fromkeys((scenes[0].name, scenes[-1].name)))))
-        jobs, writers = list[_Job](), []
-        for scene, phantom in zip(scenes, build_all(scenes), strict=True):
-            jobs.append(_Job.of(scene, phantom, jobs))
+        jobs, writers = _jobs(scenes, build_all(scenes)), []
         for job in jobs:
             for note in job.plan.notes:
                 tell(job.scene.name, note)
@@ -173,7 +178,7 @@ def simulate_scene(scene: Scene) -> SimulatedScan:
     """
     check_kind("scene", scene, Scene, "a Scene, such as of find_scene or new_scene")
     with _memory(scene.name):
-        job = _Job.of(scene, build(scene, whole=False))
+        (job,) = _jobs([scene], [build(scene, whole=False)])
         writer = MemoryWriter(scene.name, scene_id=scene_id(scene), stacks=_stacks(job.plan, job.scanner))
         job.writer = writer
         _simulate([job])

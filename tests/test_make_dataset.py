@@ -258,7 +258,7 @@ def test_a_wrong_name_among_thousands_is_answered_with_the_nearest_and_their_num
     [
         ("ctsim.phantoms.variants.build", []),
         ("ctsim.phantoms.dataset.build", ["--dry-run"]),
-        ("ctsim.phantoms.dataset.make_plan", []),
+        ("ctsim.phantoms.dataset.make_plans", []),
         ("ctsim.phantoms.dataset.simulate_views", []),
         ("ctsim.phantoms.dataset.truth_volumes", []),
     ],

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from ctsim import plan as plan_module
 from ctsim import simulate
 from ctsim.geometry import Geometry
 from ctsim.phantoms import dataset
@@ -17,9 +18,10 @@ from ctsim.phantoms.bodies.teeth import Teeth
 from ctsim.phantoms.bodies.volume import CtVolume
 from ctsim.phantoms.dataset import make_scene, make_scenes
 from ctsim.phantoms.recipes import BUILDERS
-from ctsim.phantoms.scene import Scene, build, parse_suite
+from ctsim.phantoms.scene import Scene, build, parse_suite, stream_id
 from ctsim.phantoms.variants import build_all, families
-from ctsim.settings import Truth
+from ctsim.plan import make_plan
+from ctsim.settings import Simulation, Truth
 from ctsim.signals import Part, same_rays, share_rays
 from ctsim.simulate import SharedTruth, part_of
 from ctsim.tracer.project import Tracer
@@ -69,6 +71,28 @@ def test_scenes_made_together_are_what_they_are_alone(tmp_path, more):
         make_scene(scene, tmp_path / "alone")
     assert digests(tmp_path / "together") == digests(tmp_path / "alone")
     assert len(digests(tmp_path / "alone")) > 60
+
+
+def test_scenes_looked_at_together_have_the_plans_that_they_have_alone(monkeypatch):
+    """With the worst error at edges, which is looked for in the same places whatever the beam."""
+    many = scenes(simulation=Simulation(subrays=4))
+    first = build_all(many)[0]
+    many = [msgspec.structs.replace(s, phantom=many[0].phantom) for s in many]
+    looked, whole = [], plan_module.look
+
+    def counted(phantom, scanners, *args, **kw):
+        looked.append(len(scanners))
+        return whole(phantom, scanners, *args, **kw)
+
+    monkeypatch.setattr(plan_module, "look", counted)
+    jobs = dataset._jobs(many, [first] * len(many))
+    beams = {s.scanner.tube.kvp for s in many}
+    assert looked == [len(beams)] and len(beams) > 1
+    for job in jobs:
+        alone = make_plan(first, job.scanner, job.scene.simulation, job.scene.truth, stream_id(job.scene))
+        assert job.plan.to_dict() | {"seconds": 0} == alone.to_dict() | {"seconds": 0}
+        assert job.plan.edge_error > 0
+    assert len({job.plan.edge_error for job in jobs}) == len(beams)
 
 
 def test_labels_are_shared_where_the_same_levels_are_put_together():

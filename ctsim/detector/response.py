@@ -17,7 +17,7 @@ from scipy.special import expn
 
 from ctsim.detector.panel import Blur, Lag, check_lag
 from ctsim.errors import InputError
-from ctsim.materials import E_MIN, attenuation, compton, k_shell, k_vacancies, photoelectric
+from ctsim.materials import E_MIN, attenuation, compton, incoherent, k_shell, k_vacancies, photoelectric
 
 _SLAB = {"gos": "GOS", "csi": "CsI", "ideal": "GOS", "counting": "CdTe@5.85"}
 _DEPTHS = 24  # Gauss–Legendre nodes over the depth of the first interaction, in its own probability
@@ -162,7 +162,7 @@ def outcomes(
 
 def _stopping(which: str, energies: NDArray[np.float64]) -> NDArray[np.float64]:
     """Attenuation (1/mm) [n] without coherent scatter."""
-    return photoelectric(which, energies) + compton(which, energies)[0]
+    return photoelectric(which, energies) + incoherent(which, energies)
 
 
 def _depths(mu: NDArray[np.float64], thickness: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -85,9 +85,10 @@ def signal(lengths, n, rule, j, tau, s1, s2):
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
-def signal_near(lengths, n, order, few, rule, j, same, tau, s1, s2):
-    """Sum as `signal` does, for n rays that differ in the materials order[:few] alone; order[few:] are the others.
+def signal_near(lengths, at, n, order, few, rule, j, same, tau, s1, s2):
+    """Sum as `signal` does, for n rays that differ in the materials order[at, :few] alone, not in order[at, few:].
 
+    Path lengths are lengths[at], of the whole array, since references of a slice would be counted in every call.
     Up to WIDTH − 1 rays more are read and summed, since rays that do not fill a vector are done one by one.
     """
     mu, w1, w2, nodes = rule
@@ -97,21 +98,21 @@ def signal_near(lengths, n, order, few, rule, j, same, tau, s1, s2):
         s2[i] = 0
     for k in range(nodes[j]):
         same[k] = 0
-    for c in range(few, order.size):
+    for c in range(few, order.shape[1]):
         for k in range(nodes[j]):
-            same[k] += mu[j, order[c], k] * lengths[order[c], 0]
+            same[k] += mu[j, order[at, c], k] * lengths[at, order[at, c], 0]
     # the last two materials are added where their sum is used
-    a, b = order[max(few - 1, 0)], order[max(few - 2, 0)]
+    a, b = order[at, max(few - 1, 0)], order[at, max(few - 2, 0)]
     for k in range(nodes[j]):
         for i in range(whole):
             tau[i] = same[k]
         for c in range(few - 2):
-            m = order[c]
+            m = order[at, c]
             mu_mk = mu[j, m, k]
             for i in range(whole):
-                tau[i] += mu_mk * lengths[m, i]
+                tau[i] += mu_mk * lengths[at, m, i]
         mu_a, mu_b = mu[j, a, k] * np.float32(few > 0), mu[j, b, k] * np.float32(few > 1)
         for i in range(whole):
-            e = exp_minus(tau[i] + mu_a * lengths[a, i] + mu_b * lengths[b, i])
+            e = exp_minus(tau[i] + mu_a * lengths[at, a, i] + mu_b * lengths[at, b, i])
             s1[i] += w1[j, k] * e
             s2[i] += w2[j, k] * e

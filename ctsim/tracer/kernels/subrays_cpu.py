@@ -78,18 +78,19 @@ def _sums(s1, s2, count, sums):
 
 
 @njit(cache=True, error_model="numpy")
-def _uncertainty(sums, count, seen, bounds):
+def _uncertainty(sums, count, seen, k, bounds, j, u):
     """Estimate the relative error of the mean of `count` sub-rays, of `sums` as `_sums` fills them.
 
-    `seen` is the solids' (least, largest) thickness along them and `bounds` that at the pixel's corners and centre:
-    where the bounds lie beyond, there is something brighter or darker that no sub-ray met. Half the difference of the
-    means of even and odd sub-rays can be small by chance; a share of the signal's range / count cannot.
+    seen[k, j] is the solids' (least, largest) thickness along them and bounds[:, j, u] that at the pixel's corners and
+    centre: where the bounds lie beyond, there is something brighter or darker that no sub-ray met. Half the difference
+    of the means of even and odd sub-rays can be small by chance; a share of the signal's range / count cannot.
     """
     darkest, brightest, even, odd = sums[0], sums[1], sums[2], sums[3]
-    if bounds[0] < seen[0]:  # nothing is brighter than the open field
-        brightest = min(brightest * np.exp(min(seen[0] - bounds[0], 80.0)), max(1.0, brightest))
-    if bounds[1] > seen[1]:
-        darkest *= np.exp(seen[1] - bounds[1])
+    least, largest, low, high = seen[k, j, 0], seen[k, j, 1], bounds[0, j, u], bounds[1, j, u]
+    if low < least:  # nothing is brighter than the open field
+        brightest = min(brightest * np.exp(min(least - low, 80.0)), max(1.0, brightest))
+    if high > largest:
+        darkest *= np.exp(largest - high)
     halves = abs(even / (count - count // 2) - odd / (count // 2)) / 2
     return max(halves, RANGE_SHARE * (brightest - darkest) / count) * count / (even + odd)
 
@@ -305,9 +306,9 @@ def measure_edges(rays_at, volume, solids, pose, v, columns, background, rules, 
                     )
                     counts[k] = count
                     casts += 1
-                signal_near(lengths[k], count, orders[k], few[k], rules, j, same, tau, s1, s2)
+                signal_near(lengths, k, count, orders, few[k], rules, j, same, tau, s1, s2)
                 _sums(s1, s2, count, sums)
-                excess = _uncertainty(sums, count, seen[k, j], bounds[:, j, u]) / tolerance
+                excess = _uncertainty(sums, count, seen, k, bounds, j, u) / tolerance
                 if excess <= 1.0 or count == size:
                     break
                 # the estimate sharpens with the rays, so a step is fourfold at most
