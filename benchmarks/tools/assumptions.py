@@ -1,7 +1,7 @@
 """What each thing that a simulation shares with a method gave whom, as a table.
 
     make-dataset assumptions data/ --seeds 1 2 3
-    run-benchmark data/ results/ --method hull --method twin-fdk --method fdk --method limar --method nmar
+    run-benchmark data/ results/ --method zero --method hull --method twin-fdk --method fdk --method limar --method nmar
     run-benchmark data/ results/ --method bhc-poly --method ibhc --method sirt --method asd-pocs --method fista-tv
     run-benchmark data/ results/ --method fusion --method dicdnet-lite --method splat
     python -m ctsim.benchmarks.tools.assumptions results/ docs/measured
