@@ -51,8 +51,8 @@ class Looked:
 def look(phantom: Phantom, scanners: Sequence[Scanner], simulation: Simulation, *, twin: bool) -> list[Looked]:
     """Find out what the rays of scans, and of their metal-free twins if there are to be such, meet.
 
-    The scanners differ in beam, dose and noise alone, not in `all_rays`; each scan is told to the last bit what it is
-    alone. Raises InputError where there is nothing to see, or nothing that sees it.
+    The scanners have the same geometry and `all_rays`. What is found of each, but for its seconds, is to the last bit
+    what is found of it alone. Raises InputError where there is nothing to see, or nothing that sees it.
     """
     present = present_materials(phantom) if simulation.skip else phantom.materials
     if len(present) == 1 and not phantom.solids:

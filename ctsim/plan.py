@@ -13,9 +13,10 @@ import numpy as np
 
 from ctsim.beam.dose import Dose, dose_of
 from ctsim.beam.quadrature import EnergyRule
-from ctsim.beam.spectrum import Spectrum, spectrum
+from ctsim.beam.spectrum import Spectrum, Tube, spectrum
 from ctsim.beam.spot import SubSources
 from ctsim.detector.panel import response as lag_response
+from ctsim.detector.response import Detector
 from ctsim.geometry import Geometry
 from ctsim.human import human_bytes, human_time
 from ctsim.look import Looked, density_levels, look
@@ -150,13 +151,16 @@ def make_plan(phantom: Phantom, scanner: Scanner, simulation: Simulation, truth:
 def make_plans(
     phantom: Phantom, scanners: Sequence[Scanner], simulation: Simulation, truth: Truth, stream_ids: Sequence[str]
 ) -> list[Plan]:
-    """Plan scans of a phantom, as `make_plan` does, that differ in beam, dose and noise alone.
+    """Plan scans of a phantom, as `make_plan` does, whose simulation, truth, geometry and `all_rays` are the same.
 
-    What does not depend on the beam is found once for all of them, and what depends on nothing else once a beam.
+    Scans may differ in beam, scatter, dose and noise. What none of these changes is found once for all scans, the rest
+    once for each beam.
     """
-    beams = list(dict.fromkeys((scanner.tube, scanner.detector) for scanner in scanners))
-    first = [next(s for s in scanners if (s.tube, s.detector) == beam) for beam in beams]
-    looked = dict(zip(beams, look(phantom, first, simulation, twin=_has_twin(phantom, truth)), strict=True))
+    beams: dict[tuple[Tube, Detector], Scanner] = {}
+    for scanner in scanners:
+        beams.setdefault((scanner.tube, scanner.detector), scanner)
+    found = look(phantom, list(beams.values()), simulation, twin=_has_twin(phantom, truth))
+    looked = dict(zip(beams, found, strict=True))
     return [
         _plan(phantom, scanner, simulation, truth, stream_id, looked[scanner.tube, scanner.detector])
         for scanner, stream_id in zip(scanners, stream_ids, strict=True)

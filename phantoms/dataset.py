@@ -67,15 +67,13 @@ def plan_scene(scene: Scene) -> Plan:
 
 
 def _jobs(scenes: Sequence[Scene], phantoms: Sequence[Phantom]) -> list[_Job]:
-    """Plan scenes; those of one phantom that differ in beam, dose and noise alone are looked at together."""
+    """Plan scenes; those of one phantom that differ in beam, scatter, dose and noise alone are looked at together."""
     scanners = [scene.resolve() for scene in scenes]
+    asked = [(s.simulation, s.truth, r.geometry, all_rays(r)) for s, r in zip(scenes, scanners, strict=True)]
     plans: dict[int, Plan] = {}
 
-    def asked(k: int) -> tuple[Any, ...]:
-        return scenes[k].simulation, scenes[k].truth, scanners[k].geometry, all_rays(scanners[k])
-
     def together(k: int, other: int) -> bool:
-        return phantoms[k] is phantoms[other] and asked(k) == asked(other)
+        return phantoms[k] is phantoms[other] and asked[k] == asked[other]
 
     for k in range(len(scenes)):
         if k not in plans:

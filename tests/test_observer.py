@@ -17,6 +17,7 @@ from ctsim.benchmarks.scores.observer import (
 from ctsim.geometry import Geometry
 
 DRAWS = 100
+ANATOMY = 0.02002  # the one value of the body without metal
 
 
 def gaussian(rng, d, *, n=100, locations=1, spread=0.0):
@@ -115,6 +116,36 @@ def test_volumes_of_one_value_are_told_by_that_value_alone(relative):
         assert known_background(here, DRAWS).auc == pytest.approx(expected, abs=5e-3)  # float32 ties some pairs
         value, low, high = normal_theory(here.present[:, 0], here.absent[:, 0])
         assert low < ndtr(1 / np.sqrt(2)) < high and value == pytest.approx(expected, abs=0.05)
+
+
+@pytest.mark.parametrize("locations", [2, 3])
+def test_an_observer_of_other_locations_follows_no_rounding(locations):
+    """Less the anatomy, whose one value is another, rounding is still that of the volumes."""
+    (with_lesions, without), found = one_value(100, locations, 1e-4)
+    weights = np.random.default_rng(4).normal(size=(locations, N_CHANNELS))
+    exact = (v[:, None, None] * weights for v in (with_lesions, without))
+    present, absent = (x - ANATOMY * weights for x in exact)
+    expected = varying_background(Responses(present=present, absent=absent, pairs=found.pairs), DRAWS)
+    largest = max(np.abs(found.present).max(), np.abs(found.absent).max())
+    less = Responses(
+        present=found.present - ANATOMY * weights,
+        absent=found.absent - ANATOMY * weights,
+        pairs=found.pairs,
+        scale=float(largest),
+    )
+    got = varying_background(less, DRAWS)
+    assert (got.auc, got.low, got.high) == pytest.approx((expected.auc, expected.low, expected.high), abs=5e-3)
+
+
+def test_theory_is_certain_of_what_nothing_hides():
+    rng = np.random.default_rng(8)
+    noise = [rng.normal(size=(20, N_CHANNELS)) for _ in range(2)]
+    for kind in noise:
+        kind[:, -1] = 3.0
+    noise[0][:, -1] += 0.1
+    assert normal_theory(*noise) == (1.0, 1.0, 1.0)
+    # a difference of 1e5 deviations, where the noncentral F distribution has no value
+    assert normal_theory(1e5 + noise[0][:, :1], noise[1][:, :1]) == (1.0, 1.0, 1.0)
 
 
 def test_volumes_that_do_not_vary_tie_or_are_told_apart_for_certain():

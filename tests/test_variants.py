@@ -12,6 +12,9 @@ import pytest
 
 from ctsim import plan as plan_module
 from ctsim import simulate
+from ctsim.beam.spot import FocalSpot
+from ctsim.detector.noise import Noise
+from ctsim.detector.response import Detector
 from ctsim.geometry import Geometry
 from ctsim.phantoms import dataset
 from ctsim.phantoms.bodies.teeth import Teeth
@@ -21,6 +24,7 @@ from ctsim.phantoms.recipes import BUILDERS
 from ctsim.phantoms.scene import Scene, build, parse_suite, stream_id
 from ctsim.phantoms.variants import build_all, families
 from ctsim.plan import make_plan
+from ctsim.scatter import Scatter
 from ctsim.settings import Simulation, Truth
 from ctsim.signals import Part, same_rays, share_rays
 from ctsim.simulate import SharedTruth, part_of
@@ -93,6 +97,29 @@ def test_scenes_looked_at_together_have_the_plans_that_they_have_alone(monkeypat
         assert job.plan.to_dict() | {"seconds": 0} == alone.to_dict() | {"seconds": 0}
         assert job.plan.edge_error > 0
     assert len({job.plan.edge_error for job in jobs}) == len(beams)
+
+
+def test_only_scenes_that_may_be_looked_at_together_are(monkeypatch):
+    """Whatever scenes are made together, each has the plan that it has alone."""
+    one = scenes()[0]
+    changes: list[dict[str, object]] = [
+        {"simulation": Simulation(subrays=4)},
+        {"simulation": Simulation(skip=False)},
+        {"truth": Truth(twin=False)},
+    ]
+    beams: list[dict[str, object]] = [
+        {"n_views": 9},
+        {"tube": msgspec.structs.replace(one.scanner.tube, focal_spot=FocalSpot(size=(0.4, 0.4)))},
+        {"detector": Detector(kind="csi", thickness=0.3)},
+        {"scatter": Scatter(level=1, fraction=0.1)},
+        {"noise": Noise(model="none")},
+    ]
+    many = [one, *(msgspec.structs.replace(one, **change) for change in changes)]
+    many += [msgspec.structs.replace(one, scanner=msgspec.structs.replace(one.scanner, **beam)) for beam in beams]
+    jobs = dataset._jobs(many, [build(one)] * len(many))
+    alone = [dataset.plan_scene(scene) for scene in many]
+    assert [dataset.plan_hash(job.plan) for job in jobs] == [dataset.plan_hash(plan) for plan in alone]
+    assert len({dataset.plan_hash(plan) for plan in alone}) > 6
 
 
 def test_labels_are_shared_where_the_same_levels_are_put_together():

@@ -9,8 +9,9 @@ scores put in the right order, a tie counting one half (Mann–Whitney), within 
 - Background varying: one template for all locations, trained at the other ones, and scores of all locations compared
   with each other. What artefacts make differ from place to place hides the lesion, too.
 
-Volumes are float32. A direction in which responses vary by less than that rounding has the rounding's variance instead:
-where one value fills a volume, four of five directions hold nothing else, and a template must not follow them.
+Volumes are float32. A direction in which responses vary by less than that rounding has the rounding's variance instead,
+and counts only if the classes differ by more: where one value fills a volume, four of five directions hold nothing but
+rounding, and a template must not follow them.
 
 Intervals: scans are drawn again with replacement, with and without lesion apart and within folds, and the observer is
 trained anew. A scan brings all its locations along. The same draws serve all methods, so that differences are paired.
@@ -18,7 +19,7 @@ trained anew. A scan brings all its locations along. The same draws serve all me
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ LEAST = 2 * FOLDS  # scans of a class
 DRAWS = 500
 Z95 = float(ndtri(0.975))
 ROUNDING = 1e-7  # of the largest response: the least deviation in any direction, for volumes are float32
+CERTAIN = 1e4  # squared detectability: the AUC is 1 in float64, and the noncentral F distribution fails beyond 1e8
 _CHUNK = 2**22  # comparisons at once
 
 Array = NDArray[np.float64]
@@ -40,21 +42,28 @@ Array = NDArray[np.float64]
 class Responses:
     """Responses of the channels [scan, location, channel] in scans with and without the lesions.
 
-    Scan k of both belongs to fold `pairs[k]` mod FOLDS.
+    Scan k of both belongs to fold `pairs[k]` mod FOLDS. `scale` is the largest response to a volume, of which rounding
+    is a share; 0 where that is the largest of these, as it is unless something was taken off.
     """
 
     present: Array
     absent: Array
     pairs: NDArray[np.int64]
+    scale: float = 0.0
+
+    @property
+    def rounding(self) -> float:
+        """Return the variance that rounding alone has, in units of the responses squared."""
+        return _rounding(self.scale or _largest(self.present, self.absent))
 
     def at(self, locations: NDArray[np.int64]) -> "Responses":
         """Return the responses at some of the locations."""
-        return Responses(present=self.present[:, locations], absent=self.absent[:, locations], pairs=self.pairs)
+        return replace(self, present=self.present[:, locations], absent=self.absent[:, locations])
 
     def only(self, pairs: NDArray[np.int64]) -> "Responses":
         """Return the responses of some of the scans."""
         kept = np.isin(self.pairs, pairs)
-        return Responses(present=self.present[kept], absent=self.absent[kept], pairs=self.pairs[kept])
+        return replace(self, present=self.present[kept], absent=self.absent[kept], pairs=self.pairs[kept])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,13 +124,18 @@ def normal_theory(present: Array, absent: Array) -> tuple[float, float, float]:
     signal = present.mean(0) - absent.mean(0)
     pooled = (_scatter(present) + _scatter(absent)) / (n - 2)
     values, vectors = np.linalg.eigh(pooled)
-    varies = values > _least(present, absent)
-    if not varies.any():  # nothing hides a difference
-        return (1.0, 1.0, 1.0) if float(signal @ signal) > _least(present, absent) else (0.5, 0.5, 0.5)
+    rounding = _rounding(_largest(present, absent))
+    varies = values > rounding
+    if ((signal @ vectors[:, ~varies]) ** 2 > rounding).any():  # nothing hides that difference
+        return 1.0, 1.0, 1.0
+    if not varies.any():
+        return 0.5, 0.5, 0.5
     p = int(varies.sum())
     squared = float(((signal @ vectors[:, varies]) ** 2 / values[varies]).sum())
     best = max((n - p - 3) / (n - 2) * squared - p / share, 0.0)
     value = (n - p - 1) / (p * (n - 2)) * share * squared
+    if best > CERTAIN:
+        return 1.0, 1.0, 1.0
 
     def limit(level: float) -> float:
         def excess(squared_d: float) -> float:
@@ -146,9 +160,13 @@ def wilson(share: float, error: float, n: int) -> tuple[float, float]:
     return middle - half, middle + half
 
 
-def _least(*responses: Array) -> float:
-    """Return the variance that rounding alone has, in units of the responses squared."""
-    return (ROUNDING * max(float(np.abs(kind).max()) for kind in responses)) ** 2
+def _rounding(largest: float) -> float:
+    """Return the variance that rounding alone has where this is the largest response."""
+    return (ROUNDING * largest) ** 2
+
+
+def _largest(*responses: Array) -> float:
+    return max(float(np.abs(kind).max()) for kind in responses)
 
 
 def _auc_of(squared_d: float) -> float:
@@ -194,15 +212,16 @@ def _moments(x: Array, w: Array) -> tuple[Array, Array]:
     return mean, squared - mean[:, :, None] * mean[:, None, :]
 
 
-def _template(x1: Array, x0: Array, w1: Array, w0: Array, least: float) -> tuple[Array, Array]:
+def _template(x1: Array, x0: Array, w1: Array, w0: Array, rounding: float) -> tuple[Array, Array]:
     """Return Hotelling's template [draw, channel] and the score halfway between the classes [draw].
 
-    `least` is the least variance in any direction; where that is 0, all responses are 0, and the template is, too.
+    `rounding` is the least variance in any direction; where that is 0, all responses are 0, and the template is, too.
     """
     (m1, s1), (m0, s0) = _moments(x1, w1), _moments(x0, w0)
     values, vectors = np.linalg.eigh((s1 + s0) / 2)
     along = np.einsum("bcd,bc->bd", vectors, m1 - m0)
-    template = np.einsum("bcd,bd->bc", vectors, along / np.maximum(values, least or 1.0))
+    along[(values < rounding) & (along**2 < rounding)] = 0
+    template = np.einsum("bcd,bd->bc", vectors, along / np.maximum(values, rounding or 1.0))
     return template, ((m1 + m0) / 2 * template).sum(1)
 
 
@@ -229,10 +248,9 @@ def _cross_fitted(
         for p in tested:
             where = np.array(trained if trained is not None else [q for q in tested if q != p])
             x1, x0 = (kind[np.ix_(train, where)] for kind in (found.present, found.absent))
-            centre = (x1.mean((0, 1)) + x0.mean((0, 1))) / 2  # a score is the same, but its digits do not cancel
-            template, middle = _template(x1 - centre, x0 - centre, w1[:, train], w0[:, train], _least(x1, x0))
+            template, middle = _template(x1, x0, w1[:, train], w0[:, train], found.rounding)
             for kind, x in zip(scores, (found.present, found.absent), strict=True):
-                kind.append(template @ (x[test, p] - centre).T - middle[:, None])
+                kind.append(template @ x[test, p].T - middle[:, None])
         total += _compared(scores, np.tile(w1[:, test], len(tested)), np.tile(w0[:, test], len(tested)))
     return total / len(folds)
 

@@ -56,7 +56,7 @@ HEAD = (
 CONTROLS = ("zero", "hull", "twin-fdk", "fdk")
 CONTROL = (
     "The same scores of zeros (zero), of one value within the object's shadows (hull), and of FDK by its defaults: of "
-    "the same scan without the metal (twin-fdk) and of the scan itself (fdk). None takes scatter off, as splats do."
+    "the same scan without the metal (twin-fdk) and of the scan itself (fdk). Splats take scatter off, these do not."
 )
 FARED = ("scene", *(title for name in CONTROLS for title in (f"{name}: PSNR3D", "HU", "core")))
 

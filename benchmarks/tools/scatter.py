@@ -89,16 +89,16 @@ def row(scene: Scene) -> list[str]:
     """Simulate a scene, find its scatter, reconstruct it by all methods, and return the cells of all tables."""
     stored = simulate_scene(scene)
     scan = stored.scan
-    primary, both = (np.exp(-stored.array(name)) for name in ("scatter_free", "noise_free"))
-    true = both - primary
+    unscattered, both = (np.exp(-stored.array(name)) for name in ("scatter_free", "noise_free"))
+    true = both - unscattered
     found = image_of(scatter_in(without_panel(scan, panel_of(scan)), "found"), scan)
-    is_open = primary > BANDS[-1][1]
+    is_open = unscattered > BANDS[-1][1]
     constant = float(found[is_open].mean(dtype=np.float64)) if is_open.any() else 0.0
     fared = [fares(stored, name, told, constant, true) for name in METHODS for told in TOLD]
     return [
         scene.name,
         *(f"{1e3 * mean:.2f}" for mean in (true.mean(), found.mean(), constant)),
-        *(off(found, true, (primary > low) & (primary <= high)) for _, low, high in BANDS),
+        *(off(found, true, (unscattered > low) & (unscattered <= high)) for _, low, high in BANDS),
         *(psnr for psnr, _ in fared),
         *controls(stored),
         *(core for _, core in fared[: len(CORES) - 1]),

@@ -25,6 +25,10 @@ PROBE_KEV = 60.0  # at which windows are chosen, so that they are the same for a
 FINER_RAYS = 8  # of a finer pixel at first: with those that it gets where they do not suffice, P is right to 0.02
 
 
+Window = tuple[slice, slice]
+"""Rows and columns of a detector."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Survey:
     """Path lengths (mm) [material, view, v, u] of coarse views, of the whole phantom and of it without metal."""
@@ -62,9 +66,6 @@ class Trial:
 
     seconds: float
     edge_error: float
-
-
-Window = tuple[slice, slice]
 
 
 def trial(

@@ -56,11 +56,11 @@ class Detect(study.Study[Record[Pair], Flags]):
                 settings={"pair": pair, "params": method.params},
                 data=scene.digest,
                 code=f"{code}{method.code}",
-                place=(k, _rank(method), pair),
+                place=(k, _rank(method), j, pair),
             )
             for pair in range(given.repeats)
             for k, scene in enumerate(scenes)
-            for method in used
+            for j, method in enumerate(used)
         ]
 
     def runs(self, task: Task, given: Flags) -> int:

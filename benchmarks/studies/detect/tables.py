@@ -20,12 +20,12 @@ from ctsim.benchmarks.scores.observer import (
     normal_theory,
     varying_background,
 )
+from ctsim.benchmarks.scores.soft import LEAST_DEVIATION
 from ctsim.benchmarks.studies.detect import PAIRS
 from ctsim.benchmarks.studies.detect.records import Pair, Seen, Site
 from ctsim.benchmarks.studies.detect.suite import Group
 
 BASE = "fdk"
-LEAST_DEVIATION = 0.01  # HU: below it a deviation is rounding, as in the protocol `soft`, and a contrast over it none
 WORDS = {"near": "near", "far": "far from"}
 Observer = Callable[[Responses], Area]
 TEXT = (
@@ -66,8 +66,12 @@ class Series:
     def responses(self, group: Group | None, shape: str = "ball", *, less_anatomy: bool = False) -> Responses:
         """Return the responses at the locations of a group, in both classes less those to the anatomy if asked."""
         where = np.array(self.locations(group), int)
-        present, absent = (self._of(name, shape, less_anatomy=less_anatomy) for name in ("present", "absent"))
-        return Responses(present=present, absent=absent, pairs=np.array(self.pairs)).at(where)
+        present, absent = (self._of(name, shape) for name in ("present", "absent"))
+        largest = float(max(np.abs(present).max(), np.abs(absent).max()))
+        if less_anatomy:
+            anatomy = self._of("anatomy", shape)
+            present, absent = present - anatomy, absent - anatomy
+        return Responses(present=present, absent=absent, pairs=np.array(self.pairs), scale=largest).at(where)
 
     def locations(self, group: Group | None) -> list[int]:
         """Return the numbers of the locations of a group; None for all."""
@@ -90,11 +94,8 @@ class Series:
         in_hu = deviation * abs(self.sites[where[0]].contrast_hu)
         return self.recovered(where) / deviation if in_hu > LEAST_DEVIATION else None
 
-    def _of(self, name: str, shape: str, *, less_anatomy: bool) -> np.ndarray:
-        rows = [np.array(getattr(_seen(pair, name), shape)) for pair in self.found]
-        if less_anatomy:
-            rows = [row - getattr(_seen(pair, "anatomy"), shape) for row, pair in zip(rows, self.found, strict=True)]
-        return np.stack(rows)
+    def _of(self, name: str, shape: str) -> np.ndarray:
+        return np.stack([np.array(getattr(_seen(pair, name), shape)) for pair in self.found])
 
 
 def _seen(pair: Pair, name: str) -> Seen:
@@ -244,8 +245,8 @@ def _controls(listed: Sequence[Series]) -> Table:
     measure = _Measure(observer=known_background, group="none")
     rows = [[s.scene, s.method, _interval(measure.area(s))] for s in listed if s.locations("none")]
     caption = (
-        "The same observer where there is no lesion in any scan. It can only guess, unless lesions elsewhere reach "
-        "into its region, as they all do in hull: 95 of 100 intervals should hold 0.5. "
+        "The same observer where there is no lesion in any scan. It can only guess where no lesion elsewhere reaches "
+        "into its region: 95 of 100 intervals should hold 0.5. In hull every lesion reaches it. "
         f"{DRAWS} draws make an interval."
     )
     return simple(

@@ -88,7 +88,7 @@ def signal(lengths, n, rule, j, tau, s1, s2):
 def signal_near(lengths, at, n, order, few, rule, j, same, tau, s1, s2):
     """Sum as `signal` does, for n rays that differ in the materials order[at, :few] alone, not in order[at, few:].
 
-    Path lengths are lengths[at], of the whole array, since references of a slice would be counted in every call.
+    Path lengths are lengths[at]. Whole arrays are passed: references of a slice would be counted in every call.
     Up to WIDTH − 1 rays more are read and summed, since rays that do not fill a vector are done one by one.
     """
     mu, w1, w2, nodes = rule
