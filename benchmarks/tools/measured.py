@@ -104,7 +104,7 @@ PAGES: dict[str, Page] = {
     "detect": _of(
         "detect", "Detection of lesions near metal", "protocols.md",
         *METHODS, "benchmarks/scores/channels.py", "benchmarks/scores/observer.py", f"{STUDIES}detect/",
-        f"{SUITES}detect.toml", words=f"results/; run-benchmark detect results/ {CORRECTED}",
+        f"{SUITES}detect.toml", words=f"results/`, `run-benchmark detect results/ {CORRECTED}",
     ),
     "skipping": _of(
         "skipping", "What is left out", "skipping.md",
