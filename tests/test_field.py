@@ -96,6 +96,7 @@ def curve(chosen):
         nodes=torch.tensor([[1.1, 3.0], [1.0, 1.0], [0.9, 0.4]], **double),
         log_eta=torch.log(torch.tensor([0.2, 0.5, 0.3], **double)),
         ratios=(0.7, 1.0, 0.5),
+        water=0.02,
         tv=0.3,
         scatter=0.05,
         dark=np.random.default_rng(8).random(GEOMETRY.shape) < 0.2,

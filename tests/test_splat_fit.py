@@ -171,14 +171,19 @@ def test_the_curve_gives_materials_their_own_line_integrals(kvp):
     change = (curve.densities_of(u * np.float32(1.01)) - curve.densities_of(u))[1:].astype(np.float64)
     expected = (change * sums[1:]).sum(1) / (0.01 * u[1:])
     np.testing.assert_allclose(curve.transpose(u, sums)[1:], expected, rtol=1e-3, atol=1e-4)  # float32 over 1 %
-    for knot, density in zip(curve.knots[1:-1], curve.densities[1:-1], strict=True):
+    thin = (np.array([0.1, 0.4]) * curve.water).astype(np.float32)
+    np.testing.assert_allclose(curve.densities_of(thin), np.outer([0.1, 0.4], curve.of_water), rtol=1e-5)
+    seen = set()
+    for knot, density in zip(curve.knots[2:-1], curve.densities[2:-1], strict=True):
         material = min(MATERIALS, key=lambda m: abs(_hardened(response, m) - knot))
+        seen.add(material)
         mu = attenuation(material, response.energies_kev)
         lengths = np.linspace(0, 5.0 / mu.mean(), 20)
         exact = -np.log(np.exp(-np.outer(lengths, mu)) @ response.eta)
         la, lb = ((lengths * d).astype(np.float32) for d in density)
         # two functions of energy for one measured attenuation: the worst, iron, is out by 0.07 at P = 8
         np.testing.assert_allclose(evaluate(response, la, lb)[0], exact, atol=0.02 + 0.012 * exact.max())
+    assert seen == set(MATERIALS)
 
 
 def _hardened(response, material):

@@ -138,7 +138,6 @@ def _field_model(given: Given, settings: Field, readings: dict[str, Any]) -> Mod
 
 def curve_physics(given: Given, curve: MaterialCurve, response: Response, tv: float) -> Curve:
     """Put a response and a material curve into tensors."""
-    water = curve.water / given.unit  # the start is water, as that of splats
     return Curve(
         grid=given.grid,
         knots=torch.tensor(curve.knots, dtype=torch.float32),
@@ -147,10 +146,11 @@ def curve_physics(given: Given, curve: MaterialCurve, response: Response, tv: fl
         nodes=torch.tensor(np.stack([response.a, response.b], 1), dtype=torch.float32),
         log_eta=torch.log(torch.tensor(np.maximum(response.eta, 1e-30), dtype=torch.float32)),
         ratios=tuple(axis_ratios(given.grid.whole).tolist()),
+        water=curve.water,
         tv=tv,
         scatter=given.scatter,
         dark=given.data.weights < 0,
-        scales=(water,),
+        scales=(curve.water / given.unit,),  # the start is water, as that of splats
     )
 
 

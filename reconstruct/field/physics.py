@@ -141,7 +141,7 @@ class Curve:
 
     The output is u, hardened attenuation; (ρa, ρb) are piecewise linear in it between `knots` [knot]: `densities`
     [knot, 2] and `slopes` [knot − 1, 2]. S is `scatter` over the open field. The penalty is `tv` times the mean of
-    |∇u|/water over the voxels of the grid, ∇ in differences along y, x and z times `ratios`.
+    |∇u|/water over the voxels of the grid, ∇ in differences along y, x and z times `ratios`; `water` is in 1/mm.
     """
 
     grid: Grid
@@ -151,6 +151,7 @@ class Curve:
     nodes: torch.Tensor
     log_eta: torch.Tensor
     ratios: tuple[float, ...]
+    water: float
     tv: float
     scatter: float = 0.0
     dark: NDArray[np.bool_] | None = field(default=None)
@@ -199,7 +200,7 @@ class _Variation(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, u: torch.Tensor, curve: Curve) -> torch.Tensor:
-        water, grid = float(curve.knots[1]), curve.grid
+        water, grid = curve.water, curve.grid
         volume = grid.columns(u.detach() / water).numpy()
         ratios = np.array(curve.ratios, volume.dtype)
         field, sums = np.empty((3, *volume.shape), volume.dtype), np.empty(len(volume))

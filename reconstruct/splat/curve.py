@@ -1,8 +1,9 @@
 """One unknown a splat: its hardened attenuation, from which a curve through known materials gives both densities.
 
 Blind data cannot tell ρa from ρb at every point, but matter is not arbitrary: behind a given spectrum a material's
-attenuation u tells its atomic number well enough, from water through bone and aluminium to titanium and iron. Below
-water a material is thin water. The tables are those of xraylib (`ctsim.materials`); no mask and no scene enters.
+attenuation u tells its atomic number well enough, from fat and water through bone and aluminium to titanium and iron.
+Well below fat a material is thin water, as lung is. The tables are those of xraylib (`ctsim.materials`); no mask and no
+scene enters.
 """
 
 from dataclasses import dataclass
@@ -15,7 +16,8 @@ from ctsim.materials import attenuation
 from ctsim.reconstruct.splat.kernels import curve_cpu
 from ctsim.reconstruct.splat.response import Response, tangent
 
-MATERIALS = ("water", "cortical_bone", "Al", "Ti", "Fe")
+MATERIALS = ("adipose", "water", "cortical_bone", "Al", "Ti", "Fe")
+THIN = 0.7  # times fat, up to which a material is thin water
 DEEPEST = 8.0  # of P, to which a material's own hardening is fitted
 STRONGEST = 20.0  # times iron, where the curve ends: twice what gold and tungsten have behind 150 mm of water
 METAL = 6.0  # times water: above it a splat is metal to the fit's preconditioner (bone 5.3, aluminium 6.4 at 90 kVp)
@@ -28,39 +30,38 @@ Image = NDArray[np.float32]
 class MaterialCurve:
     """Piecewise linear from u (1/mm) to (ρa, ρb): `knots` [knot], `densities` [knot, 2] and `slopes` [knot − 1, 2].
 
-    u = ā·ρa + b̄·ρb with (ā, b̄) = `tangent`, what one more mm adds to P behind the read-out's water.
+    u = ā·ρa + b̄·ρb with (ā, b̄) = `tangent`, what one more mm adds to P behind the read-out's water. `of_water` is
+    (ρa, ρb) of water, 1/mm.
     """
 
     knots: NDArray[np.float64]
     densities: NDArray[np.float64]
     slopes: NDArray[np.float64]
     tangent: tuple[float, float]
+    of_water: tuple[float, float]
 
     @classmethod
     def of(cls, response: Response, length: float) -> "MaterialCurve":
         """Build the curve for a response, read out behind `length` mm of water."""
         known = {m: _densities(response, m) for m in MATERIALS}
-        slope = tangent(response, tuple(known["water"]), length)
-        found = sorted((float(np.dot(slope, d)), tuple(d)) for d in known.values())
-        last = found[-1]
-        points = [(0.0, (0.0, 0.0)), *found, (STRONGEST * last[0], tuple(STRONGEST * v for v in last[1]))]
-        knots, densities = np.array([p[0] for p in points]), np.array([p[1] for p in points])
+        water = known["water"]
+        slope = tangent(response, tuple(water), length)
+        thin = THIN * np.dot(slope, known["adipose"]) / np.dot(slope, water)
+        found = sorted([thin * water, *known.values()], key=lambda rho: float(np.dot(slope, rho)))
+        densities = np.stack([np.zeros(2), *found, STRONGEST * found[-1]])
+        knots = densities @ slope
         return cls(
             knots=knots,
             densities=densities,
             slopes=np.diff(densities, axis=0) / np.diff(knots)[:, None],
             tangent=slope,
+            of_water=tuple(water.tolist()),
         )
 
     @property
     def water(self) -> float:
         """Attenuation of water in the hardened beam, 1/mm."""
-        return float(self.knots[1])
-
-    @property
-    def of_water(self) -> tuple[float, float]:
-        """ρa and ρb of water, 1/mm."""
-        return float(self.densities[1, 0]), float(self.densities[1, 1])
+        return float(np.dot(self.tangent, self.of_water))
 
     def densities_of(self, u: Image, unit: float = 1.0, out: Image | None = None) -> Image:
         """Return (ρa, ρb) over `unit`, float32 [splat, 2], in `out` where that is given."""

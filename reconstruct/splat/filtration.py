@@ -89,9 +89,10 @@ class Filtration:
 def found(coarse: Callable[[float], Fit | None], fine: Callable[[float], Fit | None] | None = None) -> Filtration:
     """Search the filtration that a scan shows, by `coarse` fits and then, if there are any, `fine` ones around it.
 
-    Both return the fit at a filtration, None for nothing.
+    Both return the fit at a filtration, None for nothing. Coarse ones, which take little time, are made at all
+    filtrations tried: behind dark metal, which their few passes do not reach, the misfit has more than one valley.
     """
-    misfits = _searched(coarse, USUAL)
+    misfits = _searched(coarse, USUAL, everywhere=True)
     if fine is not None:
         finer = _searched(fine, min(misfits, key=lambda t: misfits[t]) if misfits else USUAL)
         misfits = finer if len(finer) > 1 or not misfits else misfits
@@ -100,8 +101,11 @@ def found(coarse: Callable[[float], Fit | None], fine: Callable[[float], Fit | N
     return _chosen(misfits)
 
 
-def _searched(fit_of: Callable[[float], Fit | None], start: float) -> dict[float, float]:
-    """Return the misfits by filtration from `start` on, both ways while plausible; empty where that has none."""
+def _searched(fit_of: Callable[[float], Fit | None], start: float, *, everywhere: bool = False) -> dict[float, float]:
+    """Return the misfits by filtration from `start` on, both ways while plausible or `everywhere`.
+
+    Empty where `start` has none.
+    """
     first = fit_of(start)
     if first is None or not math.isfinite(least := misfit(first, rays := rays_of(first))):
         return {}
@@ -116,7 +120,7 @@ def _searched(fit_of: Callable[[float], Fit | None], start: float) -> dict[float
     for way in (1, -1):
         k = TRIED.index(start)
         # a neighbour that is plausible, too, may yet lead to a better one
-        while 0 <= k + way < len(TRIED) and misfit_at(k) <= PLAUSIBLE * min(misfits.values()):
+        while 0 <= k + way < len(TRIED) and (everywhere or misfit_at(k) <= PLAUSIBLE * min(misfits.values())):
             k += way
             misfit_at(k)
     return {t: value for t, value in sorted(misfits.items()) if math.isfinite(value)}
