@@ -96,7 +96,7 @@ def curve(chosen):
         nodes=torch.tensor([[1.1, 3.0], [1.0, 1.0], [0.9, 0.4]], **double),
         log_eta=torch.log(torch.tensor([0.2, 0.5, 0.3], **double)),
         ratios=(0.7, 1.0, 0.5),
-        water=0.02,
+        water=0.03,
         tv=0.3,
         scatter=0.05,
         dark=np.random.default_rng(8).random(GEOMETRY.shape) < 0.2,
@@ -181,6 +181,7 @@ def test_field_has_the_response_and_the_curve_of_splat(chosen):
     given = Given(scan=None, data=data, grid=grid, unit=0.02, clamped=0, scatter=0.04)
     physics = methods.curve_physics(given, known, response, 0.01)
     u = np.geomspace(1e-4, 30 * known.knots[-2], len(grid)).astype(np.float32)
+    assert physics.water == known.water and physics.scales == (known.water / 0.02,)
     rho = physics.densities_of(torch.from_numpy(u))
     assert np.allclose(rho.numpy(), known.densities_of(u), rtol=1e-5)
     la, lb = (grid.project(rho[:, k].contiguous(), VIEWS).numpy() for k in range(2))
@@ -199,7 +200,7 @@ def test_total_variation_of_a_step_is_its_area(chosen):
         ones = np.ones((n_z, n_y, n_x))
         for k in range(2):
             ones[(slice(None),) * axis + (k,)] = 2
-        values = torch.from_numpy(0.02 * ones.transpose(1, 2, 0).reshape(-1, 1))
+        values = torch.from_numpy(0.03 * ones.transpose(1, 2, 0).reshape(-1, 1))
         layer = ones.size // ones.shape[axis]
         expected = 0.3 * layer * ratio / ones.size
         # the rounded root leaves a thousandth of water in each voxel

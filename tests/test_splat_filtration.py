@@ -89,10 +89,20 @@ def test_fine_fits_are_made_around_what_coarse_ones_find(monkeypatch):
     assert fine[0] == 8.0 and sorted(fine) == [2.0, 4.0, 8.0, 14.0]
 
 
-def test_the_deepest_of_two_valleys_is_found(monkeypatch):
+@pytest.mark.parametrize("higher", [1.3, 1.02])
+def test_fine_fits_are_made_in_the_deeper_of_two_valleys(monkeypatch, higher):
     """As between aluminium rods at 50 kV: half a millimetre lies in a valley of its own."""
-    got = found(Tried(monkeypatch, lambda t: min(1.3 * valley(0.5, 1.0)(t), valley(8.0, 1.0)(t))))
-    assert got.value == pytest.approx(8.0, rel=0.1)
+
+    def two(t):
+        return min(higher * valley(0.5, 1.0)(t), valley(8.0, 1.0)(t))
+
+    fine = []
+    got = found(Tried(monkeypatch, two), lambda t: fine.append(t) or t)
+    assert got.value == pytest.approx(8.0, rel=0.1) and min(fine) == 4.0
+    alone = found(Tried(monkeypatch, two), lambda t: None)
+    assert alone.value == pytest.approx(8.0, rel=0.1) and alone.low > 4 and not alone.sentence
+    near = Tried(monkeypatch, two)
+    assert found(near).value == pytest.approx(0.5, rel=0.1) and max(near.asked) == 1.0
 
 
 def test_fine_fits_that_show_nothing_leave_what_coarse_ones_found(monkeypatch):
@@ -155,13 +165,15 @@ def test_filtrations_are_tried_on_grids_coarser_than_the_fit(monkeypatch, sizes,
     gone = []
 
     class Course:
-        def __init__(self, levels):
+        def __init__(self, levels, settings):
             self.levels = levels
+            # passes over a grid that is alone are the sum
+            assert settings.passes == ((8, 4) if len(levels) > 1 else (0, 6))
 
         def go(self, proceed):
             gone.append([(level.geometry.n_voxel[0], level.geometry.n_views) for level in self.levels])
 
-    monkeypatch.setattr(fast, "_course", lambda levels, *rest, **more: Course(levels))
+    monkeypatch.setattr(fast, "_course", lambda levels, response, settings, **more: Course(levels, settings))
     got = fast.find_filtration(levels_in_name(sizes, views), types.SimpleNamespace(e_max=90.0), Settings())
     assert gone == (fitted or [])
     assert (got is None) == (fitted is None) and (got is None or got.value == USUAL)

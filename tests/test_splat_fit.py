@@ -173,6 +173,8 @@ def test_the_curve_gives_materials_their_own_line_integrals(kvp):
     np.testing.assert_allclose(curve.transpose(u, sums)[1:], expected, rtol=1e-3, atol=1e-4)  # float32 over 1 %
     thin = (np.array([0.1, 0.4]) * curve.water).astype(np.float32)
     np.testing.assert_allclose(curve.densities_of(thin), np.outer([0.1, 0.4], curve.of_water), rtol=1e-5)
+    fat = _hardened(response, "adipose")
+    assert curve.knots[1:3] == pytest.approx([0.7 * fat, fat], rel=0.02)
     seen = set()
     for knot, density in zip(curve.knots[2:-1], curve.densities[2:-1], strict=True):
         material = min(MATERIALS, key=lambda m: abs(_hardened(response, m) - knot))

@@ -17,7 +17,7 @@ from ctsim.reconstruct.splat.kernels import curve_cpu
 from ctsim.reconstruct.splat.response import Response, tangent
 
 MATERIALS = ("adipose", "water", "cortical_bone", "Al", "Ti", "Fe")
-THIN = 0.7  # times fat, up to which a material is thin water
+THIN = 0.7  # times the attenuation of fat, up to which a material is thin water
 DEEPEST = 8.0  # of P, to which a material's own hardening is fitted
 STRONGEST = 20.0  # times iron, where the curve ends: twice what gold and tungsten have behind 150 mm of water
 METAL = 6.0  # times water: above it a splat is metal to the fit's preconditioner (bone 5.3, aluminium 6.4 at 90 kVp)
@@ -30,6 +30,7 @@ Image = NDArray[np.float32]
 class MaterialCurve:
     """Piecewise linear from u (1/mm) to (ρa, ρb): `knots` [knot], `densities` [knot, 2] and `slopes` [knot − 1, 2].
 
+    Knots are nothing, thin water, the materials by their attenuation, and `STRONGEST` times the last of them.
     u = ā·ρa + b̄·ρb with (ā, b̄) = `tangent`, what one more mm adds to P behind the read-out's water. `of_water` is
     (ρa, ρb) of water, 1/mm.
     """

@@ -54,7 +54,9 @@ ROUND = 1.25
 """Greatest ratio of a voxel's sides on the finest grid, where pixels are as fine: a sum of round splats then varies by
 10 % from one to the next, by 4 % on cubes."""
 ENOUGH, VIEWED = 32, 4  # voxels along an axis, and views, on which the filtration is found
-TRIAL = (8, 4)  # passes of a trial: with 2 over coarser grids dark metal lacks so much that it draws valleys of its own
+TRIAL, LONE_TRIAL = (8, 4), (0, 6)
+"""Passes of a trial, and of one over a grid that is alone. With 2 over coarser grids, thick aluminium that few photons
+pass is still so faint that the misfit has valleys where there is no beam."""
 Image = NDArray[np.float32]
 
 
@@ -211,9 +213,10 @@ def find_filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtr
         return None
     if k + 1 == len(levels) and levels[k].error:  # the finest grid, of a flat or a small scan
         levels = [*levels[:k], by_photons(levels[k])]
-    brief = msgspec.structs.replace(settings, passes=TRIAL)
 
     def fits_on(few: list[Data]) -> Callable[[float], Fit | None]:
+        brief = msgspec.structs.replace(settings, passes=TRIAL if len(few) > 1 else LONE_TRIAL)
+
         def fit_of(value: float) -> Fit | None:
             course = _course(few, settings.make_response(scan.e_max, value), brief, trial=True)
             return course.go(lambda fit, whole, share: True)

@@ -89,13 +89,13 @@ class Filtration:
 def found(coarse: Callable[[float], Fit | None], fine: Callable[[float], Fit | None] | None = None) -> Filtration:
     """Search the filtration that a scan shows, by `coarse` fits and then, if there are any, `fine` ones around it.
 
-    Both return the fit at a filtration, None for nothing. Coarse ones, which take little time, are made at all
-    filtrations tried: behind dark metal, which their few passes do not reach, the misfit has more than one valley.
+    Both return the fit at a filtration, None for nothing. Before fine ones, beside which they take little time, coarse
+    ones are made at all filtrations: between thick pieces of metal their misfit may have more than one valley.
     """
-    misfits = _searched(coarse, USUAL, everywhere=True)
+    misfits = _searched(coarse, USUAL, everywhere=fine is not None)
     if fine is not None:
         finer = _searched(fine, min(misfits, key=lambda t: misfits[t]) if misfits else USUAL)
-        misfits = finer if len(finer) > 1 or not misfits else misfits
+        misfits = finer if len(finer) > 1 or not misfits else _valley(misfits)
     if not misfits:
         return Filtration(value=USUAL, low=TRIED[0], high=TRIED[-1], misfits={})
     return _chosen(misfits)
@@ -124,6 +124,17 @@ def _searched(fit_of: Callable[[float], Fit | None], start: float, *, everywhere
             k += way
             misfit_at(k)
     return {t: value for t, value in sorted(misfits.items()) if math.isfinite(value)}
+
+
+def _valley(misfits: dict[float, float]) -> dict[float, float]:
+    """Return those around the least that are plausible without a gap, and one more on either side."""
+    tried, least = sorted(misfits), min(misfits.values())
+    first = last = next(k for k, t in enumerate(tried) if misfits[t] == least)
+    while first > 0 and misfits[tried[first]] <= PLAUSIBLE * least:
+        first -= 1
+    while last + 1 < len(tried) and misfits[tried[last]] <= PLAUSIBLE * least:
+        last += 1
+    return {t: misfits[t] for t in tried[first : last + 1]}
 
 
 def _chosen(misfits: dict[float, float]) -> Filtration:

@@ -126,8 +126,9 @@ def by_photons(data: Data) -> Data:
 def thinned(data: Data) -> Data:
     """Return every second view where that leaves enough for the grid, else all.
 
-    Enough is π/2 of the voxels across (Kak and Slaney, Computerized Tomographic Imaging, 1988, chapter 5). Of fewer,
-    what streaks between views leave of p may be more than what a wrong beam does.
+    Enough is π/2 of the voxels across, what parallel views over half a turn need (Kak and Slaney, Computerized
+    Tomographic Imaging, 1988, chapter 5). With fewer, streaks between views may change the misfit by more than a wrong
+    beam does.
     """
     geometry = data.geometry
     views = np.arange(0, geometry.n_views, 2)
