@@ -296,8 +296,6 @@ class SharedTruth:
     covers: list[Cover] = field(default_factory=list)
     labels: dict[Any, NDArray[np.uint8]] = field(default_factory=dict)
     bodies: dict[Any, NDArray[np.float32]] = field(default_factory=dict)
-    references: dict[Any, NDArray[np.float32]] = field(default_factory=dict)
-    """Volumes at 50 keV of the last scan and its twin; those of another spectrum or dose are the same."""
     present: list[int] = field(default_factory=list)
     """Labels that occur in the body: attenuation of others, as of metal that only solids have, changes nothing."""
 
@@ -323,21 +321,10 @@ def truth_volumes(
     for (prefix, _), volume in zip(scans, _labels(plan, scans, geometry, covers, shared), strict=True):
         yield prefix + "labels", volume
     for name, mu in (("reference_effective", effective), ("reference_50kev", at_50)):
-        known = shared.references if shared is not None and mu is at_50 else None
-        volume = None
+        volume = _body(body, geometry, mu, shared)
         for (prefix, content), cover in zip(scans, covers, strict=True):
-            # variants have the same solids, made of the same entries of the list of materials
-            key = prefix, *mu.values()
-            reference = None if known is None else known.pop(key, None)
-            if reference is None:
-                volume = _body(body, geometry, mu, shared) if volume is None else volume
-                last = content is scans[-1][1] and shared is None
-                reference = painted(volume if last else volume.copy(), content, mu, cover)
-            if known is not None:
-                known[key] = reference
-                for old in list(known)[: -len(scans)]:
-                    del known[old]
-            yield prefix + name, reference
+            last = content is scans[-1][1] and shared is None
+            yield prefix + name, painted(volume if last else volume.copy(), content, mu, cover)
 
 
 def _labels(

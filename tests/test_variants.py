@@ -152,13 +152,12 @@ def test_doses_and_metals_share_what_is_drawn_of_the_truth(tmp_path, monkeypatch
     for scene in many:
         make_scene(scene, tmp_path / "alone")
     asked = []
-    for name in ("cover_of", "body_attenuation", "body_labels", "painted"):
+    for name in ("cover_of", "body_attenuation", "body_labels"):
         whole = getattr(simulate, name)
         monkeypatch.setattr(simulate, name, lambda *of, name=name, whole=whole: asked.append(name) or whole(*of))
     make_scenes(many, tmp_path / "together")
     assert digests(tmp_path / "together") == digests(tmp_path / "alone")
-    painted = 2 * len(many) + 2 * (len(many) if len(metals) > 1 else 1)  # with twins; at 50 keV until metal changes
-    assert sorted(asked) == ["body_attenuation"] * 2 + ["body_labels"] + ["cover_of"] * 2 + ["painted"] * painted
+    assert sorted(asked) == ["body_attenuation"] * 2 + ["body_labels"] + ["cover_of"] * 2
 
 
 def test_rays_of_variants_are_traced_once(tmp_path, monkeypatch):
