@@ -89,8 +89,8 @@ class Filtration:
 def found(coarse: Callable[[float], Fit | None], fine: Callable[[float], Fit | None] | None = None) -> Filtration:
     """Search the filtration that a scan shows, by `coarse` fits and then, if there are any, `fine` ones around it.
 
-    Both return the fit at a filtration, None for nothing. Before fine ones, beside which they take little time, coarse
-    ones are made at all filtrations: between thick pieces of metal their misfit may have more than one valley.
+    Both return the fit at a filtration, None for nothing. Coarse fits take little time next to fine ones: where these
+    follow, they are made at all filtrations, since between thick metal their misfit may have more than one valley.
     """
     misfits = _searched(coarse, USUAL, everywhere=fine is not None)
     if fine is not None:
