@@ -18,6 +18,7 @@ FIRST_KEYS: dict[str, frozenset[str]] = {
         "MetalRods": _BODY,
         "Lung": f"{_BODY} vessels ribs",
         "Teeth": f"{_BODY} crowns missing",
+        "Jaw": f"{_BODY} crowns missing fillings gold_crowns bridges",
         "Broccoli": f"{_BODY} levels forks",
         "Walnut": _BODY,
         "Chicken": f"{_BODY} turns",

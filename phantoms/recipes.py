@@ -13,6 +13,7 @@ import numpy as np
 from ctsim.errors import InputError
 from ctsim.phantoms.bodies.broccoli import Broccoli, broccoli
 from ctsim.phantoms.bodies.hip import Hip, hip
+from ctsim.phantoms.bodies.jaw import Jaw, jaw
 from ctsim.phantoms.bodies.lung import Lung, lung
 from ctsim.phantoms.bodies.organic import BellPepper, Chicken, Walnut, bell_pepper, chicken, walnut
 from ctsim.phantoms.bodies.random import Random, random
@@ -26,7 +27,19 @@ from ctsim.phantoms.texture import textured
 from ctsim.types import Phantom
 
 AnyRecipe = (
-    Validation | MetalRods | Lung | Teeth | Broccoli | Walnut | Chicken | BellPepper | Random | CtVolume | Hip | Spine
+    Validation
+    | MetalRods
+    | Lung
+    | Teeth
+    | Jaw
+    | Broccoli
+    | Walnut
+    | Chicken
+    | BellPepper
+    | Random
+    | CtVolume
+    | Hip
+    | Spine
 )
 
 Builder = Callable[[LabelGrid, np.random.Generator, Any], Phantom]
@@ -36,6 +49,7 @@ BUILDERS: dict[type[Recipe], Builder] = {
     MetalRods: metal_rods,
     Lung: lung,
     Teeth: teeth,
+    Jaw: jaw,
     Broccoli: broccoli,
     Walnut: walnut,
     Chicken: chicken,

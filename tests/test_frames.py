@@ -16,6 +16,7 @@ from ctsim.benchmarks.make_dataset import main as make_dataset
 from ctsim.io.volumes import dicomwrite, metaimage, nifti
 from ctsim.io.volumes.placed import Placed
 from ctsim.phantoms.bodies.hip import Hip
+from ctsim.phantoms.bodies.jaw import Jaw
 from ctsim.phantoms.bodies.lung import Lung
 from ctsim.phantoms.bodies.spine import Spine
 from ctsim.phantoms.bodies.teeth import Teeth
@@ -87,6 +88,18 @@ LANDMARKS: dict[str, tuple[type[Recipe], Place, str, Place]] = {  # the first li
         lambda b: b.middle(b.of("enamel")),
     ),
     "teeth: nose": (Teeth, lambda b: b.middle(b.gas & (np.abs(b.z) > 0.5)), "head", lambda b: b.middle(b.of("enamel"))),
+    "jaw: great vessels": (
+        Jaw,
+        lambda b: b.middle(b.of("blood") & (np.abs(b.x) < 0.42) & (np.abs(b.z) < 0.1)),
+        "back",
+        lambda b: b.middle(b.of("enamel")),
+    ),
+    "jaw: tongue": (
+        Jaw,
+        lambda b: b.middle(b.of("muscle") & (np.abs(b.x) < 0.15) & (np.abs(b.y) < 0.2)),
+        "feet",
+        lambda b: b.middle(b.of("enamel")),
+    ),
     "hip: bladder": (Hip, lambda b: b.middle(b.of("urine")), "front", sacrum_and_pubis),
     "hip: left joint": (Hip, lambda b: b.insert("head-left"), "left", lambda b: b.insert("head-right")),
     "hip: stem": (Hip, lambda b: b.insert("tip-left"), "feet", lambda b: b.insert("cup-left")),

@@ -1,4 +1,4 @@
-"""Hips, spines and restored teeth: bone under the skin, metal in bone and in touch, several metals in one body."""
+"""Hips, spines and restored jaws: bone under the skin, metal in bone and in touch, several metals in one body."""
 
 from functools import cache
 
@@ -11,6 +11,7 @@ from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.materials import attenuation, material
 from ctsim.phantoms.bodies.hip import Hip
+from ctsim.phantoms.bodies.jaw import Jaw
 from ctsim.phantoms.bodies.spine import Spine
 from ctsim.phantoms.bodies.teeth import Teeth
 from ctsim.phantoms.recipes import build_recipe
@@ -117,9 +118,10 @@ def test_screws_run_through_pedicles_and_rods_through_their_heads(seed: int) -> 
 
 
 @SEEDED
-def test_restorations_sit_in_teeth_and_need_free_ones(seed: int) -> None:
-    plain = body(Teeth, seed)
-    full = body(Teeth, seed, fillings=4, gold_crowns=2, bridges=1)
+@pytest.mark.parametrize("kind", [Teeth, Jaw])
+def test_restorations_sit_in_teeth_and_need_free_ones(kind: type[Teeth], seed: int) -> None:
+    plain = body(kind, seed)
+    full = body(kind, seed, fillings=4, gold_crowns=2, bridges=1)
     assert np.array_equal(plain.labels, full.labels) and full.solids[: len(plain.solids)] == plain.solids
     more = full.solids[len(plain.solids) :]
     assert [s.material for s in more] == ["CoCr"] + ["Au"] * 2 + ["amalgam"] * 4
@@ -134,8 +136,30 @@ def test_restorations_sit_in_teeth_and_need_free_ones(seed: int) -> None:
     metal = cells(full, [s for s in full.solids if s not in others])
     assert not any((cells(full, [s]) & metal).sum() > 0.2 * cells(full, [s]).sum() for s in others)
     with pytest.raises(InputError, match="fillings: 12 are asked for"):
-        body(Teeth, seed, fillings=12, bridges=2, missing=10)
-    assert not any(s.metal for s in body(Teeth, seed, metal="none", fillings=4, bridges=2).solids)
+        body(kind, seed, fillings=12, bridges=2, missing=10)
+    assert not any(s.metal for s in body(kind, seed, metal="none", fillings=4, bridges=2).solids)
+
+
+@SEEDED
+def test_a_jaw_has_the_tissues_of_a_face(seed: int) -> None:
+    phantom = body(Jaw, seed)
+    filled = phantom.labels > 0
+    assert ndimage.label(filled)[1] == 1
+    # by share of what is not air: no tissue is a trace, none is nearly all
+    flesh = {name: part(phantom, name)[filled].mean() for name in ("soft_tissue", "adipose", "muscle", "blood")}
+    assert all(0.1 < flesh[name] < 0.4 for name in ("soft_tissue", "adipose", "muscle"))
+    assert 0.005 < flesh["blood"] < 0.05
+    # spongy bone, with marrow and struts in it, lies in bone, teeth, metal or soft parts of teeth, not in flesh or air
+    core = part(phantom, "spongiosa")
+    around = ndimage.binary_dilation(core) & ~core
+    inner = ndimage.binary_closing(core, iterations=2)
+    assert part(phantom, "muscle", "blood", "air")[around].mean() < 0.01
+    assert part(phantom, "adipose")[inner].mean() > 0.05 and part(phantom, "cortical_bone")[inner].mean() > 0.02
+    # bone lies deeper than the skin, which is 1.3 mm thick
+    outer = np.pad(np.stack([ndimage.binary_fill_holes(layer) for layer in filled]), 1)
+    deep = ndimage.distance_transform_edt(outer, phantom.d_voxel)[1:-1, 1:-1, 1:-1]
+    middle = slice(int(N * 0.18), int(N * 0.82))  # away from the planes in which face and neck are cut
+    assert deep[middle][part(phantom, *BONES)[middle]].min() > 1.3
 
 
 @SEEDED

@@ -3,7 +3,7 @@
 The arch is of natural size in the 60 mm cube. Front is +y, up is +z; the teeth meet at z = 0.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from ctsim.types import Phantom
 
 MATERIALS = ("air", "soft_tissue", "cortical_bone", "dentin", "enamel")
 AIR, SOFT, BONE, DENTIN, ENAMEL = range(5)
+SHRINK = 0.9  # of a relative unit to half the cube's edge
 CENTRE = -0.32  # y of the half ellipse's centre that the dental arch is
 
 
@@ -80,13 +81,25 @@ class Tooth(NamedTuple):
 def teeth(grid: LabelGrid, rng: np.random.Generator, params: Teeth) -> Phantom:
     """Draw the jaws; metal: implants under crowns of their own, crowns over whole teeth, and restorations."""
     body, metal = rng.spawn(2)
-    canvas = Canvas(grid, shrink=0.9)
+    canvas = Canvas(grid, shrink=SHRINK)
     _soft(canvas, body)
     spongy = Noise(body, 56)
+    solids = dentition(canvas, (body, metal), params, lambda jaw: _bone(canvas, jaw, spongy))
+    return assemble(canvas.whole, grid, MATERIALS, solids)
+
+
+def dentition(
+    canvas: Canvas, draws: Sequence[np.random.Generator], params: Teeth, bone: Callable[[int], None]
+) -> list[Solid]:
+    """Paint the teeth of both jaws, each into what `bone` draws of its jaw, −1 or 1; return the metal.
+
+    `draws` are the numbers for the body and for the metal. Labels are those of `MATERIALS`.
+    """
+    body, metal = draws
     rows = [_row(body, jaw) for jaw in (-1, 1)]
     present: list[dict[int, Tooth]] = []
     for jaw, row in zip((-1, 1), rows, strict=True):
-        _bone(canvas, jaw, spongy)
+        bone(jaw)
         gone = body.permutation(14)[: params.missing]
         implants, _ = _sites(params) if jaw < 0 else ([], [])
         present.append({t.slot: t for t in row if t.slot not in gone or (jaw < 0 and t.slot in SITES)})
@@ -95,7 +108,7 @@ def teeth(grid: LabelGrid, rng: np.random.Generator, params: Teeth) -> Phantom:
     solids = _metal(metal, params, canvas.unit, rows[0])
     if params.metal != "none":
         solids += _restorations(params, canvas.unit, present, rows[1])
-    return assemble(canvas.whole, grid, MATERIALS, solids)
+    return solids
 
 
 def _arch(t: Field | float) -> tuple[Field, Field]:
@@ -104,7 +117,7 @@ def _arch(t: Field | float) -> tuple[Field, Field]:
     return 0.56 * np.sin(angle) * (1 + 0.10 * np.abs(np.sin(angle)) ** 3), CENTRE + 0.98 * np.cos(angle)
 
 
-def _arch_gap(x: Field, y: Field) -> Field:
+def arch_gap(x: Field, y: Field) -> Field:
     """Distance to the arch's midline, signed: positive on the cheek side."""
     px, py = _arch(np.linspace(-1.12, 1.12, 240))
     shape = np.broadcast_shapes(x.shape, y.shape)
@@ -119,24 +132,32 @@ def _soft(canvas: Canvas, rng: np.random.Generator) -> None:
     wobble = Noise(rng, 4)
 
     def face(x: Field, y: Field, z: Field) -> Mask:
-        power = np.where(y > 0.04, np.float32(2.1), np.float32(2.6))  # the cheeks are broader than the lips
-        section = (np.abs(x / 0.95) ** 2.6 + np.abs((y - 0.04) / 0.93) ** power) ** np.float32(1 / 2.5)
-        return (section**8 + np.abs(z / 0.97) ** 8) ** np.float32(1 / 8) + 0.012 * wobble(x, y, z) < 0.98
+        return (section(x, y) ** 8 + np.abs(z / 0.97) ** 8) ** np.float32(1 / 8) + 0.012 * wobble(x, y, z) < 0.98
 
     canvas.fill(SOFT, face)
-    canvas.fill(AIR, lambda x, y, z: _mouth(x, y, z, wobble), ((-0.9, -0.7, -0.5), (0.9, 0.9, 0.5)))
-    canvas.fill(
-        SOFT,
-        lambda x, y, z: (
-            (x / 0.40) ** 2 + ((y + 0.06) / 0.52) ** 2 + ((z + 0.18 - 0.1 * wobble(x, y, z)) / 0.27) ** 2 <= 1
-        ),
-    )
-    canvas.ellipsoid(AIR, (0.0, -0.14, 0.82), (0.2, 0.5, 0.05))  # floor of the nose
+    canvas.fill(AIR, lambda x, y, z: mouth(x, y, z, wobble), MOUTH_BOX)
+    canvas.fill(SOFT, lambda x, y, z: tongue(x, y, z, wobble) <= 1)
+    canvas.ellipsoid(AIR, *NOSE)
 
 
-def _mouth(x: Field, y: Field, z: Field, wobble: Noise) -> Mask:
+MOUTH_BOX = ((-0.9, -0.7, -0.5), (0.9, 0.9, 0.5))
+NOSE = ((0.0, -0.14, 0.82), (0.2, 0.5, 0.05))  # the floor of its cavity: centre and radii
+
+
+def section(x: Field, y: Field) -> Field:
+    """Level of the face's section; 1 on its edge."""
+    power = np.where(y > 0.04, np.float32(2.1), np.float32(2.6))  # the cheeks are broader than the lips
+    return (np.abs(x / 0.95) ** 2.6 + np.abs((y - 0.04) / 0.93) ** power) ** np.float32(1 / 2.5)
+
+
+def tongue(x: Field, y: Field, z: Field, wobble: Noise) -> Field:
+    """Level of the tongue; 1 on its edge."""
+    return (x / 0.40) ** 2 + ((y + 0.06) / 0.52) ** 2 + ((z + 0.18 - 0.1 * wobble(x, y, z)) / 0.27) ** 2
+
+
+def mouth(x: Field, y: Field, z: Field, wobble: Noise) -> Mask:
     """Tell points of the open mouth: before the teeth, under the vaulted palate, back to the throat."""
-    gap = _arch_gap(x, y)
+    gap = arch_gap(x, y)
     before = np.clip(gap, 0, None) / 0.175
     vault = np.sin(np.pi / 2 * np.clip((-gap - 0.1) / 0.4, 0, 1))
     height = 0.28 + np.where(z > 0, np.float32(0.16), np.float32(0.06)) * vault
@@ -147,22 +168,28 @@ def _mouth(x: Field, y: Field, z: Field, wobble: Noise) -> Mask:
 
 def _bone(canvas: Canvas, jaw: int, spongy: Noise) -> None:
     """Alveolar bone under the gum: a compact shell round a spongy core."""
-
-    def level(x: Field, y: Field, z: Field) -> Field:
-        h = jaw * z  # height above the occlusal plane into this jaw
-        width = np.float32(0.165) + 0.03 * np.clip((h - 0.3) / 0.4, 0, 1)
-        across = _arch_gap(x, y) / width
-        return (np.abs(across) ** 4 + np.abs((h - 0.555) / 0.32) ** 4) ** np.float32(0.25)
-
-    box = ((-0.92, -0.92, -0.95 if jaw < 0 else 0.18), (0.92, 0.95, -0.18 if jaw < 0 else 0.95))
-    canvas.fill(SOFT, lambda x, y, z: level(x, y, z) <= 1.12, box, over=(AIR,))  # gum
-    canvas.fill(BONE, lambda x, y, z: level(x, y, z) <= 1, box)
+    box = ridge_box(jaw)
+    canvas.fill(SOFT, lambda x, y, z: ridge(x, y, z, jaw) <= 1.12, box, over=(AIR,))  # gum
+    canvas.fill(BONE, lambda x, y, z: ridge(x, y, z, jaw) <= 1, box)
     canvas.fill(
         SOFT,
-        lambda x, y, z: (level(x, y, z) <= 0.80) & (spongy(x, y, z) > -0.45),
+        lambda x, y, z: (ridge(x, y, z, jaw) <= 0.80) & (spongy(x, y, z) > -0.45),
         box,
         over=(BONE,),
     )
+
+
+def ridge(x: Field, y: Field, z: Field, jaw: int) -> Field:
+    """Level of the alveolar bone of the lower (−1) or upper (1) jaw; 1 on its edge."""
+    h = jaw * z  # height above the occlusal plane into this jaw
+    width = np.float32(0.165) + 0.03 * np.clip((h - 0.3) / 0.4, 0, 1)
+    across = arch_gap(x, y) / width
+    return (np.abs(across) ** 4 + np.abs((h - 0.555) / 0.32) ** 4) ** np.float32(0.25)
+
+
+def ridge_box(jaw: int) -> tuple[Vector, Vector]:
+    """Return the corners of a box about an alveolar bone and its gum."""
+    return (-0.92, -0.92, -0.95 if jaw < 0 else 0.18), (0.92, 0.95, -0.18 if jaw < 0 else 0.95)
 
 
 def _row(rng: np.random.Generator, jaw: int) -> list[Tooth]:

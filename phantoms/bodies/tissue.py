@@ -21,28 +21,30 @@ class Part(NamedTuple):
     radii: ArrayLike
 
 
-def bone(canvas: Canvas, parts: Sequence[Part], wall: float, core: int = SPONGY) -> None:
+def bone(canvas: Canvas, parts: Sequence[Part], wall: float, *, shell: int = BONE, core: int = SPONGY) -> None:
     """Paint one bone of several parts: compact `wall` thick, with a core where a part is thicker than twice that."""
     for part in parts:
-        canvas.tube(BONE, part.points, part.radii)
+        canvas.tube(shell, part.points, part.radii)
     for part in parts:
         inner = np.broadcast_to(np.asarray(part.radii, np.float64), (len(np.asarray(part.points)),)) - wall
         if inner.max() > 0.5 * wall:
-            canvas.tube(core, part.points, np.maximum(inner, 0.2 * wall), over=(BONE,))
+            canvas.tube(core, part.points, np.maximum(inner, 0.2 * wall), over=(shell,))
 
 
-def trabeculae(canvas: Canvas, rng: np.random.Generator) -> None:
-    """Put marrow and struts of compact bone into all spongy bone."""
+def trabeculae(
+    canvas: Canvas, rng: np.random.Generator, *, core: int = SPONGY, marrow: int = FAT, struts: int = BONE
+) -> None:
+    """Put marrow and struts of compact bone into all spongy bone, the label `core`."""
     coarse, fine = Noise(rng, 48), Noise(rng, 110)
 
-    def marrow(x: Field, y: Field, z: Field) -> Mask:
+    def between(x: Field, y: Field, z: Field) -> Mask:
         return (fine(x, y, z) + 0.5 * coarse(x, y, z)) > 1.15
 
-    def struts(x: Field, y: Field, z: Field) -> Mask:
+    def solid(x: Field, y: Field, z: Field) -> Mask:
         return (fine(x, y, z) - 0.5 * coarse(x, y, z)) < -1.65
 
-    canvas.fill(FAT, marrow, over=(SPONGY,))
-    canvas.fill(BONE, struts, over=(SPONGY,))
+    canvas.fill(marrow, between, over=(core,))
+    canvas.fill(struts, solid, over=(core,))
 
 
 def cut(canvas: Canvas, end: float) -> None:
