@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from ctsim.phantoms.bodies.jaw import Jaw
 from ctsim.phantoms.bodies.lung import Lung
 from ctsim.phantoms.bodies.random import Random
 from ctsim.phantoms.bodies.teeth import Teeth
@@ -44,6 +45,7 @@ ROWS = (
     # the chest is cut at neck and belly, the head above the nose's floor and below the chin
     Row(Lung, cover=1.0, cut={"z": 0.75}),
     Row(Teeth, cover=1.0, cut={"z": 0.75}),  # crowns (dentin, enamel) stand in the mouth's air: not among the bones
+    Row(Jaw, cover=1.0, cut={"z": 0.75}),
     Row(Random, cover=1.0, gas=True),  # its organs are strewn: one of gas may lie beside one of bone
 )
 NAMES = [str(row.kind.__struct_config__.tag) for row in ROWS]

@@ -96,7 +96,7 @@ LANDMARKS: dict[str, tuple[type[Recipe], Place, str, Place]] = {  # the first li
     ),
     "jaw: tongue": (
         Jaw,
-        lambda b: b.middle(b.of("muscle") & (np.abs(b.x) < 0.15) & (np.abs(b.y) < 0.2)),
+        lambda b: b.middle(b.of("muscle") & (np.abs(b.x) < 0.15) & (np.abs(b.y) < 0.2) & (np.abs(b.z) < 0.35)),
         "feet",
         lambda b: b.middle(b.of("enamel")),
     ),

@@ -140,26 +140,85 @@ def test_restorations_sit_in_teeth_and_need_free_ones(kind: type[Teeth], seed: i
     assert not any(s.metal for s in body(kind, seed, metal="none", fillings=4, bridges=2).solids)
 
 
+def shares(phantom: Phantom, where: NDArray[np.bool_]) -> dict[str, float]:
+    """What a region consists of, by material."""
+    counts = np.bincount(phantom.labels[where], minlength=len(phantom.materials))
+    return dict(zip(phantom.materials, counts / counts.sum(), strict=True))
+
+
 @SEEDED
 def test_a_jaw_has_the_tissues_of_a_face(seed: int) -> None:
     phantom = body(Jaw, seed)
     filled = phantom.labels > 0
-    assert ndimage.label(filled)[1] == 1
-    # by share of what is not air: no tissue is a trace, none is nearly all
-    flesh = {name: part(phantom, name)[filled].mean() for name in ("soft_tissue", "adipose", "muscle", "blood")}
-    assert all(0.1 < flesh[name] < 0.4 for name in ("soft_tissue", "adipose", "muscle"))
-    assert 0.005 < flesh["blood"] < 0.05
-    # spongy bone, with marrow and struts in it, lies in bone, teeth, metal or soft parts of teeth, not in flesh or air
+    whole = shares(phantom, filled)
+    # no tissue is a trace, none is nearly all
+    assert all(0.1 < whole[name] < 0.4 for name in ("soft_tissue", "adipose", "muscle"))
+    assert 0.005 < whole["blood"] < 0.05
+    side = np.arange(N) < N / 2
+    assert all(0.3 < part(phantom, "blood")[:, :, half].mean() / part(phantom, "blood").mean() / 2 < 0.7
+               for half in (side, ~side))  # fmt: skip
+    # under the surface: skin 1.2 to 1.5 mm thick, then mostly fat, then mostly muscle
+    outer = np.stack([np.pad(ndimage.binary_fill_holes(layer), 1) for layer in filled])
+    deep = np.stack([ndimage.distance_transform_edt(layer, phantom.d_voxel[1:])[1:-1, 1:-1] for layer in outer])
+    deep[: int(N * 0.2)] = deep[-int(N * 0.2) :] = 0  # above and below, bone comes near to the planes of the cut
+    assert shares(phantom, (deep > 0) & (deep < 0.8))["soft_tissue"] > 0.95
+    assert shares(phantom, (deep > 1.7) & (deep < 2.5))["adipose"] > 0.5
+    assert shares(phantom, (deep > 4.5) & (deep < 6))["muscle"] > 0.3
+    assert deep[part(phantom, *BONES) & (deep > 0)].min() > 1.2
+
+
+@SEEDED
+def test_a_jaw_has_bones_with_marrow_and_roots_in_ligaments(seed: int) -> None:
+    phantom = body(Jaw, seed)
     core = part(phantom, "spongiosa")
-    around = ndimage.binary_dilation(core) & ~core
-    inner = ndimage.binary_closing(core, iterations=2)
-    assert part(phantom, "muscle", "blood", "air")[around].mean() < 0.01
-    assert part(phantom, "adipose")[inner].mean() > 0.05 and part(phantom, "cortical_bone")[inner].mean() > 0.02
-    # bone lies deeper than the skin, which is 1.3 mm thick
-    outer = np.pad(np.stack([ndimage.binary_fill_holes(layer) for layer in filled]), 1)
-    deep = ndimage.distance_transform_edt(outer, phantom.d_voxel)[1:-1, 1:-1, 1:-1]
-    middle = slice(int(N * 0.18), int(N * 0.82))  # away from the planes in which face and neck are cut
-    assert deep[middle][part(phantom, *BONES)[middle]].min() > 1.3
+    around = shares(phantom, ndimage.binary_dilation(core) & ~core)
+    assert around["muscle"] + around["blood"] + around["air"] < 0.01
+    inner = shares(phantom, ndimage.binary_closing(core, iterations=2))
+    assert inner["adipose"] > 1.3 * inner["cortical_bone"] > 0.05  # marrow, and fewer struts
+    compact = part(phantom, "cortical_bone")
+    lower, upper = slice(int(N * 0.1), int(N * 0.4)), slice(int(N * 0.6), int(N * 0.9))
+    assert all(compact[half].mean() > 0.04 and core[half].mean() > 0.04 for half in (lower, upper))
+    # the branch behind the teeth, on both sides, and the palate between the arches
+    back = (slice(int(N * 0.45), int(N * 0.55)), slice(int(N * 0.2), int(N * 0.26)))
+    assert all(compact[(*back, half)].any() for half in (slice(None, N // 2), slice(N // 2, None)))
+    assert compact[upper, int(N * 0.45) : int(N * 0.55), int(N * 0.47) : int(N * 0.53)].mean() > 0.05
+    fine = build_recipe(Jaw(n_voxel=(192, 192, 192)), seed)  # a ligament is 0.4 mm thick
+    roots = part(fine, "dentin")
+    roots[int(192 * 0.42) : int(192 * 0.58)] = False  # crowns
+    shell = ndimage.binary_dilation(roots) & ~part(fine, "dentin", "enamel")
+    assert shares(fine, shell)["soft_tissue"] > 0.7
+
+
+@SEEDED
+def test_the_mouth_is_open_to_the_throat_and_lined(seed: int) -> None:
+    phantom = body(Jaw, seed)
+    gas, _ = ndimage.label(phantom.labels == 0)
+    sizes = np.bincount(gas.ravel())
+    sizes[[0, gas[0, 0, 0]]] = 0
+    largest = gas == np.argmax(sizes)
+    assert largest.sum() * np.prod(phantom.d_voxel) > 5000  # mm3: the mouth
+    assert largest[:, : int(N * 0.24)].any() and largest[:, int(N * 0.7) :].any()  # the throat, and before the teeth
+    inner = (gas > 0) & (gas != gas[0, 0, 0])
+    bare = shares(phantom, ndimage.binary_dilation(inner) & ~inner)
+    assert bare["soft_tissue"] + bare["enamel"] + bare["dentin"] > 0.97
+    assert bare["cortical_bone"] + bare["spongiosa"] + bare["blood"] < 0.001
+    tongue = np.zeros_like(inner)
+    middle = slice(int(N * 0.45), int(N * 0.55))
+    tongue[int(N * 0.38) : int(N * 0.5), int(N * 0.35) : int(N * 0.55), middle] = True
+    made_of = shares(phantom, tongue & (phantom.labels > 0))
+    assert made_of["muscle"] > 0.6 and made_of["adipose"] > 0.05  # with a septum of fat
+
+
+@SEEDED
+def test_metal_in_a_jaw_stands_apart_and_in_bone(seed: int) -> None:
+    phantom = body(Jaw, seed, fillings=5, gold_crowns=2, bridges=1)
+    pieces = {s.name: cells(phantom, [s]) for s in phantom.solids if not s.name.startswith("abutment")}
+    for name, inside in pieces.items():
+        if name.startswith("implant"):
+            held = shares(phantom, inside)
+            assert sum(held[m] for m in (*BONES, "adipose", "dentin", "enamel")) > 0.95, name
+        for other, there in pieces.items():
+            assert name == other or (inside & there).sum() <= 0.05 * min(inside.sum(), there.sum()), (name, other)
 
 
 @SEEDED

@@ -1,9 +1,9 @@
 """Both jaws of a dental specimen: arches of bone, 28 teeth with roots, cheeks, lips and tongue.
 
-The arch is of natural size in the 60 mm cube. Front is +y, up is +z; the teeth meet at z = 0.
+The arch has about two thirds of an adult's width in the 60 mm cube. Front is +y, up is +z; the teeth meet at z = 0.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ MATERIALS = ("air", "soft_tissue", "cortical_bone", "dentin", "enamel")
 AIR, SOFT, BONE, DENTIN, ENAMEL = range(5)
 SHRINK = 0.9  # of a relative unit to half the cube's edge
 CENTRE = -0.32  # y of the half ellipse's centre that the dental arch is
+MOUTH_BOX = ((-0.9, -0.7, -0.5), (0.9, 0.9, 0.5))
 
 
 class Teeth(Recipe, frozen=True, kw_only=True, tag="teeth"):
@@ -84,19 +85,25 @@ def teeth(grid: LabelGrid, rng: np.random.Generator, params: Teeth) -> Phantom:
     canvas = Canvas(grid, shrink=SHRINK)
     _soft(canvas, body)
     spongy = Noise(body, 56)
-    solids = dentition(canvas, (body, metal), params, lambda jaw: _bone(canvas, jaw, spongy))
+    solids = dentition(canvas, body, metal, params, lambda jaw: _bone(canvas, jaw, spongy))
     return assemble(canvas.whole, grid, MATERIALS, solids)
 
 
 def dentition(
-    canvas: Canvas, draws: Sequence[np.random.Generator], params: Teeth, bone: Callable[[int], None]
+    canvas: Canvas,
+    body: np.random.Generator,
+    metal: np.random.Generator,
+    params: Teeth,
+    bone: Callable[[int], None],
+    *,
+    fit: float = 1.0,
 ) -> list[Solid]:
     """Paint the teeth of both jaws, each into what `bone` draws of its jaw, −1 or 1; return the metal.
 
-    `draws` are the numbers for the body and for the metal. Labels are those of `MATERIALS`.
+    Numbers for the body and for the metal are drawn from generators of their own. `fit` is a tooth's width along the
+    arch over that of `KINDS`. Labels are those of `MATERIALS`.
     """
-    body, metal = draws
-    rows = [_row(body, jaw) for jaw in (-1, 1)]
+    rows = [_row(body, jaw, fit) for jaw in (-1, 1)]
     present: list[dict[int, Tooth]] = []
     for jaw, row in zip((-1, 1), rows, strict=True):
         bone(jaw)
@@ -137,11 +144,7 @@ def _soft(canvas: Canvas, rng: np.random.Generator) -> None:
     canvas.fill(SOFT, face)
     canvas.fill(AIR, lambda x, y, z: mouth(x, y, z, wobble), MOUTH_BOX)
     canvas.fill(SOFT, lambda x, y, z: tongue(x, y, z, wobble) <= 1)
-    canvas.ellipsoid(AIR, *NOSE)
-
-
-MOUTH_BOX = ((-0.9, -0.7, -0.5), (0.9, 0.9, 0.5))
-NOSE = ((0.0, -0.14, 0.82), (0.2, 0.5, 0.05))  # the floor of its cavity: centre and radii
+    canvas.ellipsoid(AIR, (0.0, -0.14, 0.82), (0.2, 0.5, 0.05))  # floor of the nose
 
 
 def section(x: Field, y: Field) -> Field:
@@ -192,12 +195,12 @@ def ridge_box(jaw: int) -> tuple[Vector, Vector]:
     return (-0.92, -0.92, -0.95 if jaw < 0 else 0.18), (0.92, 0.95, -0.18 if jaw < 0 else 0.95)
 
 
-def _row(rng: np.random.Generator, jaw: int) -> list[Tooth]:
-    """Stand 14 teeth side by side along the arch, with a little disorder."""
+def _row(rng: np.random.Generator, jaw: int, fit: float) -> list[Tooth]:
+    """Stand 14 teeth side by side along the arch, with a little disorder; the last ones share its end if they must."""
     fine = np.linspace(-1.12, 1.12, 2001)
     length = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(np.stack(_arch(fine)), axis=1)))])
     middle = np.interp(0.0, fine, length)
-    scale = 0.92 if jaw < 0 else 1.0  # lower teeth are narrower
+    scale = fit * (0.92 if jaw < 0 else 1.0)  # lower teeth are narrower
     teeth = []
     for side in (-1, 1):
         at = 0.0
