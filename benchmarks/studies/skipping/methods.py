@@ -155,6 +155,9 @@ def variants(setup: Bench) -> Iterator[Pair]:
             found.append(msgspec.structs.replace(scene, name=f"s{number}", scanner=scanner, phantom=phantom))
         return tuple(found)
 
+    def voltages(n: int) -> tuple[float, ...]:
+        return tuple(np.linspace(80.0, 140.0, n).tolist())
+
     def arrays(groups: Iterable[Sequence[Scene]]) -> list[NDArray[Any]]:
         folders = [folder for group in groups for folder in make_scenes(group, setup.folder / "variants", force=True)]
         return [array for folder in folders for array in stored_arrays(open_scan(folder))]
@@ -162,7 +165,8 @@ def variants(setup: Bench) -> Iterator[Pair]:
     for what, many in {
         f"rays of {doses} doses": scans(("Fe",), (90.0,), doses),
         f"rays of 2 metals, each at 2 voltages and {doses // 4} doses": scans(("Fe", "Ti"), (90.0, 120.0), doses // 4),
-        f"rays of {doses} voltages": scans(("Fe",), tuple(np.linspace(80.0, 140.0, doses).tolist()), 1),
+        f"rays of {doses} voltages": scans(("Fe",), voltages(doses), 1),
+        f"rays of {2 * doses} voltages": scans(("Fe",), voltages(2 * doses), 1),
     }.items():
         yield Pair(
             scene=scene.name,
