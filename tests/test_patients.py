@@ -197,7 +197,8 @@ def test_the_mouth_is_open_to_the_throat_and_lined(seed: int) -> None:
     sizes[[0, gas[0, 0, 0]]] = 0
     largest = gas == np.argmax(sizes)
     assert largest.sum() * np.prod(phantom.d_voxel) > 5000  # mm3: the mouth
-    assert largest[:, : int(N * 0.24)].any() and largest[:, int(N * 0.7) :].any()  # the throat, and before the teeth
+    assert all(largest[int(N * level), : int(N * 0.24)].any() for level in (0.2, 0.5, 0.8))  # the throat
+    assert largest[:, int(N * 0.7) :].any()  # before the teeth
     inner = (gas > 0) & (gas != gas[0, 0, 0])
     bare = shares(phantom, ndimage.binary_dilation(inner) & ~inner)
     assert bare["soft_tissue"] + bare["enamel"] + bare["dentin"] > 0.97
