@@ -25,7 +25,10 @@ MOUTH_BOX = ((-0.9, -0.7, -0.5), (0.9, 0.9, 0.5))
 
 
 class Teeth(Recipe, frozen=True, kw_only=True, tag="teeth"):
-    """Jaws with implant screws and crowns (Ti by default)."""
+    """Jaws with implant screws and crowns (Ti by default).
+
+    Second molars stand partly inside first ones, so that metal of both may overlap; `jaw` gives each tooth its place.
+    """
 
     metal: str = "Ti"
     crowns: int = 2

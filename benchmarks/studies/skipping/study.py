@@ -19,7 +19,7 @@ Case = Literal[
 # seconds of one run both ways at size core, on two idle cores (docs/measured/skipping.md)
 SECONDS: dict[str, float] = {
     "materials": 0.46, "bricks": 1.1, "rays": 10.3, "layers": 1.7, "energies": 0.63, "edges": 2.0, "refining": 1.6,
-    "scatter": 0.45, "blurs": 9.0, "twin": 2.6, "truth": 0.49, "variants": 420.0, "metal-free": 4.4,
+    "scatter": 0.45, "blurs": 9.0, "twin": 2.6, "truth": 0.49, "variants": 250.0, "metal-free": 4.4,
     "rows": 2.0, "scan": 6.7, "record": 4.8,
 }  # fmt: skip
 
