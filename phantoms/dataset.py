@@ -4,17 +4,20 @@ import contextlib
 import functools
 import hashlib
 import operator
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.beam.spectrum import spectrum
-from ctsim.dataset.manifest import About
+from ctsim.dataset.manifest import About, append_index
 from ctsim.dataset.memory import MemoryWriter, SimulatedScan
 from ctsim.dataset.truth import ScanWithTruth
 from ctsim.dataset.writer import SceneWriter, Stack
@@ -149,7 +152,17 @@ def make_scenes(
             if job.scene.drawn and id(signals) not in shares:
                 shares[id(signals)] = metal_share(job.phantom, job.scanner.geometry)
             told.append(about(job.scene, shares[id(signals)]) if job.scene.drawn else None)
-        return [writer.finish(one) for writer, one in zip(writers, told, strict=True)]
+        return _finish(writers, told)
+
+
+def _finish(writers: Sequence[SceneWriter], told: Sequence[About | None]) -> list[Path]:
+    """Put the folders in their places, several at a time, and list them in the index in the order of the scenes."""
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+        ends = [pool.submit(writer.settle, one) for writer, one in zip(writers, told, strict=True)]
+    append_index(writers[0].data_dir, *(end.result() for end in ends if end.exception() is None))
+    for end in ends:
+        end.result()  # raises what one of them met
+    return [writer.final for writer in writers]
 
 
 def about(scene: Scene, share: float) -> About:
@@ -220,8 +233,15 @@ def _write_truth(job: _Job, scatter: Scattered, shared: SharedTruth | None) -> N
     writer, scanner = job.writer, job.scanner
     info = dict(scan_info(job.plan, job.phantom, scanner, scatter))
     writer.write_image("flat", info.pop("flat"), scanner.geometry.d_detector)
-    for name, volume in truth_volumes(job.plan, job.phantom, scanner, shared):
-        writer.write_image(name, volume, scanner.geometry.d_voxel)
+    at_once = min(2, numba.get_num_threads())  # more would take memory
+    with ThreadPoolExecutor(at_once) as pool:
+        left = deque[Future[None]]()
+        for name, volume in truth_volumes(job.plan, job.phantom, scanner, shared):
+            left.append(pool.submit(writer.write_image, name, volume, scanner.geometry.d_voxel))
+            if len(left) == at_once:
+                left.popleft().result()
+        for one in left:
+            one.result()
     writer.write_text("scan.json", _json(info))
     writer.write_text("plan.json", _json(job.plan.to_dict()))
     writer.write_text("spectrum.csv", spectrum_csv(scanner))

@@ -83,6 +83,11 @@ class SceneWriter:
         self._arrays: dict[str, tuple[tuple[int, ...], str, int]] = {}
         self._lock: Lock | None = None
 
+    @property
+    def final(self) -> Path:
+        """The scene's folder when it is finished."""
+        return self.data_dir / self.name
+
     def __enter__(self) -> Self:
         with self._full_disk():
             try:
@@ -135,6 +140,11 @@ class SceneWriter:
 
     def finish(self, about: mf.About | None = None) -> Path:
         """Hash and flush everything, put the folder in its place and list it in the index."""
+        mf.append_index(self.data_dir, self.settle(about))
+        return self.final
+
+    def settle(self, about: mf.About | None = None) -> mf.Manifest:
+        """Do what `finish` does but for the index, which is to get the manifest that is returned."""
         if self._views != self.n_views:
             raise ValueError(f"only {self._views} of {self.n_views} views were written")
         with self._full_disk():
@@ -155,18 +165,16 @@ class SceneWriter:
             text = msgspec.json.format(msgspec.json.encode(whole), indent=1)
             (self._partial / mf.MANIFEST).write_bytes(text)
             durable.sync_tree(self._partial)
-            final = self.data_dir / self.name
-            durable.put_in_place(self._partial, final)
-            (final / mf.PROGRESS).unlink(missing_ok=True)  # only now: a crash before the rename must be able to go on
-            mf.append_index(self.data_dir, whole)
-        return final
+            durable.put_in_place(self._partial, self.final)
+            # only now: a crash before the rename must be able to go on
+            (self.final / mf.PROGRESS).unlink(missing_ok=True)
+        return whole
 
     def _begin(self) -> None:
-        final = self.data_dir / self.name
-        durable.recover(final)
-        if final.exists() and not self.force:
+        durable.recover(self.final)
+        if self.final.exists() and not self.force:
             is_complete(self.data_dir, self.name, self.scene_id)  # names another scene
-            raise Busy(f"{final}: already complete; replace it with --force")  # also by another process just now
+            raise Busy(f"{self.final}: already complete; replace it with --force")  # also by another process just now
         known = self._known()
         if known is None or known.views == 0:
             shutil.rmtree(self._partial, ignore_errors=True)

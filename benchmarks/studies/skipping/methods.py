@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -158,9 +159,16 @@ def variants(setup: Bench) -> Iterator[Pair]:
     def voltages(n: int) -> tuple[float, ...]:
         return tuple(np.linspace(80.0, 140.0, n).tolist())
 
-    def arrays(groups: Iterable[Sequence[Scene]]) -> list[NDArray[Any]]:
-        folders = [folder for group in groups for folder in make_scenes(group, setup.folder / "variants", force=True)]
-        return [array for folder in folders for array in stored_arrays(open_scan(folder))]
+    def make(groups: Iterable[Sequence[Scene]], where: str) -> list[Path]:
+        shutil.rmtree(setup.folder / where, ignore_errors=True)
+        return [folder for group in groups for folder in make_scenes(group, setup.folder / where)]
+
+    def stored(folders: Sequence[Path]) -> Iterator[NDArray[Any]]:
+        return itertools.chain.from_iterable(stored_arrays(open_scan(folder)) for folder in folders)
+
+    def difference(ours: Sequence[Path], others: Sequence[Path]) -> float:
+        """Read one pair of arrays after the other, off the clock."""
+        return max(largest([a], [b]) for a, b in zip(stored(ours), stored(others), strict=True))
 
     for what, many in {
         f"rays of {doses} doses": scans(("Fe",), (90.0,), doses),
@@ -171,8 +179,9 @@ def variants(setup: Bench) -> Iterator[Pair]:
         yield Pair(
             scene=scene.name,
             what=f"{what}: traced once for {len(many)} scans of one body",
-            skipping=functools.partial(arrays, [many]),
-            whole=functools.partial(arrays, [(one,) for one in many]),
+            skipping=functools.partial(make, [many], "together"),
+            whole=functools.partial(make, [(one,) for one in many], "one by one"),
+            difference=difference,
             unit="any array",
             note=f"{len(many)} scans with twins, built, planned and written",
         )
