@@ -331,7 +331,7 @@ class KilledOnce:
 
     def answers(self, function, jobs):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(manifest, "append_index", self.kill)
+            patch.setattr(dataset, "append_index", self.kill)
             patch.setattr(locks.Lock, "release", lambda lock: os.close(lock.handle))
             with pytest.raises(Killed):
                 function(jobs[0])

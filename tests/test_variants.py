@@ -1,6 +1,8 @@
 """Scenes of one body: built once, traced once, and each what it is alone."""
 
+import errno
 import hashlib
+import time
 import types
 from collections.abc import Iterable
 from dataclasses import replace
@@ -13,8 +15,10 @@ import pytest
 from ctsim import plan as plan_module
 from ctsim import simulate
 from ctsim.beam.spot import FocalSpot
+from ctsim.dataset.manifest import read_index, verify
 from ctsim.detector.noise import Noise
 from ctsim.detector.response import Detector
+from ctsim.errors import InputError
 from ctsim.geometry import Geometry
 from ctsim.phantoms import dataset
 from ctsim.phantoms.bodies.teeth import Teeth
@@ -292,3 +296,61 @@ def test_scenes_that_were_interrupted_at_different_views_go_on(tmp_path, monkeyp
     make_scenes(many, tmp_path / "parts", watch=watch)
     assert list(began.values()) == [2, 5, 0]
     assert digests(tmp_path / "parts") == digests(tmp_path / "whole")
+
+
+def test_folders_that_are_put_in_place_together_are_listed_in_the_order_of_their_scenes(tmp_path, monkeypatch):
+    many = scenes(truth=Truth())[:3]
+    settle = dataset.SceneWriter.settle
+
+    def late(self, about=None):
+        time.sleep(0.3 if self.name == many[0].name else 0.0)
+        return settle(self, about)
+
+    monkeypatch.setattr(dataset.SceneWriter, "settle", late)
+    assert make_scenes(many, tmp_path) == [tmp_path / s.name for s in many]
+    assert list(read_index(tmp_path)) == [s.name for s in many]
+
+
+def test_a_folder_that_cannot_be_put_in_place_leaves_the_others_finished(tmp_path, monkeypatch):
+    many = scenes(truth=Truth())[:3]
+    settle = dataset.SceneWriter.settle
+
+    def refused(self, about=None):
+        if self.name == many[1].name:
+            raise PermissionError(errno.EACCES, "Permission denied", str(self.final))
+        return settle(self, about)
+
+    monkeypatch.setattr(dataset.SceneWriter, "settle", refused)
+    with pytest.raises(PermissionError):
+        make_scenes(many, tmp_path / "data")
+    assert list(read_index(tmp_path / "data")) == [many[0].name, many[2].name]
+    monkeypatch.undo()
+    make_scenes(many[1:2], tmp_path / "data")
+    make_scenes(many, tmp_path / "whole")
+    assert digests(tmp_path / "data") == digests(tmp_path / "whole")
+    assert verify(tmp_path / "data") == []
+
+
+def test_true_volumes_are_whole_however_late_they_are_written(tmp_path, monkeypatch):
+    many = scenes()[:2]
+    make_scenes(many, tmp_path / "whole")
+    write = dataset.SceneWriter.write_image
+
+    def late(self, name, array, spacing):
+        time.sleep(0.03)
+        write(self, name, array, spacing)
+
+    monkeypatch.setattr(dataset.SceneWriter, "write_image", late)
+    make_scenes(many, tmp_path / "late")
+    assert digests(tmp_path / "late") == digests(tmp_path / "whole")
+
+
+def test_a_true_volume_that_cannot_be_written_stops_the_scene(tmp_path, monkeypatch):
+    def full(self, name, array, spacing):
+        if name == "metal_free/reference_50kev":  # the last one
+            raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setattr(dataset.SceneWriter, "write_image", full)
+    with pytest.raises(InputError, match="disk is full; scene 'body-00000' keeps its first 7 of 7 views"):
+        make_scenes(scenes()[:1], tmp_path)
+    assert not (tmp_path / "body-00000").exists()
