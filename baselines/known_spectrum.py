@@ -141,7 +141,7 @@ def water_precorrection(scan: Scan, settings: Known) -> Volume:
 class Ibhc(Known, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What is known, and of what the object is."""
 
-    iterations: Annotated[int, about("corrections after the water correction", ge=1, le=50)] = 2
+    iterations: Annotated[int, about("corrections after the water correction", ge=1, le=50)] = 3
     bone: Annotated[str, about("material of voxels denser than water")] = "cortical_bone"
     metal: Annotated[str, about("material in the automatic metal mask; empty: metal is treated as bone")] = ""
 

@@ -52,7 +52,7 @@ class OsSart(Sart, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Sirt(Sart, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As `Sart`."""
 
-    iterations: Count = 30
+    iterations: Count = 43
     relaxation: Relaxation = 1.9
 
 
