@@ -37,7 +37,7 @@ Share = Annotated[float, msgspec.Meta(gt=0, le=10)]
 class FistaTv(Iterations, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """As `Iterations`, and how each denoises."""
 
-    iterations: Count = 30
+    iterations: Count = 50
     tv: Annotated[float, about("size of ripples that a step flattens", "of the scan's water", ge=0, le=1000)] = 0.0024
     tv_iterations: Annotated[int, about("iterations of each denoising", ge=1, le=10_000)] = 20
     positivity: Positivity = True
