@@ -46,7 +46,7 @@ def test_each_iteration_is_scored_as_a_run_of_as_many(smallest, tmp_path, capsys
         for k in (1, 2, 3)
     ]
     line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("ibhc: "))
-    assert f"best {np.argmax(means) + 1}, {max(means):.2f} dB" in line and f"{means[1]:.2f} dB after 2" in line
+    assert f"best {np.argmax(means) + 1}, {max(means):.2f} dB" in line and f"{means[2]:.2f} dB after 3" in line
 
 
 @pytest.mark.parametrize(
