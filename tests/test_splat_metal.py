@@ -108,7 +108,8 @@ def test_slopes_are_the_derivatives_of_the_readings(volume, which):
     part, rng = fit.parts[which], np.random.default_rng(3)
     g = rng.standard_normal((1, 36, 44)).astype(np.float32)
     _, slopes = fit._seen([part.paths(views) for part in fit.parts])
-    by_density = part.back(slopes[which], g, views).astype(np.float64) / part.lattice.unit
+    pixels = fit.parts[0].projector.arranged(g)
+    by_density = part.back(slopes[which], pixels, views).astype(np.float64) / part.lattice.unit
     u, way = part.u.copy(), rng.uniform(0.5, 1, len(part.u)).astype(np.float32)
     step = 1e-2
     part.u = (u * (1 + step * way)).astype(np.float32)

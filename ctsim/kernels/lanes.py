@@ -1,7 +1,8 @@
-"""Eight float32 lanes as one value in numba, so that LLVM keeps a row of pixels in one register.
+"""A row of float32 lanes as one value in numba, so that LLVM keeps a row of pixels in one register.
 
 Numba has no vector type of its own, and its loops over arrays that may alias are not vectorised. A value of
-type `lanes` is an LLVM vector; on machines with narrower registers LLVM splits it.
+type `lanes` is an LLVM vector: sixteen lanes on processors with AVX-512, eight on others. Where registers are narrower
+LLVM splits it.
 """
 
 import math
@@ -11,11 +12,19 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
+from numba.core import cgutils, config
+from numba.core.codegen import get_host_cpu_features
 from numba.core.datamodel.models import PrimitiveModel
 from numba.extending import intrinsic, register_model
 
-WIDTH = 8
+
+def _has_avx512() -> bool:
+    """Whether numba compiles for registers of 512 bits."""
+    told = config.CPU_FEATURES  # NUMBA_CPU_FEATURES, None unless set
+    return "+avx512f" in (get_host_cpu_features() if told is None else told)
+
+
+WIDTH = 16 if _has_avx512() else 8
 _FLOATS, _INTS = ir.VectorType(ir.FloatType(), WIDTH), ir.VectorType(ir.IntType(32), WIDTH)
 _LARGEST = 115.0  # 2^115 = 4e34: the clamp of exponents keeps results normal float32
 _MAGIC = 1.5 * 2.0**23  # added to a float32 it leaves the nearest whole number in the last bits
@@ -23,7 +32,7 @@ _NODES = 0.5 * np.cos((np.arange(64) + 0.5) * math.pi / 64)
 
 
 class Lanes(types.Type):
-    """The numba type of eight float32 lanes."""
+    """The numba type of a row of float32 lanes."""
 
     def __init__(self) -> None:
         super().__init__(name="lanes")
@@ -53,7 +62,7 @@ def _spread(builder, number):
 
 
 def _address(context, builder, array_type, array, row, column):
-    """Address of array[row, column … column + 7] of a C-contiguous float32 array; nothing is checked."""
+    """Address of array[row, column … column + WIDTH − 1] of a C-contiguous float32 array; nothing is checked."""
     view = context.make_array(array_type)(context, builder, array)
     at = cgutils.get_item_pointer(context, builder, array_type, view, [row, column], wraparound=False)
     return builder.bitcast(at, _FLOATS.as_pointer())
@@ -66,7 +75,7 @@ def _operation(function: Callable[..., Any]) -> Any:
 
 @_operation
 def load(typingctx, array, row, column):
-    """Read array[row, column : column + 8]."""
+    """Read array[row, column : column + WIDTH]."""
 
     def codegen(context, builder, signature, args):
         value = builder.load(_address(context, builder, signature.args[0], *args))
@@ -78,7 +87,7 @@ def load(typingctx, array, row, column):
 
 @_operation
 def store(typingctx, array, row, column, value):
-    """Write array[row, column : column + 8]."""
+    """Write array[row, column : column + WIDTH]."""
 
     def codegen(context, builder, signature, args):
         written = builder.store(args[3], _address(context, builder, signature.args[0], *args[:3]))
@@ -90,7 +99,7 @@ def store(typingctx, array, row, column, value):
 
 @_operation
 def spread(typingctx, number):
-    """Return eight copies of a float32."""
+    """Return a float32 in all lanes."""
 
     def codegen(context, builder, signature, args):
         return _spread(builder, args[0])
@@ -100,7 +109,7 @@ def spread(typingctx, number):
 
 @_operation
 def pick(typingctx, array, row, column):
-    """Return eight copies of array[row, column]; nothing is checked."""
+    """Return array[row, column] in all lanes; nothing is checked."""
 
     def codegen(context, builder, signature, args):
         array_type = signature.args[0]
@@ -112,8 +121,21 @@ def pick(typingctx, array, row, column):
 
 
 @_operation
+def pair(typingctx, array, row, column):
+    """Return array[row, column] and array[row, column + 1] in turns; nothing is checked."""
+
+    def codegen(context, builder, signature, args):
+        two = ir.VectorType(ir.FloatType(), 2)
+        value = builder.load(builder.bitcast(_address(context, builder, signature.args[0], *args), two.as_pointer()))
+        value.align = 4
+        return builder.shuffle_vector(value, value, ir.Constant(_INTS, [0, 1] * (WIDTH // 2)))
+
+    return lanes(array, types.intp, types.intp), codegen
+
+
+@_operation
 def ramp(typingctx, first):
-    """Return first, first + 1, … first + 7."""
+    """Return first, first + 1, … in the lanes."""
 
     def codegen(context, builder, signature, args):
         return builder.fadd(_spread(builder, args[0]), ir.Constant(_FLOATS, [float(k) for k in range(WIDTH)]))
@@ -248,13 +270,13 @@ def _shuffled(which: list[int], doc: str):
 _TURNS = [k + far for k in range(WIDTH) for far in (0, WIDTH)]
 evens = _shuffled([*range(0, 2 * WIDTH, 2)], "Every second lane of a and on through b, from the first.")
 odds = _shuffled([*range(1, 2 * WIDTH, 2)], "Every second lane of a and on through b, from the second.")
-lower = _shuffled(_TURNS[:WIDTH], "The lanes of a and b in turns, the first eight.")
-upper = _shuffled(_TURNS[WIDTH:], "The lanes of a and b in turns, the last eight.")
+lower = _shuffled(_TURNS[:WIDTH], "The lanes of a and b in turns, the first half.")
+upper = _shuffled(_TURNS[WIDTH:], "The lanes of a and b in turns, the second half.")
 
 
 @_operation
 def total(typingctx, a):
-    """Return the sum of the eight lanes, by halves."""
+    """Return the sum of the lanes, by halves."""
 
     def codegen(context, builder, signature, args):
         value, n = args[0], WIDTH

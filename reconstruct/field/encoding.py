@@ -150,7 +150,7 @@ class Lattice:
         return self.buffers[name]
 
     def spread(self, table: Floats, owner: object) -> Floats:
-        """Return a table's features in the lattice columns at each z, [lattice column · feature, z + 8].
+        """Return a table's features in the lattice columns at each z, [lattice column · feature, z + WIDTH].
 
         They stay until another owner asks. A pass is one: its backward half may find that another has come between.
         """

@@ -19,9 +19,10 @@ Image = NDArray[np.float32]
 class LatticeProjector:
     """Projects the splats of `lattice`, in its order, along the rays of `geometry`, in two channels.
 
-    Images lie as the kernels want them, [view, channel, u, v + 8] or as `Projector` has them: `arranged` puts pictures
-    [view, v, u] into that form, and `pictures` takes them out of it. Splats are projected by EWA unless `exact`, which
-    has no columns: those of half a voxel span so small an angle that EWA is off by a thousandth of the peak at most.
+    Images lie as the kernels want them, [view, channel, u, v + WIDTH] or as `Projector` has them: `arranged` puts
+    pictures [view, v, u] into that form, and `pictures` takes them out of it. Splats are projected by EWA unless
+    `exact`, which has no columns: those of half a voxel span so small an angle that EWA is off by a thousandth of the
+    peak at most.
     """
 
     def __init__(self, geometry: Geometry, lattice: Lattice, *, exact: bool = False) -> None:
@@ -68,10 +69,11 @@ class LatticeProjector:
 
     def pictures(self, images: Image) -> Image:
         """View the detector's part of images as [..., v, u]."""
-        n_v, n_u = self._n_detector
-        if not self.by_columns:
-            return images[..., :n_u]
-        return images[..., :n_v].swapaxes(-1, -2)
+        return self.turned(images[..., :-WIDTH])
+
+    def turned(self, inner: Image) -> Image:
+        """View images without scratch as [..., v, u]."""
+        return inner.swapaxes(-1, -2) if self.by_columns else inner
 
 
 def _upright(cameras: NDArray[np.float64]) -> bool:

@@ -6,14 +6,13 @@ fainter or smears it. Where there is metal, P is therefore −ln of the mean of 
 splats near its surface are half as far apart, so that sub-pixels differ.
 """
 
-from collections.abc import Sequence
-
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from ctsim.geometry import Geometry
+from ctsim.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.curve import DENSEST
 from ctsim.reconstruct.splat.lattice import Lattice
 from ctsim.reconstruct.splat.level import refined
@@ -56,31 +55,41 @@ def split(part: Part, fine: Mask) -> list[Part]:
     return [tissue, metal]
 
 
-def average(response: Response, rest: Sequence[Image], fine: Part, paths: Image, found: Sequence[Image]) -> Image:
-    """Correct `found`, P and its derivatives of [view, v, u] for one ray a pixel, in place where there is fine metal.
+def average(
+    response: Response, rest: tuple[Image, Image], fine: Part, paths: Image, found: tuple[Image, Image, Image]
+) -> Image:
+    """Correct `found`, P and its derivatives, for one ray a pixel, in place where there is fine metal.
 
-    `rest`, two of [view, v, u], and `paths`, as the fine part has them, are La and Lb, which add up. The derivatives by
-    the sub-pixels' own are returned as `paths` is; those by `rest` are their sums.
+    `rest`, as the coarse part has them, and `paths`, as the fine part has them, are La and Lb, which add up. The
+    derivatives by the sub-pixels' own are returned as `paths` is; those by `rest` are their sums.
     """
-    la, lb = (fine.blocks(paths[:, channel]).transpose(0, 1, 3, 2, 4) for channel in (0, 1))
-    met = la.any((3, 4))
-    n = FINER * FINER
+    own = [_sub_pixels(fine, paths[:, channel]) for channel in (0, 1)]
+    met = own[0][0] != 0
+    for one in own[0][1:]:
+        met |= one != 0
     p, by_a, by_b = evaluate(
         response,
-        *(own[met].reshape(-1, n) + other[met][:, None] for own, other in zip((la, lb), rest, strict=True)),
+        *(np.stack([one[met] for one in a]) + b[..., :-WIDTH][met] for a, b in zip(own, rest, strict=True)),
     )
-    least = p.min(1, keepdims=True)
+    least = p.min(0)
     shares = np.exp(least - p)
-    total = shares.sum(1, keepdims=True)
+    total = shares.sum(0)
     shares /= total
     by_a *= shares
     by_b *= shares
-    for image, values in zip(found, (least[:, 0] - np.log(total[:, 0] / n), by_a.sum(1), by_b.sum(1)), strict=True):
-        image[met] = values
+    for image, values in zip(found, (least - np.log(total / len(p)), by_a.sum(0), by_b.sum(0)), strict=True):
+        image[..., :-WIDTH][met] = values
     slopes = np.zeros_like(paths)
     for channel, values in enumerate((by_a, by_b)):
-        fine.blocks(slopes[:, channel]).transpose(0, 1, 3, 2, 4)[met] = values.reshape(-1, FINER, FINER)
+        for one, its_own in zip(_sub_pixels(fine, slopes[:, channel]), values, strict=True):
+            one[met] = its_own
     return slopes
+
+
+def _sub_pixels(fine: Part, image: Image) -> list[Image]:
+    """View each sub-pixel of the pixels of an image: [view, …] without scratch."""
+    blocks = fine.blocks(image)
+    return [blocks[:, :, j, :, i] for j in range(FINER) for i in range(FINER)]
 
 
 def _finer(geometry: Geometry, box: tuple[slice, ...]) -> Geometry:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.geometry import Geometry
+from ctsim.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.curve import MaterialCurve
 from ctsim.reconstruct.splat.level import Data
 from ctsim.reconstruct.splat.metal import average, split, surface
@@ -170,13 +171,9 @@ class Fit:
     def _seen(self, paths: list[Image]) -> tuple[Image, list[Image]]:
         """Return P, as an image of the first part, and its derivatives by every part's paths, as these are."""
         coarse, *fine = paths
-        la, lb = np.ascontiguousarray(coarse[:, 0]), np.ascontiguousarray(coarse[:, 1])
-        found = evaluate(self.response, la, lb)
-        pictures = self.parts[0].projector.pictures
-        slopes = [
-            average(self.response, (pictures(la), pictures(lb)), part, own, tuple(pictures(image) for image in found))
-            for part, own in zip(self.parts[1:], fine, strict=True)
-        ]
+        rest = np.ascontiguousarray(coarse[:, 0]), np.ascontiguousarray(coarse[:, 1])
+        found = evaluate(self.response, *rest)
+        slopes = [average(self.response, rest, *given, found) for given in zip(self.parts[1:], fine, strict=True)]
         return found[0], [np.stack(found[1:], 1), *slopes]
 
     def _step(self, views: NDArray[np.int64], new: list[Part], length: float) -> float:
@@ -202,13 +199,14 @@ class Fit:
         weights *= left
         if new:
             along = [part.along(own, path) for part, own, path in zip(self.parts, slopes, paths, strict=True)]
-            along = sum(along[1:], along[0]) * coarse.pictures(weights * left)  # J·u: the majoriser's other half
+            met = weights * left  # times J·u, the majoriser's other half
+            met[..., :-WIDTH] *= sum(along[1:], along[0])
             for part, own in zip(self.parts, slopes, strict=True):
                 if any(part is one for one in new):
-                    part.measure(own, along, views)
+                    part.measure(own, met, views)
         lacking *= weights
         for part, own in zip(self.parts, slopes, strict=True):
-            part.move(own, coarse.pictures(lacking), views, length)
+            part.move(own, lacking, views, length)
         self.view_updates += len(views)
         return loss
 

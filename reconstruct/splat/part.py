@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctsim.geometry import Geometry
+from ctsim.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.columns import LatticeProjector
 from ctsim.reconstruct.splat.curve import METAL, MaterialCurve
 from ctsim.reconstruct.splat.kernels import step_cpu
@@ -64,24 +65,26 @@ class Part:
         # the projector takes two channels: the second is not looked at
         np.stack([values, values], 1, out=self._pair)
         self._pair /= np.float32(self.lattice.unit)
-        return self.blocks(self.projector.forward(self._pair, views)[:, 0]).mean((2, 4))
+        return self.projector.turned(self.blocks(self.projector.forward(self._pair, views)[:, 0]).mean((2, 4)))
 
     def blocks(self, image: Image) -> Image:
-        """View images of one channel as sub-pixels within pixels, [view, v, sub-pixel, u, sub-pixel]."""
-        pictures = self.projector.pictures(image)
-        n_view, n_v, n_u = pictures.shape
-        return pictures.reshape(n_view, n_v // self.finer, self.finer, n_u // self.finer, self.finer)
+        """View images of one channel, without scratch, as sub-pixels in pixels: [view, row, sub-pixel, column, …]."""
+        inner = image[..., :-WIDTH]
+        n_view, n_row, n_column = inner.shape
+        return inner.reshape(n_view, n_row // self.finer, self.finer, n_column // self.finer, self.finer)
 
     def along(self, slopes: Image, paths: Image) -> Image:
-        """Sum slopes times paths over channels and the sub-pixels of a pixel: [view, v, u]."""
+        """Sum slopes times paths over channels and the sub-pixels of a pixel: [view, …] without scratch."""
         a, b = (self.blocks(slopes[:, k]) * self.blocks(paths[:, k]) for k in (0, 1))
         return (a + b).sum((2, 4))
 
-    def back(self, slopes: Image, pixels: Image, views: NDArray[np.int64]) -> Image:
-        """Sum slopes times what `pixels` [view, v, u] hold over the pixels: [splat, channel], until the next call."""
-        images = np.zeros_like(slopes)  # in the scratch columns, too
-        for k in (0, 1):
-            np.multiply(self.blocks(slopes[:, k]), pixels[:, :, None, :, None], out=self.blocks(images[:, k]))
+    def back(self, slopes: Image, pixels: Image, views: NDArray[np.int64], out: Image | None = None) -> Image:
+        """Sum slopes times what the scan's `pixels` hold over the pixels: [splat, channel], until the next call.
+
+        The products are in `out`, which may be `slopes`, where that is given.
+        """
+        images = np.empty_like(slopes) if out is None else out
+        step_cpu.multiply(slopes, pixels, self.finer, WIDTH, images)
         return self.projector.adjoint(images, views, self._pair)
 
     def measure(self, slopes: Image, along: Image, views: NDArray[np.int64]) -> None:
@@ -90,11 +93,11 @@ class Part:
         self.measured += len(views)
 
     def move(self, slopes: Image, lacking: Image, views: NDArray[np.int64], length: float) -> None:
-        """Step by `length` of a step towards what pixels lack.
+        """Step by `length` of a step towards what pixels lack; slopes are overwritten.
 
         The curvature is that of all views in which it was measured: it changes little from subset to subset.
         """
-        gradient = self.curve.transpose(self.u, self.back(slopes, lacking, views), length, self._gradient)
+        gradient = self.curve.transpose(self.u, self.back(slopes, lacking, views, slopes), length, self._gradient)
         curvature = self.curve.transpose(self.u, self.curvature, len(views) / self.measured, self._roots)
         self._move(gradient, curvature, len(views))
 

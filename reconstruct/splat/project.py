@@ -43,7 +43,7 @@ class Projector:
     """Projects splats along the rays of `geometry`, any pose or detector offset.
 
     With `box` a pixel measures the mean over its area (to second order), as detectors do; without, the ray through its
-    centre. Images hold eight columns more than the detector; they are zero, and count as such if they are finite.
+    centre. Images hold `WIDTH` columns more than the detector; they are zero, and count as such if they are finite.
     Splats that lie behind the source, are not finite or have no extent are left out.
     """
 
@@ -62,7 +62,7 @@ class Projector:
     def forward(
         self, shapes: NDArray[np.float32], values: NDArray[np.float32], views: Views = None
     ) -> NDArray[np.float32]:
-        """Sum values [splat, channel] times line integrals (mm) over the splats: float32 [view, channel, v, u + 8].
+        """Sum values [splat, channel] times line integrals (mm) over the splats: float32 [view, channel, v, u + WIDTH].
 
         One or two channels. Raises InputError for wrong shapes, and views that do not exist.
         """
@@ -84,7 +84,7 @@ class Projector:
     def adjoint(
         self, shapes: NDArray[np.float32], images: NDArray[np.float32], views: Views = None
     ) -> NDArray[np.float32]:
-        """Sum images [view, channel, v, u + 8] times line integrals (mm) over the pixels: float32 [splat, channel].
+        """Sum images [view, channel, v, u + WIDTH] times line integrals (mm) over the pixels: float32 [splat, channel].
 
         One, two or four channels. Raises InputError as `forward` does.
         """
@@ -99,7 +99,7 @@ class Projector:
         return sums
 
     def gradient(self, splats: Splats, images: NDArray[np.float32], view: int) -> Gradient:
-        """Return the gradient of a loss whose derivative by view `view` is `images` [channel, v, u + 8].
+        """Return the gradient of a loss whose derivative by view `view` is `images` [channel, v, u + WIDTH].
 
         It is that of the EWA form for every tolerance (a Projector of infinite tolerance has no other), and
         knows no cutoff. One channel a density. Raises InputError for wrong shapes, and a view that does not exist.

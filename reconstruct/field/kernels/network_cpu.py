@@ -117,7 +117,7 @@ def _by_inputs(w, gradient, n, out):
 
 @njit(cache=True, error_model="numpy")
 def _by_weights(inputs, gradient, n, sums):
-    """Add the gradients by weights to `sums` [input · neurons + neuron, 8], to be added up over the lanes."""
+    """Add the gradients by weights to `sums` [input · neurons + neuron, WIDTH], to be added up over the lanes."""
     n_j = gradient.shape[0]
     for k in range(0, inputs.shape[0], 4):
         for j in range(0, n_j, 2):
@@ -233,7 +233,7 @@ def _forward(task, tasks, columns, lattice, n_f, between, network, out):
 def forward(tasks, columns, lattice, n_f, between, network, out):
     """Fill `out` [point, output] with the field: scale · squareplus(w2ᵀ · relu(w1ᵀ · h + b1) + b2).
 
-    `lattice` [lattice column · feature, z + 8] is what `lattice_cpu.spread` made of a table with `n_f` features;
+    `lattice` [lattice column · feature, z + WIDTH] is what `lattice_cpu.spread` made of a table with `n_f` features;
     `network` w1 [input, neuron], b1 [1, neuron], w2 [neuron, output], b2 [1, output] and scale [output].
     """
     _forward(_forward_task.address(), tasks, columns, lattice, n_f, between, network, out)
@@ -288,8 +288,9 @@ def _backward(task, tasks, columns, lattice, n_f, between, network, gradient, be
 def backward(tasks, columns, lattice, n_f, between, network, gradient, behind, by_lattice):
     """Take gradients by the field [point, output] back: fill `by_lattice`, and return those by w1, b1, w2 and b2.
 
-    `by_lattice` [copy · feature, z + 8] has lattice columns of its own for each task: `behind` [task + 1, level + 1]
-    says by how much they lie behind those of the lattices, and in the last place where the task's begin.
+    `by_lattice` [copy · feature, z + WIDTH] has lattice columns of its own for each task: `behind`
+    [task + 1, level + 1] says by how much they lie behind those of the lattices, and in the last place where the
+    task's begin.
     """
     w1, _, w2, _, _ = network
     (n_i, n_j), n_o = w1.shape, w2.shape[1]

@@ -95,11 +95,11 @@ class Objective:
         )
 
     def paths(self, splats: Splats, view: int) -> Array:
-        """Return the path values [channel, v, u + 8]."""
+        """Return the path values [channel, v, u + WIDTH]."""
         return self.projector.forward(splats.shapes(), splats.densities, [view])[0]
 
     def line_integrals(self, paths: Array, response: Response) -> tuple[Array, list[Array] | list[np.float32]]:
-        """Return P [v, u + 8], and its derivative by each channel's path value."""
+        """Return P [v, u + WIDTH], and its derivative by each channel's path value."""
         if self.settings.basis == "constant":
             return paths[0], [np.float32(1)]  # for any response, whose shares sum to 1
         p, by_a, by_b = responses.evaluate(response, *self._both(paths))
@@ -114,7 +114,7 @@ class Objective:
         return total / max(int(self.valid[views].sum()), 1)
 
     def _both(self, paths: Array) -> tuple[Array, Array]:
-        """Return La and Lb [v, u + 8]; a channel without densities is 0."""
+        """Return La and Lb [v, u + WIDTH]; a channel without densities is 0."""
         return (np.zeros_like(paths[0]), paths[0]) if len(paths) == 1 else (paths[0], paths[1])
 
     def _tv(self, splats: Splats, step: int) -> tuple[float, Array]:

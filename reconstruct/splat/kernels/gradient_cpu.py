@@ -54,7 +54,7 @@ GRADIENT = 13
 
 @njit(cache=True, error_model="numpy")
 def read_moments(fp, values, images, cutoff, n_u, out):
-    """Write the eight sums over images [channel · v, u + 8] of one or two channels."""
+    """Write the eight sums over images [channel · v, u + WIDTH] of one or two channels."""
     n_c = values.shape[0]
     n_v = images.shape[0] // n_c
     left, right = _columns(fp, n_u)
@@ -190,7 +190,7 @@ def _gradient_chunk(shapes, values, quaternions, bounds, camera, image, out):
 def gradient(shapes, values, quaternions, camera, image, out):
     """Write the gradients of splats in one view, out float32 [splat, GRADIENT], which must be zero.
 
-    Values [splat, channel] are the densities, image [channel · v, u + 8] is dLoss/dL of one or two channels. The
+    Values [splat, channel] are the densities, image [channel · v, u + WIDTH] is dLoss/dL of one or two channels. The
     camera's tolerance must be infinite.
     Round splats take any quaternions but zero and get 0 for them.
     """

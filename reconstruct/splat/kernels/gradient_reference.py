@@ -19,7 +19,7 @@ def gradient(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return the derivatives of Σ image·L by densities, positions, log scales, quaternions and places (u, v).
 
-    The camera's tolerance must be infinite, image is [channel, v, u + 8]. The cutoff is taken as given.
+    The camera's tolerance must be infinite, image is [channel, v, u + WIDTH]. The cutoff is taken as given.
     """
     shapes = pack(positions, scales, quaternions)
     n_v, n_u = image.shape[1], image.shape[2] - WIDTH

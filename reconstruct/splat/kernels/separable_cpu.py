@@ -6,13 +6,13 @@ shadow is taken as exp(−½ du²/S_uu − ½ dv²/S_vv), of the mass that EWA g
 of Long, Fessler and Balter (IEEE Trans. Med. Imaging 29, 2010, doi:10.1109/TMI.2010.2050898) with Gaussians. What it
 leaves out is S_uv, of the order of u·v/dsd² of the others.
 
-A profile is summed eight rows at a time over the splats within reach of them, and the transpose eight splats at a time
-over the rows within theirs: sums stay in registers, and both take the same pairs, since what lies beyond a splat's
-cutoff is zero.
+A profile is summed over pairs of splats, for half as many rows as a register has lanes, and the transpose over pairs of
+rows: with a row in each lane most of what is computed lies beyond the cutoff. Sums stay in registers. Both take the
+same pairs of splat and row, since what lies beyond a splat's cutoff is zero.
 
 Splats are ordered by run, z ascending in even steps: `runs` holds xy float64 [run, 2], the starts [run + 1] of runs in
-z float32 [1, splat + 8], both mm, and the most splats that a run has. Images are float32
-[channel · u, v + 8], transposed and with 8 columns of scratch.
+z float32 [1, splat + WIDTH], both mm, and the most splats that a run has. Images are float32
+[channel · u, v + WIDTH], transposed and with WIDTH columns of scratch.
 """
 
 import math
@@ -31,6 +31,7 @@ from ctsim.kernels.lanes import (
     lower,
     mul,
     odds,
+    pair,
     pick,
     ramp,
     spread,
@@ -53,6 +54,7 @@ from ctsim.reconstruct.splat.kernels.splat_cpu import (
     SOURCE,
 )
 
+HALF = WIDTH // 2  # rows, or splats, that are done at a time, each with two of the other
 RUNS = 256  # in a task of the transpose
 RUNS_TYPE = "Tuple((float64[:,::1], int64[::1], float32[:,::1], int64))"  # of `runs`, in Numba's words
 SLACK = 1e-3  # of a splat and of a row: ranges are wider by that, so that the cutoff alone decides, not rounding
@@ -179,11 +181,30 @@ def _filled(values, first, last):
     return first, last
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _pairs(span, n):
+    """Return how many pairs hold all that a span of a row of n holds, wherever it begins."""
+    return (min(int(math.floor(span)) + 1, n) + 1) // 2
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _start(first, n, pairs):
+    """Return where pairs begin that reach from `first` on: further in at the ends of a row of n."""
+    return max(0, min(int(math.ceil(min(max(first, -1e9), 1e9))), n - 2 * pairs))
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _paired(a, b):
+    """Return the sums of the pairs of lanes of a and on through b."""
+    return add(evens(a, b), odds(a, b))
+
+
 @compiled_once(RUNS_TYPE, "float32[:,::1]", "float64", "float64[::1]", "float32[:,::1]")
 def _forward_view(runs, values, scale, camera, image):
     xy, starts, z, tallest = runs
     n_u, n_v = image.shape[0] // 2, image.shape[1] - WIDTH
     place, least, zero = np.empty(PLACE), _least(camera), spread(np.float32(0))
+    twice = lower(ramp(np.float32(0)), ramp(np.float32(0)))
     table, gains = np.empty((5, tallest + WIDTH), np.float32), np.empty((1, n_u + WIDTH), np.float32)
     for run in range(xy.shape[0]):
         bounds = _filled(values, starts[run], starts[run + 1])
@@ -198,16 +219,25 @@ def _forward_view(runs, values, scale, camera, image):
         n, lowest = bounds[1] - bounds[0], _row(camera, place, z[0, bounds[0]])
         highest = _row(camera, place, z[0, bounds[1] - 1])
         a_row = (n - 1) / (highest - lowest) if highest != lowest else 0.0  # splats, of either sign
-        wide = abs(a_row) * (0.5 * (WIDTH - 1) + reach + SLACK) + SLACK
+        wide = abs(a_row) * (0.5 * (HALF - 1) + reach + SLACK) + SLACK
+        pairs = _pairs(2 * wide, n)
+        table[FIRST, n] = table[SECOND, n] = 0
         for v in range(low, high, WIDTH):
-            middle = (v + 0.5 * (WIDTH - 1) - lowest) * a_row
-            first, last = max(0, int(math.ceil(middle - wide))), min(n, int(math.floor(middle + wide)) + 1)
-            a, b, rows = zero, zero, ramp(np.float32(v))
-            for k in range(first, last):
-                t = sub(rows, pick(table, ROW, k))
-                g = decay(mul(mul(t, t), pick(table, FALLING, k)), least)
-                a = fma(g, pick(table, FIRST, k), a)
-                b = fma(g, pick(table, SECOND, k), b)
+            middle = (v + 0.5 * (HALF - 1) - lowest) * a_row
+            k, m = _start(middle - wide, n, pairs), _start(middle + HALF * a_row - wide, n, pairs)
+            rows, later = add(twice, spread(np.float32(v))), add(twice, spread(np.float32(v + HALF)))
+            a, b, c, d = zero, zero, zero, zero
+            for _ in range(pairs):
+                t = sub(rows, pair(table, ROW, k))
+                g = decay(mul(mul(t, t), pair(table, FALLING, k)), least)
+                a = fma(g, pair(table, FIRST, k), a)
+                b = fma(g, pair(table, SECOND, k), b)
+                t = sub(later, pair(table, ROW, m))
+                g = decay(mul(mul(t, t), pair(table, FALLING, m)), least)
+                c = fma(g, pair(table, FIRST, m), c)
+                d = fma(g, pair(table, SECOND, m), d)
+                k, m = k + 2, m + 2
+            a, b = _paired(a, c), _paired(b, d)
             for u in range(left, right):
                 g = pick(gains, 0, u - left)
                 store(image, u, v, fma(g, a, load(image, u, v)))
@@ -221,7 +251,7 @@ def _forward_views(forward_view, runs, values, scale, cameras, images):
 
 
 def forward(runs, values, scale, cameras, images):
-    """Project values [splat, 2] onto views, one a thread: images [view, 2 · u, v + 8] must be zero."""
+    """Project values [splat, 2] onto views, one a thread: images [view, 2 · u, v + WIDTH] must be zero."""
     _forward_views(_forward_view.address(), runs, values, scale, cameras, images)
 
 
@@ -239,12 +269,20 @@ def _add_runs_own(table, bounds, sums):
         sums[bounds[0] + k, 1] += table[SECOND, k]
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _topmost(table, k, n):
+    """Return the least row of `HALF` splats from k on."""
+    return min(table[ROW, min(k, n - 1)], table[ROW, min(k + HALF, n) - 1])
+
+
 @compiled_once("UniTuple(int64, 2)", RUNS_TYPE, "float64", "float64[::1]", "float32[:,::1]", "float32[:,::1]")
 def _backward_runs(chosen, runs, scale, camera, image, sums):
     xy, starts, z, tallest = runs
     n_u, n_v = image.shape[0] // 2, image.shape[1] - WIDTH
-    place, profile = np.empty(PLACE), np.empty((2, n_v + WIDTH), np.float32)
-    least, zero = _least(camera), spread(np.float32(0))
+    place, profile = np.empty(PLACE), np.empty((2, n_v + WIDTH + 1), np.float32)
+    least, zero, two = _least(camera), spread(np.float32(0)), spread(np.float32(2))
+    twice = lower(ramp(np.float32(0)), ramp(np.float32(0)))
+    turns = sub(ramp(np.float32(0)), add(twice, twice))  # 0, 1, 0, 1, …
     table, gains = np.empty((5, tallest + WIDTH), np.float32), np.empty((1, n_u + WIDTH), np.float32)
     for run in range(chosen[0], chosen[1]):
         bounds = (starts[run], starts[run + 1])
@@ -260,18 +298,29 @@ def _backward_runs(chosen, runs, scale, camera, image, sums):
                 b = fma(g, load(image, n_u + u, v), b)
             store(profile, 0, v, a)
             store(profile, 1, v, b)
+        end = low + -(-(high - low) // WIDTH) * WIDTH
+        profile[0, end] = profile[1, end] = 0
         _shadows(camera, place, z, bounds, table)
         n = bounds[1] - bounds[0]
+        spacing = abs(table[ROW, n - 1] - table[ROW, 0]) / max(n - 1, 1)
+        pairs = _pairs((HALF - 1) * spacing + 2 * reach + 4 * SLACK, high - low)
         for k in range(0, n, WIDTH):
-            one, other = table[ROW, k], table[ROW, min(k + WIDTH, n) - 1]
-            first = max(low, int(math.ceil(min(one, other) - reach - SLACK)))
-            last = min(high, int(math.floor(max(one, other) + reach + SLACK)) + 1)
-            a, b, rows, falling = zero, zero, load(table, ROW, k), load(table, FALLING, k)
-            for v in range(first, last):
-                t = sub(spread(np.float32(v)), rows)
+            v = low + _start(_topmost(table, k, n) - reach - SLACK - low, high - low, pairs)
+            w = low + _start(_topmost(table, k + HALF, n) - reach - SLACK - low, high - low, pairs)
+            rows, falling = load(table, ROW, k), load(table, FALLING, k)
+            later, steep = upper(rows, rows), upper(falling, falling)
+            rows, falling = lower(rows, rows), lower(falling, falling)
+            t, s = sub(add(spread(np.float32(v)), turns), rows), sub(add(spread(np.float32(w)), turns), later)
+            a, b, c, d = zero, zero, zero, zero
+            for _ in range(pairs):
                 g = decay(mul(mul(t, t), falling), least)
-                a = fma(g, pick(profile, 0, v), a)
-                b = fma(g, pick(profile, 1, v), b)
+                a = fma(g, pair(profile, 0, v), a)
+                b = fma(g, pair(profile, 1, v), b)
+                g = decay(mul(mul(s, s), steep), least)
+                c = fma(g, pair(profile, 0, w), c)
+                d = fma(g, pair(profile, 1, w), d)
+                v, w, t, s = v + 2, w + 2, add(t, two), add(s, two)
+            a, b = _paired(a, c), _paired(b, d)
             store(table, FIRST, k, mul(a, load(table, PEAKS, k)))
             store(table, SECOND, k, mul(b, load(table, PEAKS, k)))
         _add_runs_own(table, bounds, sums)
@@ -289,5 +338,5 @@ def _backward_tasks(backward_runs, runs, scale, cameras, images, sums):
 
 
 def backward(runs, scale, cameras, images, sums):
-    """Apply the transpose: write to sums [splat, 2] Σ w·images over all pixels of images [view, 2 · u, v + 8]."""
+    """Apply the transpose: write to sums [splat, 2] Σ w·images over all pixels of images [view, 2 · u, v + WIDTH]."""
     _backward_tasks(_backward_runs.address(), runs, scale, cameras, images, sums)

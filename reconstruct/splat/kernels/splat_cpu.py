@@ -14,7 +14,7 @@ order), and as |v_c| det Σ^½/(τ²V) is the Gaussian's mass, that stays.
 A splat whose EWA form is within `tolerance` of its peak takes that form, by multiplication from row to row.
 
 Shapes are float32 [4, splat] (x, y, z, σ in mm) or [15, splat] (x, y, z, three σ, and R row by row: column k of R is
-the axis of σ_k). Images are float32 [channel · v, u + 8]; the last 8 columns stay zero, and count as such.
+the axis of σ_k). Images are float32 [channel · v, u + WIDTH]; the last WIDTH columns stay zero, and count as such.
 """
 
 import math
@@ -191,7 +191,7 @@ def _columns(fp, n_u):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _rows(fp, column, cutoff, n_v):
-    """Return the half-open range of rows within the cutoff in one of the columns `column` … `column` + 7."""
+    """Return the half-open range of rows within the cutoff in one of the columns `column` … `column` + WIDTH − 1."""
     a = column - fp[U0]
     b = a + (WIDTH - 1)
     near = a if a > 0 else (b if b < 0 else 0.0)
@@ -227,7 +227,7 @@ def _is_steep(fp, column, first, last):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _value(fp, column, t, dv):
-    """Return √(E/D) exp(−Q/2D), or exp(−Q/2) for a splat in its EWA form, in eight lanes."""
+    """Return √(E/D) exp(−Q/2D), or exp(−Q/2) for a splat in its EWA form, in the lanes."""
     falling = mul(t, spread(np.float32(-0.5 * fp[C_UU])))
     q = fma(falling, t, spread(np.float32(-0.5 * dv * dv / fp[S_VV])))
     if fp[EXACT] == 0:
@@ -362,7 +362,7 @@ def _forward_all(shapes, values, camera, image):
 
 @njit(cache=True, error_model="numpy", parallel=True)
 def forward_views(shapes, values, cameras, images):
-    """Project onto many views, one a thread: images [view, channel · v, u + 8] must be zero."""
+    """Project onto many views, one a thread: images [view, channel · v, u + WIDTH] must be zero."""
     for view in prange(cameras.shape[0]):
         _forward_all(shapes, values, cameras[view], images[view])
 
@@ -379,7 +379,7 @@ def _backward_chunk(shapes, bounds, cameras, images, n_u, sums):
 
 @njit(cache=True, error_model="numpy", parallel=True)
 def backward_views(shapes, cameras, images, sums):
-    """Apply the transpose: sums [splat, channel] += Σ w·images over all pixels of images [view, channel · v, u + 8]."""
+    """Apply the transpose: sums [splat, channel] += Σ w·images over images [view, channel · v, u + WIDTH]."""
     n = sums.shape[0]
     chunks = max(CHUNKS, n // 4096)
     for c in prange(chunks):

@@ -9,7 +9,7 @@ centre's shadow in units of the shadow's covariance S = JΣJᵀ, J the derivativ
 and D is A over its value on the ray through the centre; EWA takes D = 1 and that ray's |v|. A pixel that is a box has
 variance 1/12: S grows by it, and the peak falls so that the sum over all pixels stays.
 
-Shapes and cameras are those of `splat_cpu`; images are [view, channel · v, u + 8], the last 8 columns unused.
+Shapes and cameras are those of `splat_cpu`; images are [view, channel · v, u + WIDTH], the last WIDTH columns unused.
 """
 
 import numpy as np

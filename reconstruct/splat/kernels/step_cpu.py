@@ -1,4 +1,4 @@
-"""A preconditioned step of the splats' unknowns, in passes without temporaries: they are tens of millions."""
+"""Steps of the splats' unknowns and what leads to them, in passes without temporaries: they are tens of millions."""
 
 import math
 
@@ -6,6 +6,24 @@ import numpy as np
 from numba import njit, prange
 
 LEAST = 1e-20  # curvature, of what no ray sees
+
+
+@njit(parallel=True, cache=True)
+def multiply(slopes, pixels, finer, scratch, out):
+    """Write slopes [view, channel, row, column] times the pixel [view, row, column] that each lies in to `out`.
+
+    A pixel has finer × finer of them. The last columns, `scratch` of either, become 0; `out` may be `slopes`.
+    """
+    n_views, n_c, n_rows, n_columns = slopes.shape
+    for task in prange(n_views * n_rows):
+        view, row = task // n_rows, task % n_rows
+        line = pixels[view, row // finer, : pixels.shape[2] - scratch]
+        for c in range(n_c):
+            given, product = slopes[view, c, row], out[view, c, row]
+            for k in range(finer):
+                for i in range(line.size):
+                    product[finer * i + k] = given[finer * i + k] * line[i]
+            product[n_columns - scratch :] = 0
 
 
 @njit(parallel=True, cache=True, error_model="numpy")

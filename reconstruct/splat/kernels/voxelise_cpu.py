@@ -5,7 +5,7 @@ squares, so nothing cancels: a slice knows ξ_z, a row ξ_y, and along the row �
 1/12 to each of Σ's diagonal, to second order, and the peak falls so that the mass stays. Rows end where |ξ| reaches
 the cutoff, up to seven voxels later.
 
-Shapes are those of `splat_cpu`. Volumes are float32 [channel · z · y, x + 8]; the last 8 columns are scratch,
+Shapes are those of `splat_cpu`. Volumes are float32 [channel · z · y, x + WIDTH]; the last WIDTH columns are scratch,
 and zero where they are read. A grid vector is (voxel size z, y, x in mm, centre of voxel 0 z, y, x in mm, cutoff,
 variance of a box in voxels²).
 """
@@ -82,7 +82,7 @@ def _row(b, xi_z, y, left, n_x):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _value(b, square, centre, x):
-    """Return exp(−½|ξ|²) in eight voxels of a row."""
+    """Return exp(−½|ξ|²) in `WIDTH` voxels of a row."""
     xi = mul(ramp(np.float32(x - centre)), spread(np.float32(1 / b[L_XX])))
     along = mul(xi, spread(HALF))
     return exp(fma(along, xi, spread(np.float32(-0.5 * square))))
