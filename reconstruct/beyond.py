@@ -52,14 +52,17 @@ def seen_beyond(
     to miss all. The first and last row count where rays leave the grid upwards or downwards at all, a column where
     nothing farther out is seen from the other side, as it is beyond the short side of an offset detector.
     """
-    lit = data > np.maximum(LEAST, SIGMAS * np.sqrt(np.exp(np.maximum(data, 0)) / np.float32(i0)))
-    missing = 0 if lengths is None else int((lit & (lengths == 0)).sum())
+
+    def lit(p: NDArray[np.float32]) -> NDArray[np.bool_]:
+        return p > np.maximum(LEAST, SIGMAS * np.sqrt(np.exp(np.maximum(p, 0)) / np.float32(i0)))
+
+    missing = 0 if lengths is None else int((lit(data) & (lengths == 0)).sum())
     radius = field_radius(geometry)
     first, last = _reaches(geometry)
-    edges = {"first column": lit[:, :, 0]} if first >= NEARLY * min(radius, last) else {}
-    edges |= {"last column": lit[:, :, -1]} if last >= NEARLY * min(radius, first) else {}
+    edges = {"first column": lit(data[:, :, 0])} if first >= NEARLY * min(radius, last) else {}
+    edges |= {"last column": lit(data[:, :, -1])} if last >= NEARLY * min(radius, first) else {}
     if _leaves_through_the_ends(geometry, radius):
-        edges |= {"first row": lit[:, 0], "last row": lit[:, -1]}
+        edges |= {"first row": lit(data[:, 0]), "last row": lit(data[:, -1])}
     return Beyond(
         missing=missing if missing > 0.1 * SHARE * data.size else 0,
         sides={name: int(edge.sum()) for name, edge in edges.items() if edge.sum() > SHARE * edge.size},

@@ -1,5 +1,8 @@
 """How much a reading counts: by its photons, and by how well a model of finite resolution can explain it."""
 
+from concurrent.futures import ThreadPoolExecutor
+
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -40,13 +43,17 @@ def doubt_edges(p: Image, weights: Image, edges: float, scatter: float = 0.0) ->
     bend nothing and are not dark. Bounds, w < 0, keep their weights; their p lacks `scatter`, S/I0, which that of
     readings has.
     """
-    for reading, weight in zip(p, weights, strict=True):
+
+    def doubt(reading: Image, weight: Image) -> None:
         reading = as_read(reading, weight, scatter)
         bend = bends(reading, weight != 0) / np.float32(edges)
         dark = (reading > DARK) & (weight != 0)
         if dark.any():
             bend = np.where(ndimage.maximum_filter(dark, 3), ndimage.maximum_filter(bend, 3), bend)
         weight /= 1 + np.maximum(weight, 0) * bend * bend
+
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+        list(pool.map(doubt, p, weights))
 
 
 def as_read(p: Image, weights: Image, scatter: float) -> Image:

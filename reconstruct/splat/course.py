@@ -19,7 +19,7 @@ from ctsim.reconstruct.splat.response import Response
 EMPTY, AGAIN = 0.05, 0.3
 """Times water: below the first a voxel of the coarser volume is empty; within the shadows it begins at the second."""
 SMALLEST, FLATTEST = 24, 8  # voxels along x and y, and along z, below which there is no coarser level
-PASSES, ALONE, MOST, HALF = (20, 9), 12, 6e10, 0.5
+PASSES, ALONE, MOST, SHARE = (20, 9), 12, 9e10, 0.25
 """Passes over each coarser grid and the finest, or over one alone; fewer, at least one, where all of a grid would meet
 more voxels, and over a coarser grid where they would meet more than this share of what those over the finest do.
 
@@ -141,7 +141,7 @@ def passes_over(levels: list[Data], given: tuple[int, int] | None) -> list[int]:
     if given is not None:
         return [given[level is levels[-1]] for level in levels] if len(levels) > 1 else [sum(given)]
     finest = min(ALONE if len(levels) == 1 else PASSES[1], affordable(levels[-1].geometry))
-    most = min(HALF * finest * work(levels[-1].geometry), MOST)
+    most = min(SHARE * finest * work(levels[-1].geometry), MOST)
     return [*(max(min(PASSES[0], int(most / work(level.geometry))), 1) for level in levels[:-1]), finest]
 
 
@@ -156,7 +156,7 @@ def in_passes(finest: Geometry, given: tuple[int, int] | None) -> float:
     if alone:
         return float(min(ALONE, affordable(finest)))
     last = min(PASSES[1], affordable(finest))
-    return last + min(PASSES[0], 16 * HALF * last) / 15
+    return last + min(PASSES[0], 16 * SHARE * last) / 15
 
 
 def affordable(geometry: Geometry) -> int:
