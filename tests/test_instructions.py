@@ -1,7 +1,7 @@
 """What is equal on processors with other instructions: paths and draws to the bit, signals to a derived rounding.
 
 Another processor is this one when numba is told to use no more than x86-64 began with (or the least of its kind): no
-fused multiply-add, vectors of 128 bits. `CTSIM_INSTRUCTIONS=full` compiles the whole simulator so, which takes 2 min.
+fused multiply-add, vectors of 128 bits, eight lanes. `CTSIM_INSTRUCTIONS=full` compiles the whole simulator so, which takes 2 min.
 """
 
 import os
@@ -14,6 +14,9 @@ import pytest
 
 from ctsim.detector.noise import Noise, detect, pixel_pattern
 from ctsim.geometry import Geometry
+from ctsim.kernels.lanes import WIDTH
+from ctsim.reconstruct.splat.columns import LatticeProjector
+from ctsim.reconstruct.splat.lattice import Lattice
 from ctsim.rng import stream_key
 from ctsim.tracer.kernels.ray_cpu import signal
 from ctsim.tracer.project import Tracer, path_lengths
@@ -68,9 +71,22 @@ def measure() -> dict[str, np.ndarray]:
     found["counts"] = detect(
         m1, m1 * np.float32(0.9), noise=noise, i0=1e4, key=stream_key("a", "view", 1), pattern=pattern
     )
+    found |= splats(geometry, r)
     if FULL:
         found |= simulated()
     return found
+
+
+def splats(geometry, r) -> dict[str, np.ndarray]:
+    """Project a lattice of splats and take images back, all positive, with the lanes of these instructions."""
+    lattice = Lattice(geometry=geometry, support=r.random(geometry.n_voxel) < 0.7)
+    projector, views = LatticeProjector(geometry, lattice), np.arange(geometry.n_views)
+    pictures = r.random((len(views), 2, *geometry.n_detector)).astype(np.float32)
+    return {
+        "lanes": np.array(WIDTH),
+        "projected": projector.pictures(projector.forward(r.random((len(lattice), 2)).astype(np.float32), views)),
+        "sums": projector.adjoint(projector.arranged(pictures), views),
+    }
 
 
 def simulated() -> dict[str, np.ndarray]:
@@ -121,6 +137,14 @@ def test_signals_are_within_rounding_of_the_formula_on_both(here, other):
         bound = U * ((terms * each).sum(0) / terms.sum(0) + mu.shape[1] + 1)
         for found in (here, other):
             assert (np.abs(found[name] / terms.sum(0) - 1) <= bound * (1 + 1e-5)).all()
+
+
+def test_splats_are_within_rounding_with_lanes_of_another_number(here, other):
+    """Weights are the same to the bit, and sums of positive terms in whatever order within a rounding for each."""
+    assert other["lanes"] == 8
+    for name, terms in (("projected", here["sums"].shape[0]), ("sums", 7 * 12 * 12)):  # a shadow is 11 pixels wide
+        assert here[name].any()
+        assert (np.abs(here[name].astype(float) - other[name]) <= 2 * terms * U * here[name]).all(), name
 
 
 @pytest.mark.skipif(not FULL, reason="CTSIM_INSTRUCTIONS=full compiles the whole simulator, which takes 2 min")

@@ -6,7 +6,7 @@ import pytest
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.splat import metal
 from ctsim.reconstruct.splat.curve import DENSEST, MaterialCurve
-from ctsim.reconstruct.splat.kernels import response_reference
+from ctsim.reconstruct.splat.kernels import response_reference, step_cpu
 from ctsim.reconstruct.splat.lattice import Lattice
 from ctsim.reconstruct.splat.level import weighted
 from ctsim.reconstruct.splat.ordered import Fit
@@ -117,6 +117,19 @@ def test_slopes_are_the_derivatives_of_the_readings(volume, which):
     part.u = (u * (1 - step * way)).astype(np.float32)
     down, less = fit.fitted(views).astype(np.float64), CURVE.densities_of(part.u).astype(np.float64)
     assert (g * (up - down)).sum() == pytest.approx((by_density * (more - less)).sum(), rel=2e-3)
+
+
+@pytest.mark.parametrize("finer", [1, 2])
+def test_slopes_are_multiplied_by_their_pixels_and_scratch_becomes_zero(finer):
+    rng, scratch = np.random.default_rng(2), 3
+    slopes = rng.random((2, 2, 5 * finer, 7 * finer + scratch)).astype(np.float32)
+    pixels = rng.random((2, 5, 7 + scratch)).astype(np.float32)
+    expected = slopes * np.pad(pixels[..., :7].repeat(finer, 1).repeat(finer, 2), [(0, 0), (0, 0), (0, 3)])[:, None]
+    out = np.full_like(slopes, np.nan)
+    step_cpu.multiply(slopes, pixels, finer, scratch, out)
+    np.testing.assert_array_equal(out, expected)
+    step_cpu.multiply(slopes, pixels, finer, scratch, slopes)
+    np.testing.assert_array_equal(slopes, expected)
 
 
 def test_fine_metal_explains_readings_that_one_grid_does_not(volume):

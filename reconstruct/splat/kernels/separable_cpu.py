@@ -279,7 +279,7 @@ def _topmost(table, k, n):
 def _backward_runs(chosen, runs, scale, camera, image, sums):
     xy, starts, z, tallest = runs
     n_u, n_v = image.shape[0] // 2, image.shape[1] - WIDTH
-    place, profile = np.empty(PLACE), np.empty((2, n_v + WIDTH + 1), np.float32)
+    place, profile = np.empty(PLACE), np.zeros((2, n_v + WIDTH + 1), np.float32)  # a pair may end beyond the last row
     least, zero, two = _least(camera), spread(np.float32(0)), spread(np.float32(2))
     twice = lower(ramp(np.float32(0)), ramp(np.float32(0)))
     turns = sub(ramp(np.float32(0)), add(twice, twice))  # 0, 1, 0, 1, …
@@ -298,8 +298,6 @@ def _backward_runs(chosen, runs, scale, camera, image, sums):
                 b = fma(g, load(image, n_u + u, v), b)
             store(profile, 0, v, a)
             store(profile, 1, v, b)
-        end = low + -(-(high - low) // WIDTH) * WIDTH
-        profile[0, end] = profile[1, end] = 0
         _shadows(camera, place, z, bounds, table)
         n = bounds[1] - bounds[0]
         spacing = abs(table[ROW, n - 1] - table[ROW, 0]) / max(n - 1, 1)
