@@ -1,7 +1,8 @@
 """What is equal on processors with other instructions: paths and draws to the bit, signals to a derived rounding.
 
 Another processor is this one when numba is told to use no more than x86-64 began with (or the least of its kind): no
-fused multiply-add, vectors of 128 bits, eight lanes. `CTSIM_INSTRUCTIONS=full` compiles the whole simulator so, which takes 2 min.
+fused multiply-add, vectors of 128 bits, eight lanes. `CTSIM_INSTRUCTIONS=full` compiles the whole simulator so, which
+takes 2 min.
 """
 
 import os

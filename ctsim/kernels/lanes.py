@@ -20,7 +20,7 @@ from numba.extending import intrinsic, register_model
 
 def _has_avx512() -> bool:
     """Whether numba compiles for registers of 512 bits."""
-    told = config.CPU_FEATURES  # NUMBA_CPU_FEATURES, None unless set
+    told = vars(config)["CPU_FEATURES"]  # NUMBA_CPU_FEATURES, None unless set
     return "+avx512f" in (get_host_cpu_features() if told is None else told)
 
 
