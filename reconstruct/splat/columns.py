@@ -27,15 +27,14 @@ class LatticeProjector:
 
     def __init__(self, geometry: Geometry, lattice: Lattice, *, exact: bool = False) -> None:
         self._projector = Projector(geometry=geometry, tolerance=0 if exact else math.inf)
-        self._n_detector, self._scale = geometry.n_detector, lattice.scale
-        self._shapes = lattice.splats(np.zeros((len(lattice), 1), np.float32)).shapes()
+        self._n_detector, self._scale, self._n_splats = geometry.n_detector, lattice.scale, len(lattice)
         self.by_columns = not exact and _upright(self._projector.cameras)
         if self.by_columns:
-            places = lattice.positions[:, :2]
-            breaks = np.any(places[1:] != places[:-1], axis=1) | (np.diff(lattice.index) != 1)
-            starts = np.unique(np.concatenate([[0], np.flatnonzero(breaks) + 1, [len(lattice)]])).astype(np.int64)
-            z = np.pad(lattice.positions[None, :, 2], [(0, 0), (0, WIDTH)])
-            self._runs = (places[starts[:-1]].astype(np.float64), starts, z, int(np.diff(starts).max(initial=0)))
+            places, starts = lattice.runs()
+            z = np.pad(lattice.heights[None], [(0, 0), (0, WIDTH)])
+            self._runs = (places, starts, z, int(np.diff(starts).max(initial=0)))
+        else:
+            self._shapes = lattice.splats(np.zeros((len(lattice), 1), np.float32)).shapes()
 
     def forward(self, values: Image, views: NDArray[np.int64]) -> Image:
         """Sum values [splat, 2] times line integrals (mm) over the splats; scratch columns may hold anything finite."""
@@ -54,7 +53,7 @@ class LatticeProjector:
         if not self.by_columns:
             return self._projector.adjoint(self._shapes, images, views)
         stack = images.reshape(len(views), 2 * self._n_detector[1], images.shape[-1])
-        sums = np.empty((self._shapes.shape[1], 2), np.float32) if out is None else out
+        sums = np.empty((self._n_splats, 2), np.float32) if out is None else out
         kernels.backward(self._runs, self._scale, self._projector.cameras[views], stack, sums)
         return sums
 

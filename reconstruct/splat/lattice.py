@@ -29,24 +29,23 @@ class Lattice:
 
     geometry: Geometry
     support: NDArray[np.bool_]
-    positions: NDArray[np.float32] = field(init=False)
     scale: float = field(init=False)
     unit: float = field(init=False)
     index: NDArray[np.int64] = field(init=False)
     _box: tuple[slice, ...] = field(init=False)
+    _axes: tuple[NDArray[np.float32], ...] = field(init=False)  # y, x and z (mm) within the box
     _size: tuple[int, ...] = field(init=False)
     _denoiser: Denoiser = field(init=False)
     _volume: NDArray[np.float32] = field(init=False)
 
     def __post_init__(self) -> None:
-        z, y, x = (axis.astype(np.float32) for axis in self.geometry.voxel_centres())
-        columns = self.support.transpose(1, 2, 0)
-        j, i, k = np.nonzero(columns)
-        self.positions = np.stack([x[i], y[j], z[k]], 1)
+        columns, (z, y, x) = self.support.transpose(1, 2, 0), self.geometry.voxel_centres()
         d = np.array(self.geometry.d_voxel)
         self.scale = SIGMA * float(np.prod(d)) ** (1 / 3)
         self.unit = float((math.sqrt(2 * math.pi) * self.scale) ** 3 / np.prod(d))
-        self._box = tuple(slice(int(n.min()), int(n.max()) + 1) if n.size else slice(0, 0) for n in (j, i, k))
+        held = (np.flatnonzero(columns.any(others)) for others in ((1, 2), (0, 2), (0, 1)))
+        self._box = tuple(slice(int(n[0]), int(n[-1]) + 1) if n.size else slice(0, 0) for n in held)
+        self._axes = tuple(axis[part].astype(np.float32) for axis, part in zip((y, x, z), self._box, strict=True))
         inside = np.ascontiguousarray(columns[self._box])
         self._size, self.index = inside.shape, np.flatnonzero(inside)
         self._volume = np.empty(self._size, np.float32)
@@ -54,6 +53,28 @@ class Lattice:
 
     def __len__(self) -> int:
         return len(self.index)
+
+    @property
+    def positions(self) -> NDArray[np.float32]:
+        """The middles of the splats, (x, y, z) in mm: [splat, 3], made anew each time."""
+        return np.stack([*self._above(self.index), self.heights], 1)
+
+    @property
+    def heights(self) -> NDArray[np.float32]:
+        """The splats' z in mm."""
+        return self._axes[2][self.index % max(self._size[2], 1)]
+
+    def runs(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return (x, y) in mm of runs, splats on end above each other, and where they start and the last ends."""
+        begins = np.ones(len(self) + 1, np.bool_)
+        begins[1:-1] = (np.diff(self.index) != 1) | (self.index[1:] % max(self._size[2], 1) == 0)
+        starts = np.flatnonzero(begins)
+        return np.stack(self._above(self.index[starts[:-1]]), 1).astype(np.float64), starts
+
+    def _above(self, index: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return x and y in mm at places in the flat box."""
+        column = index // max(self._size[2], 1)
+        return self._axes[1][column % max(self._size[1], 1)], self._axes[0][column // max(self._size[1], 1)]
 
     def splats(self, densities: NDArray[np.float32]) -> Splats:
         """Return the splats with densities [splat, channel] that are given as attenuations of the volume."""

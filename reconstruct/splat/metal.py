@@ -40,18 +40,24 @@ def surface(part: Part) -> Mask:
 
 
 def split(part: Part, fine: Mask) -> list[Part]:
-    """Return `part` without the voxels `fine` [z, y, x], which must not be none, and those on finer splats."""
-    values = part.lattice.scattered(part.u)
-    rest = Lattice(geometry=part.geometry, support=part.lattice.support & ~fine)
-    box = ndimage.find_objects(fine.astype(np.uint8))[0]
-    geometry = _finer(part.geometry, box)
-    lattice = Lattice(geometry=geometry, support=fine[box].repeat(FINER, 0).repeat(FINER, 1).repeat(FINER, 2))
-    start = lattice.gather(refined(values[box], geometry))
-    tissue = Part(geometry=part.geometry, lattice=rest, curve=part.curve, u=rest.gather(values), exact=part.exact)
+    """Return `part` without the voxels `fine` [z, y, x], which must not be none, and those on finer splats.
+
+    Memory is at its peak here: a `part` that only the caller's expression knows is gone before its rest is made.
+    """
+    geometry, support, measured = part.geometry, part.lattice.support, part.measured
+    curve, exact = part.curve, part.exact
+    values, *curvature = map(part.lattice.scattered, (part.u, part.curvature[:, 0], part.curvature[:, 1]))
+    del part
+    rest = Lattice(geometry=geometry, support=support & ~fine)
+    tissue = Part(geometry=geometry, lattice=rest, curve=curve, u=rest.gather(values), exact=exact)
     for channel in (0, 1):
-        tissue.curvature[:, channel] = rest.gather(part.lattice.scattered(part.curvature[:, channel]))
-    tissue.measured = part.measured
-    metal = Part(geometry=geometry, lattice=lattice, curve=part.curve, u=start, finer=FINER, exact=part.exact)
+        tissue.curvature[:, channel] = rest.gather(curvature[channel])
+    tissue.measured = measured
+    box = ndimage.find_objects(fine.astype(np.uint8))[0]
+    finer = _finer(geometry, box)
+    lattice = Lattice(geometry=finer, support=fine[box].repeat(FINER, 0).repeat(FINER, 1).repeat(FINER, 2))
+    start = lattice.gather(refined(values[box], finer))
+    metal = Part(geometry=finer, lattice=lattice, curve=curve, u=start, finer=FINER, exact=exact)
     return [tissue, metal]
 
 

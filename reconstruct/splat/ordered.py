@@ -166,7 +166,7 @@ class Fit:
     def _split(self, fine: NDArray[np.bool_]) -> None:
         """Give voxels `fine` finer splats; none, or all that there are, change nothing."""
         if fine.any() and np.any(self.parts[0].lattice.support & ~fine):
-            self.parts, self.fine = split(self.parts[0], fine), fine
+            self.parts, self.fine = split(self.parts.pop(), fine), fine
 
     def _seen(self, paths: list[Image]) -> tuple[Image, list[Image]]:
         """Return P, as an image of the first part, and its derivatives by every part's paths, as these are."""
