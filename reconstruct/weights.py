@@ -44,8 +44,8 @@ def doubt_edges(p: Image, weights: Image, edges: float, scatter: float = 0.0) ->
     readings has.
     """
 
-    def doubt(reading: Image, weight: Image) -> None:
-        reading = as_read(reading, weight, scatter)
+    def doubt(view: tuple[Image, Image]) -> None:
+        reading, weight = as_read(*view, scatter), view[1]
         bend = bends(reading, weight != 0) / np.float32(edges)
         dark = (reading > DARK) & (weight != 0)
         if dark.any():
@@ -53,7 +53,7 @@ def doubt_edges(p: Image, weights: Image, edges: float, scatter: float = 0.0) ->
         weight /= 1 + np.maximum(weight, 0) * bend * bend
 
     with ThreadPoolExecutor(numba.get_num_threads()) as pool:
-        list(pool.map(doubt, p, weights))
+        list(pool.map(doubt, zip(p, weights, strict=True)))
 
 
 def as_read(p: Image, weights: Image, scatter: float) -> Image:

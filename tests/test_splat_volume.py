@@ -77,7 +77,7 @@ def test_a_splat_ends_at_the_cutoff(kind):
         inside, wide = exact(given, geometry, True, 3.5), exact(given, geometry, True, np.inf)
         peak = wide.max()
         assert np.abs(got - inside)[inside > 0].max() < 1e-6 * peak
-        # up to seven voxels of a row may be there that lie beyond
+        # up to WIDTH − 1 voxels of a row may be there that lie beyond
         assert np.minimum(np.abs(got - wide), got)[inside == 0].max() < 1e-6 * peak
         assert (got[inside == 0] == 0).any()
 

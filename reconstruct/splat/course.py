@@ -21,7 +21,8 @@ EMPTY, AGAIN = 0.05, 0.3
 SMALLEST, FLATTEST = 24, 8  # voxels along x and y, and along z, below which there is no coarser level
 PASSES, ALONE, MOST, SHARE = (20, 9), 12, 9e10, 0.25
 """Passes over each coarser grid and the finest, or over one alone; fewer, at least one, where all of a grid would meet
-more voxels, and over a coarser grid where they would meet more than this share of what those over the finest do.
+more voxels, and over a coarser grid where they would meet more than this share of what those over the finest do, two
+of them at least.
 
 A pass over half the resolution costs a sixteenth. What dark rays alone tell, as between rods of metal, takes many.
 """
@@ -141,7 +142,7 @@ def passes_over(levels: list[Data], given: tuple[int, int] | None) -> list[int]:
     if given is not None:
         return [given[level is levels[-1]] for level in levels] if len(levels) > 1 else [sum(given)]
     finest = min(ALONE if len(levels) == 1 else PASSES[1], affordable(levels[-1].geometry))
-    most = min(SHARE * finest * work(levels[-1].geometry), MOST)
+    most = min(SHARE * max(finest, 2) * work(levels[-1].geometry), MOST)
     return [*(max(min(PASSES[0], int(most / work(level.geometry))), 1) for level in levels[:-1]), finest]
 
 
@@ -156,7 +157,7 @@ def in_passes(finest: Geometry, given: tuple[int, int] | None) -> float:
     if alone:
         return float(min(ALONE, affordable(finest)))
     last = min(PASSES[1], affordable(finest))
-    return last + min(PASSES[0], 16 * SHARE * last) / 15
+    return last + min(PASSES[0], 16 * SHARE * max(last, 2)) / 15
 
 
 def affordable(geometry: Geometry) -> int:

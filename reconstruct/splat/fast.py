@@ -68,7 +68,8 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How a fit goes, what beam it assumes, and how its volume is read.
 
     `passes` null makes them 20 and 9, or 12 over a grid that is alone, and fewer, at least one, where the passes over a
-    level times its views times its voxels would be more than 9e10, minutes of two cores. `tv` is stronger in the first
+    level times its views times its voxels would be more than 9e10, minutes of two cores, or over a coarser grid more
+    than a quarter of that over the finest (of two passes at least). `tv` is stronger in the first
     passes and on coarser levels. Weights are the share of photons that came through. On coarser grids those of dark
     rays are raised as by an error of P of 0.005 besides noise. Where a body is thick they are raised on the finest
     grid, too, to half of the usual weight, but by no more than an error of `model_error` would; 0 leaves them there.

@@ -104,15 +104,14 @@ class Fit:
             turn, k = divmod(self.steps, n)
             if turn == self.metal_from and k == 0:
                 self._split(surface(self.parts[0]))
-            new = self.parts[turn > 0 :] if turn in (0, self.metal_from) and k % every == 0 else []
+            first_new = (turn > 0) if turn in (0, self.metal_from) and k % every == 0 else len(self.parts)
             views, length = np.arange(order[k], n_views, n), step_length(self.steps / n, passes)
-            self.loss = self._step(views, new, length)
+            self.loss = self._step(views, self.parts[first_new:], length)
             self.steps, self._total = self.steps + 1, (self._total if k else 0.0) + self.loss
             if (k + 1) % every == 0 or k + 1 == n:
                 hundreds = (k % every + 1) / n * n_views / 100
                 threshold = self.tv * self.curve.water * 2 ** max(min(passes, SETTLED) - 1 - turn, 0)
-                for part in self.parts:
-                    part.denoise(threshold * hundreds, SMOOTHING)
+                self._denoise(threshold * hundreds)
             if k + 1 == n:
                 self.misfit = self._total / n
             if not proceed(self, k + 1 == n):
@@ -167,6 +166,11 @@ class Fit:
         """Give voxels `fine` finer splats; none, or all that there are, change nothing."""
         if fine.any() and np.any(self.parts[0].lattice.support & ~fine):
             self.parts, self.fine = split(self.parts.pop(), fine), fine
+
+    def _denoise(self, threshold: float) -> None:
+        """Denoise all parts: not in `run`, whose loop would still know a part that is split and gone."""
+        for part in self.parts:
+            part.denoise(threshold, SMOOTHING)
 
     def _seen(self, paths: list[Image]) -> tuple[Image, list[Image]]:
         """Return P, as an image of the first part, and its derivatives by every part's paths, as these are."""

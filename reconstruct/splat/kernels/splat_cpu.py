@@ -42,7 +42,7 @@ CHUNKS = 16  # of splats at least, one a task
 ROWS = 32  # rows by multiplication before the exponentials are computed again
 STEEP = 110.0  # −2 log of the faintest value that multiplication may start from
 CHANGE = 50.0  # −2 log of what multiplication may make of a fainter one: e^(25 − 55) of the peak is nothing
-UPRIGHT, NARROWEST = 0.1, 12.5  # C_uv/C_vv and C_vv up to which a change, (cutoff + 0.8 √C_vv)², stays below it
+UPRIGHT, NARROWEST = 0.8 / WIDTH, 12.5  # C_uv/C_vv, C_vv: up to these a change, (cutoff + 0.8 √C_vv)², stays below it
 LARGEST = 1e30  # of a line integral: what is longer is not a splat
 # a camera vector: source, detector centre − source, u step, v step, then numbers, and what follows from all these
 SOURCE, ACROSS, STEP_U, STEP_V, CUTOFF, TOLERANCE, BOX = 0, 3, 6, 9, 12, 13, 14

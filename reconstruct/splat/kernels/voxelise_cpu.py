@@ -3,7 +3,7 @@
 With x = (z, y, x) in voxels from the centre and Σ = LLᵀ in that order, ξ = L⁻¹x gives the exponent −½|ξ|² as a sum of
 squares, so nothing cancels: a slice knows ξ_z, a row ξ_y, and along the row ξ_x is linear. A voxel that is a box adds
 1/12 to each of Σ's diagonal, to second order, and the peak falls so that the mass stays. Rows end where |ξ| reaches
-the cutoff, up to seven voxels later.
+the cutoff, or up to WIDTH − 1 voxels later.
 
 Shapes are those of `splat_cpu`. Volumes are float32 [channel · z · y, x + WIDTH]; the last WIDTH columns are scratch,
 and zero where they are read. A grid vector is (voxel size z, y, x in mm, centre of voxel 0 z, y, x in mm, cutoff,
