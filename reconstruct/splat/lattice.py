@@ -1,6 +1,7 @@
 """Round splats on the reconstruction grid, where there is something."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numba
@@ -16,6 +17,7 @@ from ctsim.reconstruct.tv import Denoiser, axis_ratios
 SIGMA = 0.45
 """σ of a splat in voxels: wider ones, not negative, cannot make the edges of a volume of this grid."""
 SLICES = 32  # of a volume that are filtered together
+PIECE = 1 << 22  # splats
 
 
 @dataclass(slots=True, kw_only=True)
@@ -57,12 +59,12 @@ class Lattice:
     @property
     def positions(self) -> NDArray[np.float32]:
         """The middles of the splats, (x, y, z) in mm: [splat, 3], made anew each time."""
-        return np.stack([*self._above(self.index), self.heights], 1)
+        return self._at(self.index)
 
     @property
     def heights(self) -> NDArray[np.float32]:
         """The splats' z in mm."""
-        return self._axes[2][self.index % max(self._size[2], 1)]
+        return self._height(self.index)
 
     def runs(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return (x, y) in mm of runs, splats on end above each other, and where they start and the last ends."""
@@ -71,6 +73,12 @@ class Lattice:
         starts = np.flatnonzero(begins)
         return np.stack(self._above(self.index[starts[:-1]]), 1).astype(np.float64), starts
 
+    def _at(self, index: NDArray[np.int64]) -> NDArray[np.float32]:
+        return np.stack([*self._above(index), self._height(index)], 1)
+
+    def _height(self, index: NDArray[np.int64]) -> NDArray[np.float32]:
+        return self._axes[2][index % max(self._size[2], 1)]
+
     def _above(self, index: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return x and y in mm at places in the flat box."""
         column = index // max(self._size[2], 1)
@@ -78,10 +86,19 @@ class Lattice:
 
     def splats(self, densities: NDArray[np.float32]) -> Splats:
         """Return the splats with densities [splat, channel] that are given as attenuations of the volume."""
+        return self._some(densities, slice(None))
+
+    def pieces(self, densities: NDArray[np.float32]) -> Iterator[Splats]:
+        """Return the splats in pieces: all at once they take more memory than the rest of a large fit."""
+        for first in range(0, max(len(self), 1), PIECE):
+            yield self._some(densities, slice(first, first + PIECE))
+
+    def _some(self, densities: NDArray[np.float32], which: slice) -> Splats:
+        positions = self._at(self.index[which])
         return Splats(
-            positions=self.positions,
-            scales=np.full((len(self), 1), self.scale, np.float32),
-            densities=(densities / np.float32(self.unit)).astype(np.float32),
+            positions=positions,
+            scales=np.full((len(positions), 1), self.scale, np.float32),
+            densities=(densities[which] / np.float32(self.unit)).astype(np.float32),
         )
 
     @property

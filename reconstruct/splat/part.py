@@ -127,11 +127,18 @@ class Part:
 
     def densities(self, geometry: Geometry) -> Image:
         """Return ρa and ρb, means over the voxels of a grid: [2, z, y, x]."""
-        return voxelise(self.lattice.splats(self.curve.densities_of(self.u)), geometry)
+        return self._voxelised(self.curve.densities_of(self.u), geometry)
 
     def volume(self, geometry: Geometry) -> Image:
         """Return u, a mean over the voxels of a grid: [z, y, x] in 1/mm."""
-        return voxelise(self.lattice.splats(self.u[:, None]), geometry)[0]
+        return self._voxelised(self.u[:, None], geometry)[0]
+
+    def _voxelised(self, densities: Image, geometry: Geometry) -> Image:
+        volumes = (voxelise(piece, geometry) for piece in self.lattice.pieces(densities))
+        volume = next(volumes)
+        for more in volumes:
+            volume += more
+        return volume
 
     def _ramp(self, n_views: int) -> Image:
         _, n_y, n_x = self.lattice.support.shape
