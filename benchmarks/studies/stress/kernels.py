@@ -20,6 +20,7 @@ from ctsim.benchmarks.studies.stress.scans import FEW, Findings, Stacks, exact_p
 from ctsim.benchmarks.studies.stress.suite import P_SURE, RODS, Scene, in_air
 from ctsim.detector.noise import Noise
 from ctsim.geometry import Geometry
+from ctsim.kernels.lanes import WIDTH
 from ctsim.materials import attenuation
 from ctsim.plan import make_plan
 from ctsim.reconstruct.splat.descent.densify import Schedule, densify
@@ -47,6 +48,7 @@ GEOMETRY = Geometry(
     n_views=3,
     start_deg=7.0,
 )
+WITH_SCRATCH = (GEOMETRY.n_detector[0], GEOMETRY.n_detector[1] + WIDTH)  # of a splat projector's image
 TURNED = (1.0, 0.3, 0.2, 0.1)
 
 
@@ -221,7 +223,7 @@ def _near_float64(found: Findings, given: Splats) -> None:
 
 
 def _gradient_is_finite(found: Findings, given: Splats) -> None:
-    image = np.random.Generator(np.random.Philox(key=3)).normal(size=(2, 23, 38)).astype(np.float32)
+    image = np.random.Generator(np.random.Philox(key=3)).normal(size=(2, *WITH_SCRATCH)).astype(np.float32)
     gradient = Projector(geometry=GEOMETRY).gradient(given, image, 0)
     for name in ("densities", "positions", "log_scales", "rotations", "centres"):
         found.finite(f"the gradient in {name}", getattr(gradient, name))
@@ -281,7 +283,7 @@ def empty(_: int, found: Findings) -> None:
     none = Splats(**{name: a[:0] for name, a in asdict(FAIR).items()})
     view = Projector(geometry=GEOMETRY)
     images = view.forward(none.shapes(), none.densities)
-    found.say("images of zeros", holds=images.shape == (3, 2, 23, 38) and not images.any())
+    found.say("images of zeros", holds=images.shape == (3, 2, *WITH_SCRATCH) and not images.any())
     found.say("a volume of zeros", holds=not voxelise(none, GEOMETRY).any())
     found.say("no sums", holds=view.adjoint(none.shapes(), images).shape == (0, 2))
     _gradient_is_finite(found, none)
