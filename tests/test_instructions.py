@@ -141,7 +141,7 @@ def test_signals_are_within_rounding_of_the_formula_on_both(here, other):
 
 
 def test_splats_are_within_rounding_with_lanes_of_another_number(here, other):
-    """Weights are the same to the bit, and sums of positive terms in whatever order within a rounding for each."""
+    """Weights are the same to the bit, and sums of positive terms, in any order, within a rounding for each."""
     assert other["lanes"] == 8
     for name, terms in (("projected", here["sums"].shape[0]), ("sums", 7 * 12 * 12)):  # a shadow is 11 pixels wide
         assert here[name].any()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ctsim.geometry import Geometry
-from ctsim.reconstruct.splat import metal
+from ctsim.reconstruct.splat import lattice, metal
 from ctsim.reconstruct.splat.curve import DENSEST, MaterialCurve
 from ctsim.reconstruct.splat.kernels import response_reference, step_cpu
 from ctsim.reconstruct.splat.lattice import Lattice
@@ -130,6 +130,15 @@ def test_slopes_are_multiplied_by_their_pixels_and_scratch_becomes_zero(finer):
     np.testing.assert_array_equal(out, expected)
     step_cpu.multiply(slopes, pixels, finer, scratch, slopes)
     np.testing.assert_array_equal(slopes, expected)
+
+
+def test_a_volume_is_the_sum_of_its_pieces(volume, monkeypatch):
+    part = part_of(volume)
+    whole = part.densities(GEOMETRY), part.volume(GEOMETRY)
+    monkeypatch.setattr(lattice, "PIECE", len(part.u) // 3)
+    assert len(list(part.lattice.pieces(part.u[:, None]))) > 2
+    for found, expected in zip((part.densities(GEOMETRY), part.volume(GEOMETRY)), whole, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * expected.max())
 
 
 def test_fine_metal_explains_readings_that_one_grid_does_not(volume):
