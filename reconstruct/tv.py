@@ -9,11 +9,16 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.kernels import tv_cpu as kernels
 
+SPARSE = 0.25  # of its box that a support fills, up to which boxes around its islands are looked for
+MANY = 1000  # islands, from which on they take longer than the memory is worth
+
 Array = NDArray[np.float32]
+Box = tuple[slice, ...]
 
 
 def axis_ratios(geometry: Geometry) -> NDArray[np.float32]:
@@ -29,10 +34,17 @@ class Denoiser:
     doi:10.1109/TIP.2009.2028250. The dual field is kept from call to call, as a start for the next.
     """
 
-    def __init__(self, support: NDArray[np.bool_], ratios: NDArray[np.float32], positivity: bool) -> None:
+    def __init__(
+        self,
+        support: NDArray[np.bool_],
+        ratios: NDArray[np.float32],
+        positivity: bool,
+        memory: tuple[Array, Array] | None = None,
+    ) -> None:
+        """Denoise on `support`; `memory` is a dual field of zeros and one to work in, None for new ones."""
         self.support, self.ratios, self.positivity = support, ratios, positivity
-        self.dual = np.zeros((3, *support.shape), np.float32)
-        self._ahead = np.empty_like(self.dual)
+        shape = (3, *support.shape)
+        self.dual, self._ahead = memory or (np.zeros(shape, np.float32), np.empty(shape, np.float32))
 
     def run(self, b: Array, tau: float, iterations: int) -> Array:
         """Return the minimiser of `b`, [y, x, z], after `iterations` steps."""
@@ -50,6 +62,54 @@ class Denoiser:
             start, t = ahead, after
         kernels.primal(b, self.dual, np.float32(tau), self.ratios, self.support, self.positivity, x)
         return x
+
+
+class SparseDenoiser:
+    """A `Denoiser` that holds boxes around the islands of its support alone, to the same bits.
+
+    A slope reaches from a voxel to those next to it, and the slopes of one voxel to those that touch by a corner:
+    islands that do not even touch so do not know of each other, and a margin of one voxel holds all slopes of each. The
+    `dual` fields of the boxes lie one after another: [number].
+    """
+
+    def __init__(
+        self, support: NDArray[np.bool_], boxes: list[tuple[Box, NDArray[np.bool_]]], ratios: Array, positivity: bool
+    ) -> None:
+        sizes = [3 * island.size for _, island in boxes]
+        ends = np.cumsum(sizes)
+        self._shape = support.shape
+        self.dual, ahead = np.zeros(ends[-1], np.float32), np.empty(max(sizes), np.float32)
+        self._parts = [
+            (box, Denoiser(island, ratios, positivity, (field.reshape(shape), ahead[: field.size].reshape(shape))))
+            for (box, island), field in zip(boxes, np.split(self.dual, ends[:-1]), strict=True)
+            for shape in [(3, *island.shape)]
+        ]
+
+    def run(self, b: Array, tau: float, iterations: int) -> Array:
+        """Return the minimiser of `b`, [y, x, z], after `iterations` steps."""
+        x = np.zeros(self._shape, np.float32)
+        for box, part in self._parts:
+            x[box] += part.run(np.ascontiguousarray(b[box]), tau, iterations)  # boxes overlap, islands do not
+        return x
+
+
+def denoiser_on(support: NDArray[np.bool_], ratios: NDArray[np.float32], positivity: bool) -> Denoiser | SparseDenoiser:
+    """Return a denoiser of as little memory as the support allows: shells of metal fill little of their box."""
+    if support.any() and support.mean() <= SPARSE:
+        boxes = _islands(support)
+        if len(boxes) <= MANY and 2 * sum(island.size for _, island in boxes) <= support.size:
+            return SparseDenoiser(support, boxes, ratios, positivity)
+    return Denoiser(support, ratios, positivity)
+
+
+def _islands(support: NDArray[np.bool_]) -> list[tuple[Box, NDArray[np.bool_]]]:
+    """Return boxes around what touches, one voxel wider where the support has room, and what of it is within each."""
+    labels, _ = ndimage.label(support, np.ones((3, 3, 3), np.bool_))
+    boxes = (
+        tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in box)  # beyond the last voxel a slice ends by itself
+        for box in ndimage.find_objects(labels)
+    )
+    return [(box, labels[box] == k) for k, box in enumerate(boxes, start=1)]
 
 
 def total_variation(x: Array, ratios: NDArray[np.float32]) -> float:

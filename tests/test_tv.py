@@ -10,7 +10,7 @@ from ctsim.baselines.sart import sart
 from ctsim.baselines.tv_methods import asd_pocs, awpcsd, fista_tv
 from ctsim.reconstruct.kernels.tv_reference import primal, slopes
 from ctsim.reconstruct.projector import forward
-from ctsim.reconstruct.tv import Denoiser, axis_ratios, descend, total_variation
+from ctsim.reconstruct.tv import Denoiser, SparseDenoiser, axis_ratios, denoiser_on, descend, total_variation
 
 
 def test_fista_keeps_its_promise():
@@ -105,6 +105,41 @@ def test_a_second_denoising_starts_from_the_dual_field_of_the_first_and_nothing_
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
         np.testing.assert_allclose(denoiser.dual, dual, rtol=0, atol=1e-5)
     assert np.abs(expected - fgp(b, tau, 6, 0 * dual, support)[0]).max() > 1e-3  # a cold start is seen
+
+
+def islands():
+    """Pieces that touch by an edge, that lie one voxel apart, within another's box, and at every border: [y, x, z]."""
+    support = np.zeros((23, 26, 29), bool)
+    support[0:3, 1:4, 0:2] = True
+    support[3, 0, 0:2] = support[5, 0, 0:2] = True  # by an edge of the first, and one voxel from that
+    support[8, 9:12, 8:10] = True
+    support[8:20, 20, 4:20] = support[19, 6:20, 4:20] = True  # an angle, whose box holds the last one
+    support[-2:, -3:, -4:] = True
+    return support
+
+
+@pytest.mark.parametrize("positivity", [True, False])
+def test_islands_are_denoised_as_one_support_is_to_the_bit(positivity):
+    rng, support = np.random.default_rng(4), islands()
+    whole, sparse = Denoiser(support, RATIOS, positivity), denoiser_on(support, RATIOS, positivity)
+    assert isinstance(sparse, SparseDenoiser) and 2 * sparse.dual.size < whole.dual.size
+    for tau in (0.3, 0.2, 0.0):
+        b = (rng.standard_normal(support.shape) + 0.5).astype(np.float32)
+        expected = whole.run(b, tau, 6)
+        np.testing.assert_array_equal(sparse.run(b, tau, 6), expected)
+        assert np.abs(expected[support] - b[support]).max() > 0.1 or tau == 0
+
+
+def test_a_support_that_fills_its_box_is_not_taken_apart():
+    assert isinstance(denoiser_on(np.ones((6, 5, 4), bool), RATIOS, True), Denoiser)
+    assert isinstance(denoiser_on(np.zeros((6, 5, 4), bool), RATIOS, True), Denoiser)
+    assert isinstance(denoiser_on(np.zeros((0, 0, 0), bool), RATIOS, True), Denoiser)
+    thin = np.zeros((40, 40, 40), bool)
+    thin[::39], thin[:, ::39], thin[..., ::39] = True, True, True  # a hollow box is one island as large as its box
+    assert isinstance(denoiser_on(thin, RATIOS, True), Denoiser)
+    dust = np.zeros((60, 60, 60), bool)
+    dust[::5, ::5, ::5] = True
+    assert isinstance(denoiser_on(dust, RATIOS, True), Denoiser)
 
 
 def test_total_variation_and_its_descent():

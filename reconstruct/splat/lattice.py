@@ -12,7 +12,7 @@ from scipy import fft
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.splat.kernels import step_cpu
 from ctsim.reconstruct.splat.model import Splats
-from ctsim.reconstruct.tv import Denoiser, axis_ratios
+from ctsim.reconstruct.tv import Denoiser, SparseDenoiser, axis_ratios, denoiser_on
 
 SIGMA = 0.45
 """σ of a splat in voxels: wider ones, not negative, cannot make the edges of a volume of this grid."""
@@ -37,7 +37,7 @@ class Lattice:
     _box: tuple[slice, ...] = field(init=False)
     _axes: tuple[NDArray[np.float32], ...] = field(init=False)  # y, x and z (mm) within the box
     _size: tuple[int, ...] = field(init=False)
-    _denoiser: Denoiser = field(init=False)
+    _denoiser: Denoiser | SparseDenoiser = field(init=False)
     _volume: NDArray[np.float32] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -51,7 +51,7 @@ class Lattice:
         inside = np.ascontiguousarray(columns[self._box])
         self._size, self.index = inside.shape, np.flatnonzero(inside)
         self._volume = np.empty(self._size, np.float32)
-        self._denoiser = Denoiser(inside, axis_ratios(self.geometry), positivity=True)
+        self._denoiser = denoiser_on(inside, axis_ratios(self.geometry), positivity=True)
 
     def __len__(self) -> int:
         return len(self.index)
@@ -103,7 +103,7 @@ class Lattice:
 
     @property
     def dual(self) -> NDArray[np.float32]:
-        """The denoiser's dual field, with which it starts: [3, y, x, z]."""
+        """The denoiser's dual field, with which it starts."""
         return self._denoiser.dual
 
     @property
