@@ -11,9 +11,11 @@ import pytest
 import ctsim
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.splat import fast, filtration
+from ctsim.reconstruct.splat.curve import MaterialCurve
 from ctsim.reconstruct.splat.fast import Settings, reconstruct
 from ctsim.reconstruct.splat.filtration import PLAUSIBLE, USUAL, Filtration, found
 from ctsim.reconstruct.splat.level import Data, thinned
+from ctsim.reconstruct.splat.response import evaluate
 
 
 class Tried:
@@ -64,13 +66,72 @@ def test_beams_without_a_filter_are_found(monkeypatch, at):
     tried = Tried(monkeypatch, lambda t: math.exp((filtration.scale(t) - filtration.scale(at)) ** 2))
     got = found(tried)
     assert got.value == pytest.approx(at, abs=0.015) and got.low <= at <= got.high < 0.15
-    assert ("without a filter" in got.sentence) == (at < 0.03) and min(tried.asked) == 0
+    assert ("softer than any" in got.sentence) == (at < 0.03) and min(tried.asked) == 0
 
 
 def test_a_scan_behind_a_thin_filter_tells_its_beam(monkeypatch):
     """From nothing to a twentieth of a millimetre the ratio is endless, and the beams are nearly the same."""
     got = found(Tried(monkeypatch, lambda t: math.exp(4 * max(t - 0.05, 0))))
-    assert got.low == 0 and 0.05 < got.high < 0.1 and "without a filter" in got.sentence
+    assert got.low == 0 and 0.05 < got.high < 0.1 and "softer than any" in got.sentence
+
+
+def soft_valley(at):
+    return lambda t: math.exp((filtration.scale(t) - filtration.scale(at)) ** 2)
+
+
+class Grids:
+    """Misfits by filtration on a coarse and on a soft fit's grid, and what was asked of the latter."""
+
+    def __init__(self, monkeypatch, coarse, soft):
+        self.asked = []
+        of = {"coarse": coarse, "soft": soft}
+        monkeypatch.setattr(filtration, "rays_of", lambda fit: None)
+        monkeypatch.setattr(filtration, "misfit", lambda fit, rays: of[fit[0]](fit[1]))
+
+    def coarse(self, t):
+        return "coarse", t
+
+    def soft(self, t):
+        self.asked.append(t)
+        return "soft", t
+
+
+@pytest.mark.parametrize(("at", "screen"), [(-0.1, True), (-0.05, True), (0.02, True), (0.02, False), (0.0, False)])
+def test_where_there_may_be_no_filter_a_finer_grid_and_thinner_screens_are_tried(monkeypatch, at, screen):
+    grids = Grids(monkeypatch, soft_valley(0.06), soft_valley(at))
+    got = found(grids.coarse, None, grids.soft, screen=screen)
+    assert got.value == pytest.approx(at, abs=0.015) and got.low <= at <= got.high
+    assert grids.asked[0] == 0 and (min(grids.asked) < 0) == screen and len(set(grids.asked)) == len(grids.asked)
+    assert ("softer than any" in got.sentence) == (not screen)
+
+
+def test_a_screen_thinner_than_any_that_is_tried_is_said(monkeypatch):
+    grids = Grids(monkeypatch, soft_valley(0.0), lambda t: math.exp(10 * t))
+    got = found(grids.coarse, None, grids.soft, screen=True)
+    assert got.low == -0.15 and "no filter and a screen 0.15 mm thinner to" in got.sentence
+
+
+@pytest.mark.parametrize("coarse", [soft_valley(0.25), lambda t: 1.0, lambda t: max(1.0, t / 4)])
+def test_behind_a_filter_and_where_a_scan_tells_no_beam_no_softer_one_is_tried(monkeypatch, coarse):
+    grids = Grids(monkeypatch, coarse, soft_valley(-0.1))
+    got = found(grids.coarse, None, grids.soft, screen=True)
+    assert not grids.asked and got == found(grids.coarse)
+
+
+def test_soft_fits_that_show_nothing_leave_what_was_found(monkeypatch):
+    grids = Grids(monkeypatch, soft_valley(0.06), soft_valley(-0.1))
+    assert found(grids.coarse, None, lambda t: None, screen=True) == found(grids.coarse)
+    assert found(grids.coarse, None, lambda t: grids.soft(t) if t == 0 else None, screen=True) == found(grids.coarse)
+
+
+def test_a_filtration_below_none_is_a_thinner_screen():
+    assumed, thinner = Settings().make_response(90.0, 0.0), Settings().make_response(90.0, -0.1)
+    told = Settings(detector={"kind": "gos", "thickness": 0.1}).make_response(90.0, 0.0)
+    np.testing.assert_array_equal(thinner.eta, told.eta)
+    assert thinner.described()["theta"] == [0.0]
+    a, b = (np.full((1, 1), 10 * density, np.float32) for density in MaterialCurve.of(assumed, 0.0).of_water)
+    softer, harder = (evaluate(response, a, b)[0].item() for response in (thinner, assumed))
+    assert softer > harder + 0.02
 
 
 def test_the_scale_of_filtrations_is_smooth_and_has_an_inverse():
@@ -179,6 +240,36 @@ def test_filtrations_are_tried_on_grids_coarser_than_the_fit(monkeypatch, sizes,
     assert (got is None) == (fitted is None) and (got is None or got.value == USUAL)
 
 
+@pytest.mark.parametrize(
+    ("sizes", "views", "fitted"),
+    [
+        ((24, 48, 96, 192), (30, 60, 120, 240), [(24, 30), (48, 60), (96, 120)]),
+        ((48, 96, 192), (160, 400, 640), [(48, 160), (96, 200)]),
+        ((24, 48, 96), (15, 30, 60), [(24, 15), (48, 30), (96, 60)]),
+    ],
+)
+def test_soft_beams_are_tried_on_the_finest_grid_that_costs_little_off_edges(monkeypatch, sizes, views, fitted):
+    levels, seen = levels_in_name(sizes, views), []
+    for level in levels:
+        level.p[:, 0, 0] = 2.0
+
+    class Course:
+        def __init__(self, levels):
+            self.levels = levels
+
+        def go(self, proceed):
+            seen.extend(self.levels)
+
+    monkeypatch.setattr(fast, "_course", lambda levels, response, settings, **more: Course(levels))
+    monkeypatch.setattr(fast, "found", lambda coarse, fine, soft, screen: soft(0.0))
+    fast.find_filtration(levels, types.SimpleNamespace(e_max=90.0), Settings())
+    assert [(level.geometry.n_voxel[0], level.geometry.n_views) for level in seen] == fitted
+    lowered = [bool((level.weights < 1).any()) for level in seen]
+    # the finest level of a scan comes with its edges doubted
+    assert lowered == [False] * (len(seen) - 1) + [len(seen) < len(levels)]
+    assert all((level.weights == 1).all() for level in levels)
+
+
 @dataclasses.dataclass
 class Left:
     """A fit of nothing, which leaves all of `data.p`."""
@@ -249,8 +340,10 @@ def test_a_trial_that_fails_is_left_out(monkeypatch, broken):
 
 def test_a_beam_softer_than_any_assumed_is_said(monkeypatch):
     got = found(Tried(monkeypatch, lambda t: 1 + t))
-    assert f"without a filter, or a softer one, for which values are too low: 0 to {got.high:g} mm Al" in got.sentence
-    assert "without a filter" not in found(Tried(monkeypatch, lambda t: 1 / t)).sentence
+    assert (
+        f"softer than any that was tried, for which values are too low: 0 mm Al to {got.high:g} mm Al" in got.sentence
+    )
+    assert "softer" not in found(Tried(monkeypatch, lambda t: 1 / t)).sentence
     assert not found(Tried(monkeypatch, valley(2.0, steepness=0.5))).sentence
 
 
@@ -302,13 +395,16 @@ def test_the_usual_beam_is_found_to_be_one():
     assert 0.38 / 2 < value < 0.38 * 2
 
 
-def test_a_tube_without_a_filter_is_found_and_said():
-    """No fit that assumes 0.1 mm, the least that was tried once, comes near: those photons are in the beam."""
+def test_a_tube_without_a_filter_before_a_thin_screen_is_found():
+    """The assumed screen is twice as thick: before it even no filter is too hard, by 1.8 dB."""
     bare = scan_behind()
-    least, _ = quality(bare, filtration=0.1)
+    none, _ = quality(bare, filtration=0)
     blind, got = quality(bare)
-    assert got["value"] < 0.03 and got["low"] == 0 and {"0", "0.05", "0.1"} <= set(got["misfits"])
-    assert blind > least + 2
+    known, _ = quality(bare, response="known", tube={"filters": []}, detector={"kind": "gos", "thickness": 0.1})
+    told, of_told = quality(bare, detector={"kind": "gos", "thickness": 0.1})
+    assert -0.15 < got["value"] < -0.02 and {"-0.1", "-0.05", "0"} <= set(got["misfits"])
+    assert 0 <= of_told["value"] < 0.05
+    assert blind > none + 1 and min(blind, told) > known - 1
 
 
 def test_no_filtration_can_be_told():

@@ -42,11 +42,13 @@ LONGEST = 40.0  # mm of water, on which the true beam and a filtration are compa
 CAPTION = (
     f"PSNR3D of tissue (dB), soft-tissue RMSE (HU), and the attenuation in the metal's core over the true one. Usual: "
     f"behind {USUAL:g} mm Al, which is assumed where nothing is found. Found: behind the filtration that the method "
-    "finds in the scan, in brackets the range that explains it nearly as well. Detector told: the same, but for what "
-    "detects, which is told (`detector`) and not taken for 0.2 mm of GOS. Known: told the tube and the detector. "
+    "finds in the scan, in brackets the range that explains it nearly as well; less than 0 is no filter, and a screen "
+    "that is thinner by as many mm. Detector told: the same, but for what detects, which is told (`detector`) and not "
+    "taken for 0.2 mm of GOS. Known: told the tube and the detector. "
     f"The equivalent filtration is the one behind which the assumed tube hardens in up to {LONGEST:g} mm of water as "
     "the true beam does; it is computed from both spectra, without any scan. The constants of the search were chosen "
-    "on these scenes, among others, so that this is no test on scenes unseen."
+    "on these scenes, among others, so that this is no test on scenes unseen. The six with a seed in their names came "
+    "after the search for soft beams: on them nothing was chosen."
 )
 HEAD = (
     *("scene", "equivalent (mm Al)", "found (mm Al)", "usual: PSNR3D", "HU", "core"),

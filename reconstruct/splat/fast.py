@@ -38,11 +38,20 @@ from ctsim.reconstruct.splat.level import (
     doubted,
     evening_error,
     least_met,
+    off_edges,
     some_readings,
     thinned,
 )
 from ctsim.reconstruct.splat.ordered import Fit
-from ctsim.reconstruct.splat.response import FILTER, Response, basis_functions, evaluate, make_response, tangent
+from ctsim.reconstruct.splat.response import (
+    FILTER,
+    SCINTILLATOR,
+    Response,
+    basis_functions,
+    evaluate,
+    make_response,
+    tangent,
+)
 from ctsim.reconstruct.splat.verdict import bounded, dark_misfit, flat, metal_unread, uneven, unexplained, verdict
 from ctsim.reconstruct.starved import Below, weights_and_bounds
 from ctsim.reconstruct.watch import Stopwatch
@@ -77,10 +86,10 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
     The finest grid is at most as fine as the detector's pixels at the isocentre. With `fine_metal` the splats within
     two voxels of the surface of metal are half as far apart in the second half of the passes over each grid.
     `response` "tube" is a tube behind `filtration`, seen by `detector`, null for 0.2 mm of GOS; `filtration` null has
-    it found, on grids of at least 32 voxels along x and y. `readout` "hardened" is by the object's own water;
-    `Volume.at_energy` gives the volume at any energy. `scatter` "found" is what the pixels tell that no shadow reaches
-    (`scatter_of`), with its course over the panel; a number is the same everywhere, and 0 is for scans whose open
-    pixels are brighter than their open field for another reason.
+    it found, on grids of at least 32 voxels along x and y, and a thinner screen where there is next to none.
+    `readout` "hardened" is by the object's own water; `Volume.at_energy` gives the volume at any energy. `scatter`
+    "found" is what the pixels tell that no shadow reaches (`scatter_of`), with its course over the panel; a number is
+    the same everywhere, and 0 is for scans whose open pixels are brighter than their open field for another reason.
     """
 
     passes: Annotated[tuple[Passes, Passes] | None, about("over the views: on each coarser level, on the finest")] = (
@@ -115,10 +124,16 @@ class Settings(Common, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return USUAL if self.filtration is None else self.filtration
 
     def make_response(self, e_max: float, filtration: float) -> Response:
-        """Build the response for a scan of greatest energy `e_max` (keV), of the tube behind a `filtration` (mm Al)."""
+        """Build the response for a scan of greatest energy `e_max` (keV), of the tube behind a `filtration` (mm Al).
+
+        Below 0 it is none, and the assumed screen is thinner by as many mm.
+        """
         if self.response == "tube":
-            sees = None if self.detector is None else known_detector(self.detector)
-            return make_response("tube", e_max=e_max, basis="klein-nishina", theta=(filtration,), detector=sees)
+            sees = SCINTILLATOR if self.detector is None else known_detector(self.detector)
+            if filtration < 0:
+                sees = msgspec.structs.replace(sees, thickness=sees.thickness + filtration)
+            theta = (max(filtration, 0.0),)
+            return make_response("tube", e_max=e_max, basis="klein-nishina", theta=theta, detector=sees)
         seen = detected(self.tube, self.detector, e_max)
         return make_response("known", e_max=e_max, basis="klein-nishina", spectrum=seen)
 
@@ -224,9 +239,12 @@ def find_filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtr
 
         return fit_of
 
-    # on the finest grid, trials would take as long as the fit
-    fine = fits_on([*levels[: k + 1], thinned(levels[k + 1])]) if k + 2 < len(levels) else None
-    return found(fits_on(levels[: k + 1]), fine)
+    # on the finest grid of a large scan, trials would take as long as the fit
+    some = [*levels[: k + 1], thinned(levels[k + 1])] if k + 2 < len(levels) else None
+    fine = None if some is None else fits_on(some)
+    # what no grid holds of edges, a soft beam's misfit is full of
+    soft = fits_on(levels if some is None else [*some[:-1], off_edges(some[-1], settings.edges)])
+    return found(fits_on(levels[: k + 1]), fine, soft, screen=settings.detector is None)
 
 
 def _fitted(course: Course, scan: Scan, settings: Settings, stopwatch: Stopwatch) -> Fit | None:

@@ -8,12 +8,15 @@ unfinished fit and nothing of the beam. A water bottle, which looks the same fro
 beam. Rays through metal are left out, since what its shape leaves is larger; they are the same rays for all
 filtrations.
 
+A beam may be softer than the assumed tube's without a filter. What is softer is then a thinner screen: filtrations
+below 0 mean none, before a screen that is thinner by as many mm.
+
 Consistency of the data is what other calibrations of a beam without a phantom use, too (Würfl et al., Epipolar
 consistency beam hardening, Med. Phys. 44, 2017).
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +29,7 @@ from ctsim.reconstruct.splat.ordered import Fit
 
 USUAL = 0.5  # mm of aluminium, from which the search starts
 TRIED = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 14.0, 20.0)
+SOFTER = (-0.15, -0.1, -0.05)  # thinner screens, tried where there may be no filter
 THIN = 0.1  # mm of aluminium, below which filtrations differ by their difference, not by their ratio
 PLAUSIBLE = 1.05  # times the least misfit, at two standard deviations: materials, scatter and spectra are assumed
 UNTOLD, SOFT = 8.0, 1.0
@@ -40,12 +44,15 @@ METAL, FAINT = 8.0, 1e-3
 LEAST = 0.3  # of the neighbours that count: an average over fewer is left out
 FEWEST = 1000  # averages less a mean for each pixel, below which there is no misfit
 
+Fits = Callable[[float], Fit | None]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Filtration:
     """The filtration (mm of aluminium), the least and the greatest that explain the scan nearly as well, and misfits.
 
     `misfits` are those of `misfit` by the filtration tried on the last grid, empty where the scan shows too little.
+    Below 0 there is no filter, and a screen that is thinner by as many mm.
     """
 
     value: float
@@ -77,20 +84,27 @@ class Filtration:
                 "alike, and no more was tried; a nearly round body may be behind less; `filtration` or the response "
                 '"known" tells it'
             )
-        if self.low > TRIED[0]:
+        if self.low > min(self.misfits):
             return ""
         return (
-            f"the beam may be that of the assumed tube without a filter, or a softer one, for which values are too "
-            f"low: {self.low:g} to {self.high:g} mm Al explain the scan alike; "
+            f"the beam may be softer than any that was tried, for which values are too low: {_named(self.low)} to "
+            f"{_named(self.high)} explain the scan alike; "
             '`filtration`, `detector` or the response "known" tells the method more'
         )
 
 
-def found(coarse: Callable[[float], Fit | None], fine: Callable[[float], Fit | None] | None = None) -> Filtration:
+def _named(filtration: float) -> str:
+    return f"{filtration:g} mm Al" if filtration >= 0 else f"no filter and a screen {-filtration:g} mm thinner"
+
+
+def found(coarse: Fits, fine: Fits | None = None, soft: Fits | None = None, *, screen: bool = False) -> Filtration:
     """Search the filtration that a scan shows, by `coarse` fits and then, if there are any, `fine` ones around it.
 
-    Both return the fit at a filtration, None for nothing. Coarse fits take little time next to fine ones: where these
+    All return the fit at a filtration, None for nothing. Coarse fits take little time next to fine ones: where these
     follow, they are made at all filtrations, since between thick metal their misfit may have more than one valley.
+    Where there may be next to no filter, `soft` ones follow, on the finest grid that costs little, with thinner screens
+    if `screen`, which stands for one that is not known: many photons of such a beam stop in the first voxels, and what
+    a coarse grid misses there looks like a filter of 0.05 mm.
     """
     misfits = _searched(coarse, USUAL, everywhere=fine is not None)
     if fine is not None:
@@ -98,10 +112,16 @@ def found(coarse: Callable[[float], Fit | None], fine: Callable[[float], Fit | N
         misfits = finer if len(finer) > 1 or not misfits else _valley(misfits)
     if not misfits:
         return Filtration(value=USUAL, low=TRIED[0], high=TRIED[-1], misfits={})
-    return _chosen(misfits)
+    chosen = _chosen(misfits)
+    if soft is None or chosen.low >= THIN or chosen.high > SOFT:
+        return chosen
+    softer = _searched(soft, TRIED[0], (*SOFTER, *TRIED) if screen else TRIED)
+    return _chosen(softer) if len(softer) > 1 else chosen
 
 
-def _searched(fit_of: Callable[[float], Fit | None], start: float, *, everywhere: bool = False) -> dict[float, float]:
+def _searched(
+    fit_of: Fits, start: float, tried: Sequence[float] = TRIED, *, everywhere: bool = False
+) -> dict[float, float]:
     """Return the misfits by filtration from `start` on, both ways while plausible or `everywhere`.
 
     Empty where `start` has none.
@@ -112,15 +132,15 @@ def _searched(fit_of: Callable[[float], Fit | None], start: float, *, everywhere
     misfits = {start: least}
 
     def misfit_at(k: int) -> float:
-        if (value := TRIED[k]) not in misfits:
+        if (value := tried[k]) not in misfits:
             fit = fit_of(value)
             misfits[value] = math.inf if fit is None else misfit(fit, rays)
         return misfits[value]
 
     for way in (1, -1):
-        k = TRIED.index(start)
+        k = tried.index(start)
         # a neighbour that is plausible, too, may yet lead to a better one
-        while 0 <= k + way < len(TRIED) and (everywhere or misfit_at(k) <= PLAUSIBLE * min(misfits.values())):
+        while 0 <= k + way < len(tried) and (everywhere or misfit_at(k) <= PLAUSIBLE * min(misfits.values())):
             k += way
             misfit_at(k)
     return {t: value for t, value in sorted(misfits.items()) if math.isfinite(value)}

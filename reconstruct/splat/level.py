@@ -116,6 +116,13 @@ def doubted(levels: list[Data], i0: float, edges: float) -> list[Data]:
     return [*changed, finest]
 
 
+def off_edges(data: Data, edges: float) -> Data:
+    """Return the data with edges doubted, as those of the finest grid are."""
+    weights = data.weights.copy()
+    doubt_edges(data.p, weights, edges, data.scatter)
+    return replace(data, weights=weights)
+
+
 def by_photons(data: Data) -> Data:
     """Return the data with the weights of trial fits: by photons alone, not evened out nor lowered at edges."""
     weights = photon_weights(data.p, data.weights > 0)
