@@ -44,7 +44,9 @@ class Denoiser:
         """Denoise on `support`; `memory` is a dual field of zeros and one to work in, None for new ones."""
         self.support, self.ratios, self.positivity = support, ratios, positivity
         shape = (3, *support.shape)
-        self.dual, self._ahead = memory or (np.zeros(shape, np.float32), np.empty(shape, np.float32))
+        if memory is None:
+            memory = np.zeros(shape, np.float32), np.empty(shape, np.float32)
+        self.dual, self._ahead = memory
 
     def run(self, b: Array, tau: float, iterations: int) -> Array:
         """Return the minimiser of `b`, [y, x, z], after `iterations` steps."""
@@ -67,49 +69,46 @@ class Denoiser:
 class SparseDenoiser:
     """A `Denoiser` that holds boxes around the islands of its support alone, to the same bits.
 
-    A slope reaches from a voxel to those next to it, and the slopes of one voxel to those that touch by a corner:
-    islands that do not even touch so do not know of each other, and a margin of one voxel holds all slopes of each. The
-    `dual` fields of the boxes lie one after another: [number].
+    A slope reaches from a voxel to those next to it, and the slopes of one voxel to those that touch by an edge:
+    islands that do not even touch so do not know of each other, and a margin of one voxel holds all slopes of each.
+    The `dual` fields of the boxes lie one after another: [number].
     """
 
     def __init__(
-        self, support: NDArray[np.bool_], boxes: list[tuple[Box, NDArray[np.bool_]]], ratios: Array, positivity: bool
+        self, shape: tuple[int, ...], islands: list[tuple[Box, NDArray[np.bool_]]], ratios: Array, positivity: bool
     ) -> None:
-        sizes = [3 * island.size for _, island in boxes]
-        ends = np.cumsum(sizes)
-        self._shape = support.shape
-        self.dual, ahead = np.zeros(ends[-1], np.float32), np.empty(max(sizes), np.float32)
-        self._parts = [
-            (box, Denoiser(island, ratios, positivity, (field.reshape(shape), ahead[: field.size].reshape(shape))))
-            for (box, island), field in zip(boxes, np.split(self.dual, ends[:-1]), strict=True)
-            for shape in [(3, *island.shape)]
-        ]
+        """Denoise on islands, each a box of the volume's `shape` and the support within it."""
+        self._shape = shape
+        self.dual = np.zeros(sum(3 * support.size for _, support in islands), np.float32)
+        ahead = np.empty(max(3 * support.size for _, support in islands), np.float32)  # used by one after another
+        self._parts: list[tuple[Box, Denoiser]] = []
+        first = 0
+        for box, support in islands:
+            field = (3, *support.shape)
+            size = 3 * support.size
+            memory = self.dual[first : first + size].reshape(field), ahead[:size].reshape(field)
+            self._parts.append((box, Denoiser(support, ratios, positivity, memory)))
+            first += size
 
     def run(self, b: Array, tau: float, iterations: int) -> Array:
         """Return the minimiser of `b`, [y, x, z], after `iterations` steps."""
         x = np.zeros(self._shape, np.float32)
         for box, part in self._parts:
-            x[box] += part.run(np.ascontiguousarray(b[box]), tau, iterations)  # boxes overlap, islands do not
+            found = part.run(np.ascontiguousarray(b[box]), tau, iterations)
+            np.copyto(x[box], found, where=part.support)  # boxes overlap, islands do not
         return x
 
 
 def denoiser_on(support: NDArray[np.bool_], ratios: NDArray[np.float32], positivity: bool) -> Denoiser | SparseDenoiser:
     """Return a denoiser of as little memory as the support allows: shells of metal fill little of their box."""
     if support.any() and support.mean() <= SPARSE:
-        boxes = _islands(support)
-        if len(boxes) <= MANY and 2 * sum(island.size for _, island in boxes) <= support.size:
-            return SparseDenoiser(support, boxes, ratios, positivity)
+        labels, _ = ndimage.label(support, np.ones((3, 3, 3), np.bool_))
+        # beyond the last voxel a slice ends by itself
+        boxes = [tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in box) for box in ndimage.find_objects(labels)]
+        if len(boxes) < MANY and 2 * sum(labels[box].size for box in boxes) <= support.size:
+            islands = [(box, labels[box] == k) for k, box in enumerate(boxes, start=1)]
+            return SparseDenoiser(support.shape, islands, ratios, positivity)
     return Denoiser(support, ratios, positivity)
-
-
-def _islands(support: NDArray[np.bool_]) -> list[tuple[Box, NDArray[np.bool_]]]:
-    """Return boxes around what touches, one voxel wider where the support has room, and what of it is within each."""
-    labels, _ = ndimage.label(support, np.ones((3, 3, 3), np.bool_))
-    boxes = (
-        tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in box)  # beyond the last voxel a slice ends by itself
-        for box in ndimage.find_objects(labels)
-    )
-    return [(box, labels[box] == k) for k, box in enumerate(boxes, start=1)]
 
 
 def total_variation(x: Array, ratios: NDArray[np.float32]) -> float:

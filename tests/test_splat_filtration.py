@@ -99,29 +99,36 @@ class Grids:
 @pytest.mark.parametrize(("at", "screen"), [(-0.1, True), (-0.05, True), (0.02, True), (0.02, False), (0.0, False)])
 def test_where_there_may_be_no_filter_a_finer_grid_and_thinner_screens_are_tried(monkeypatch, at, screen):
     grids = Grids(monkeypatch, soft_valley(0.06), soft_valley(at))
-    got = found(grids.coarse, None, grids.soft, screen=screen)
+    got = found(grids.coarse, None, grids.soft, screen_assumed=screen)
     assert got.value == pytest.approx(at, abs=0.015) and got.low <= at <= got.high
     assert grids.asked[0] == 0 and (min(grids.asked) < 0) == screen and len(set(grids.asked)) == len(grids.asked)
     assert ("softer than any" in got.sentence) == (not screen)
+    described = got.described()
+    assert described.get("screen") == (pytest.approx(0.2 + got.value) if got.value < 0 else None)
 
 
 def test_a_screen_thinner_than_any_that_is_tried_is_said(monkeypatch):
     grids = Grids(monkeypatch, soft_valley(0.0), lambda t: math.exp(10 * t))
-    got = found(grids.coarse, None, grids.soft, screen=True)
-    assert got.low == -0.15 and "no filter and a screen 0.15 mm thinner to" in got.sentence
+    got = found(grids.coarse, None, grids.soft, screen_assumed=True)
+    assert got.low == -0.15 and f"-0.15 to {got.high:g} mm Al explain it alike (below 0: none, and a" in got.sentence
+    assert "thinner than 0.2 mm of GOS" in got.sentence
+    flat = found(grids.coarse, None, Grids(monkeypatch, soft_valley(0.0), lambda t: 1.0).soft, screen_assumed=True)
+    assert "does not tell its beam" in flat.sentence and "-0.15 to 20 mm Al explain it alike (below" in flat.sentence
 
 
 @pytest.mark.parametrize("coarse", [soft_valley(0.25), lambda t: 1.0, lambda t: max(1.0, t / 4)])
 def test_behind_a_filter_and_where_a_scan_tells_no_beam_no_softer_one_is_tried(monkeypatch, coarse):
     grids = Grids(monkeypatch, coarse, soft_valley(-0.1))
-    got = found(grids.coarse, None, grids.soft, screen=True)
+    got = found(grids.coarse, None, grids.soft, screen_assumed=True)
     assert not grids.asked and got == found(grids.coarse)
 
 
 def test_soft_fits_that_show_nothing_leave_what_was_found(monkeypatch):
     grids = Grids(monkeypatch, soft_valley(0.06), soft_valley(-0.1))
-    assert found(grids.coarse, None, lambda t: None, screen=True) == found(grids.coarse)
-    assert found(grids.coarse, None, lambda t: grids.soft(t) if t == 0 else None, screen=True) == found(grids.coarse)
+    assert found(grids.coarse, None, lambda t: None, screen_assumed=True) == found(grids.coarse)
+    assert found(grids.coarse, None, lambda t: grids.soft(t) if t == 0 else None, screen_assumed=True) == found(
+        grids.coarse
+    )
 
 
 def test_a_filtration_below_none_is_a_thinner_screen():
@@ -246,9 +253,10 @@ def test_filtrations_are_tried_on_grids_coarser_than_the_fit(monkeypatch, sizes,
         ((24, 48, 96, 192), (30, 60, 120, 240), [(24, 30), (48, 60), (96, 120)]),
         ((48, 96, 192), (160, 400, 640), [(48, 160), (96, 200)]),
         ((24, 48, 96), (15, 30, 60), [(24, 15), (48, 30), (96, 60)]),
+        ((24, 48), (20, 40), [(24, 20), (48, 40)]),
     ],
 )
-def test_soft_beams_are_tried_on_the_finest_grid_that_costs_little_off_edges(monkeypatch, sizes, views, fitted):
+def test_soft_beams_are_tried_off_edges_on_the_grid_after_that_of_the_coarse_search(monkeypatch, sizes, views, fitted):
     levels, seen = levels_in_name(sizes, views), []
     for level in levels:
         level.p[:, 0, 0] = 2.0
@@ -261,12 +269,11 @@ def test_soft_beams_are_tried_on_the_finest_grid_that_costs_little_off_edges(mon
             seen.extend(self.levels)
 
     monkeypatch.setattr(fast, "_course", lambda levels, response, settings, **more: Course(levels))
-    monkeypatch.setattr(fast, "found", lambda coarse, fine, soft, screen: soft(0.0))
+    monkeypatch.setattr(fast, "found", lambda coarse, fine, soft, screen_assumed: soft(0.0))
     fast.find_filtration(levels, types.SimpleNamespace(e_max=90.0), Settings())
     assert [(level.geometry.n_voxel[0], level.geometry.n_views) for level in seen] == fitted
-    lowered = [bool((level.weights < 1).any()) for level in seen]
-    # the finest level of a scan comes with its edges doubted
-    assert lowered == [False] * (len(seen) - 1) + [len(seen) < len(levels)]
+    lowered = [bool((level.weights < 0.99 * np.exp(-level.p)).any()) for level in seen]
+    assert lowered == [False] * (len(seen) - 1) + [True]
     assert all((level.weights == 1).all() for level in levels)
 
 
@@ -335,14 +342,12 @@ def test_a_scan_that_shows_nothing_leaves_the_usual_filtration():
 @pytest.mark.parametrize("broken", [math.nan, math.inf])
 def test_a_trial_that_fails_is_left_out(monkeypatch, broken):
     got = found(Tried(monkeypatch, lambda t: 1.0 if t == USUAL else broken))
-    assert got.value == USUAL and got.misfits == {USUAL: 1.0}
+    assert got.value == USUAL and got.misfits == {USUAL: 1.0} and not got.sentence
 
 
 def test_a_beam_softer_than_any_assumed_is_said(monkeypatch):
     got = found(Tried(monkeypatch, lambda t: 1 + t))
-    assert (
-        f"softer than any that was tried, for which values are too low: 0 mm Al to {got.high:g} mm Al" in got.sentence
-    )
+    assert f"softer than any that was tried, for which values are too low: 0 to {got.high:g} mm Al" in got.sentence
     assert "softer" not in found(Tried(monkeypatch, lambda t: 1 / t)).sentence
     assert not found(Tried(monkeypatch, valley(2.0, steepness=0.5))).sentence
 

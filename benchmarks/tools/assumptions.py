@@ -3,7 +3,9 @@
     make-dataset assumptions data/ --seeds 1 2 3
     run-benchmark data/ results/ --method zero --method hull --method twin-fdk --method fdk --method limar --method nmar
     run-benchmark data/ results/ --method bhc-poly --method ibhc --method sirt --method asd-pocs --method fista-tv
-    run-benchmark data/ results/ --method fusion --method dicdnet-lite --method splat
+    run-benchmark data/ results/ --method fdk-ramp --method water-precorrection --method os-sart --method cgls
+    run-benchmark data/ results/ --method sart --method awpcsd --method acdnet-lite --method oscnet-lite
+    run-benchmark data/ results/ --method denoise-lite --method fusion --method dicdnet-lite --method splat
     python -m ctsim.benchmarks.tools.assumptions results/ docs/measured
 
 The scenes of the suite `assumptions` are "OBJECT-FAVOUR"; "OBJECT-strict" grants no method anything. A cell is what a

@@ -36,9 +36,9 @@ from ctsim.reconstruct.splat.level import (
     Data,
     by_photons,
     doubted,
+    edges_doubted,
     evening_error,
     least_met,
-    off_edges,
     some_readings,
     thinned,
 )
@@ -215,7 +215,10 @@ def _weighted(
 
 
 def find_filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtration | None:
-    """Find the filtration by coarse fits; None where it is given, the beam is known, or grids or views are too few.
+    """Find the filtration by trial fits; None where it is given, the beam is known, or grids or views are too few.
+
+    All are made on the grid of 32 to 63 voxels along the shortest axis and the next one, if there is a finer one still.
+    Those of soft beams are made on the next one, if there is one, the fit's own or not.
 
     Edges that no grid holds are the misfit on a coarse one: on 18 voxels 12 mm of aluminium are found where 0.5 are
     right. Two views contradict each other before no beam: 19 mm are found.
@@ -227,8 +230,10 @@ def find_filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtr
     k = next(k for k, level in enumerate(levels) if min(level.geometry.n_voxel[1:]) >= ENOUGH)
     if levels[k].geometry.n_views < VIEWED:
         return None
+    coarse, more = levels[: k + 1], k + 2 < len(levels)
     if k + 1 == len(levels) and levels[k].error:  # the finest grid, of a flat or a small scan
-        levels = [*levels[:k], by_photons(levels[k])]
+        coarse = [*levels[:k], by_photons(levels[k])]
+    some = [*levels[: k + 1], thinned(levels[k + 1])] if more else [*levels[:-1], by_photons(levels[-1])]
 
     def fits_on(few: list[Data]) -> Callable[[float], Fit | None]:
         brief = msgspec.structs.replace(settings, passes=TRIAL if len(few) > 1 else LONE_TRIAL)
@@ -239,12 +244,13 @@ def find_filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtr
 
         return fit_of
 
-    # on the finest grid of a large scan, trials would take as long as the fit
-    some = [*levels[: k + 1], thinned(levels[k + 1])] if k + 2 < len(levels) else None
-    fine = None if some is None else fits_on(some)
-    # what no grid holds of edges, a soft beam's misfit is full of
-    soft = fits_on(levels if some is None else [*some[:-1], off_edges(some[-1], settings.edges)])
-    return found(fits_on(levels[: k + 1]), fine, soft, screen=settings.detector is None)
+    @functools.cache
+    def off_edges() -> Callable[[float], Fit | None]:  # where errors are most of a soft beam's misfit
+        return fits_on([*some[:-1], edges_doubted(some[-1], settings.edges)])
+
+    # on the finest grid, trials take as long as the fit: soft beams alone are worth it
+    fine = fits_on(some) if more else None
+    return found(fits_on(coarse), fine, lambda value: off_edges()(value), screen_assumed=settings.detector is None)
 
 
 def _fitted(course: Course, scan: Scan, settings: Settings, stopwatch: Stopwatch) -> Fit | None:

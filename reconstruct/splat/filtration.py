@@ -8,8 +8,8 @@ unfinished fit and nothing of the beam. A water bottle, which looks the same fro
 beam. Rays through metal are left out, since what its shape leaves is larger; they are the same rays for all
 filtrations.
 
-A beam may be softer than the assumed tube's without a filter. What is softer is then a thinner screen: filtrations
-below 0 mean none, before a screen that is thinner by as many mm.
+A beam may be softer than the assumed tube's without a filter. Such beams are imitated by a thinner screen: filtrations
+below 0 mean none, and a screen that is thinner than the assumed one by as many mm.
 
 Consistency of the data is what other calibrations of a beam without a phantom use, too (Würfl et al., Epipolar
 consistency beam hardening, Med. Phys. 44, 2017).
@@ -26,6 +26,7 @@ from scipy import ndimage
 from scipy.interpolate import Akima1DInterpolator
 
 from ctsim.reconstruct.splat.ordered import Fit
+from ctsim.reconstruct.splat.response import SCINTILLATOR
 
 USUAL = 0.5  # mm of aluminium, from which the search starts
 TRIED = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 14.0, 20.0)
@@ -52,7 +53,7 @@ class Filtration:
     """The filtration (mm of aluminium), the least and the greatest that explain the scan nearly as well, and misfits.
 
     `misfits` are those of `misfit` by the filtration tried on the last grid, empty where the scan shows too little.
-    Below 0 there is no filter, and a screen that is thinner by as many mm.
+    Below 0 there is no filter, and a screen that is thinner than the assumed one by as many mm.
     """
 
     value: float
@@ -61,9 +62,10 @@ class Filtration:
     misfits: dict[float, float]
 
     def described(self) -> dict[str, Any]:
-        """Return all of it in the types of JSON."""
+        """Return all of it in the types of JSON, and the screen (mm of GOS) where it is thinner than assumed."""
         tried = {f"{t:g}": round(value, 6) for t, value in self.misfits.items()}
-        return {"value": self.value, "low": self.low, "high": self.high, "misfits": tried}
+        screen = {"screen": round(SCINTILLATOR.thickness + self.value, 3)} if self.value < 0 else {}
+        return {"value": self.value, **screen, "low": self.low, "high": self.high, "misfits": tried}
 
     @property
     def sentence(self) -> str:
@@ -73,38 +75,37 @@ class Filtration:
         """
         if not self.misfits:
             return ""
+        explain = f"{self.low:g} to {self.high:g} mm Al explain it alike"
+        if self.low < 0:
+            explain += f" (below 0: none, and a screen that much thinner than {SCINTILLATOR.thickness:g} mm of GOS)"
         if self.low <= SOFT and self.high >= UNTOLD * max(self.low, THIN):
             return (
-                f"the scan does not tell its beam (round bodies do not): {self.low:g} to {self.high:g} mm Al explain "
-                'it alike; `filtration` or the response "known" tells it'
+                f"the scan does not tell its beam (round bodies do not): {explain}; "
+                '`filtration` or the response "known" tells it'
             )
         if self.high >= TRIED[-1]:
             return (
-                f"the scan tells no upper limit of its filtration: {self.low:g} to {self.high:g} mm Al explain it "
-                "alike, and no more was tried; a nearly round body may be behind less; `filtration` or the response "
-                '"known" tells it'
+                f"the scan tells no upper limit of its filtration: {explain}, and no more was tried; a nearly round "
+                'body may be behind less; `filtration` or the response "known" tells it'
             )
-        if self.low > min(self.misfits):
+        if self.low > min(TRIED[0], *self.misfits):
             return ""
         return (
-            f"the beam may be softer than any that was tried, for which values are too low: {_named(self.low)} to "
-            f"{_named(self.high)} explain the scan alike; "
+            f"the scan's beam may be softer than any that was tried, for which values are too low: {explain}; "
             '`filtration`, `detector` or the response "known" tells the method more'
         )
 
 
-def _named(filtration: float) -> str:
-    return f"{filtration:g} mm Al" if filtration >= 0 else f"no filter and a screen {-filtration:g} mm thinner"
-
-
-def found(coarse: Fits, fine: Fits | None = None, soft: Fits | None = None, *, screen: bool = False) -> Filtration:
+def found(
+    coarse: Fits, fine: Fits | None = None, soft: Fits | None = None, *, screen_assumed: bool = False
+) -> Filtration:
     """Search the filtration that a scan shows, by `coarse` fits and then, if there are any, `fine` ones around it.
 
     All return the fit at a filtration, None for nothing. Coarse fits take little time next to fine ones: where these
     follow, they are made at all filtrations, since between thick metal their misfit may have more than one valley.
-    Where there may be next to no filter, `soft` ones follow, on the finest grid that costs little, with thinner screens
-    if `screen`, which stands for one that is not known: many photons of such a beam stop in the first voxels, and what
-    a coarse grid misses there looks like a filter of 0.05 mm.
+    Where there may be next to no filter, `soft` ones follow, with thinner screens too if the screen is only assumed:
+    many photons of such a beam stop in the first voxels, and what a coarse grid misses there looks like a filter of
+    0.05 mm.
     """
     misfits = _searched(coarse, USUAL, everywhere=fine is not None)
     if fine is not None:
@@ -115,14 +116,14 @@ def found(coarse: Fits, fine: Fits | None = None, soft: Fits | None = None, *, s
     chosen = _chosen(misfits)
     if soft is None or chosen.low >= THIN or chosen.high > SOFT:
         return chosen
-    softer = _searched(soft, TRIED[0], (*SOFTER, *TRIED) if screen else TRIED)
+    softer = _searched(soft, TRIED[0], (*SOFTER, *TRIED) if screen_assumed else TRIED)
     return _chosen(softer) if len(softer) > 1 else chosen
 
 
 def _searched(
     fit_of: Fits, start: float, tried: Sequence[float] = TRIED, *, everywhere: bool = False
 ) -> dict[float, float]:
-    """Return the misfits by filtration from `start` on, both ways while plausible or `everywhere`.
+    """Return the misfits by those filtrations of `tried` from `start` on, both ways while plausible or `everywhere`.
 
     Empty where `start` has none.
     """
@@ -169,7 +170,7 @@ def _chosen(misfits: dict[float, float]) -> Filtration:
     above -= above.min()
     plausible = fine[above <= math.log(PLAUSIBLE)]
     mean = np.average(fine, weights=np.exp(-2 * above / math.log(PLAUSIBLE)))
-    value, low, high = (round(float(t), 3) for t in from_scale([mean, plausible[0], plausible[-1]]))
+    value, low, high = (round(float(t), 3) + 0.0 for t in from_scale([mean, plausible[0], plausible[-1]]))
     return Filtration(value=value, low=low, high=high, misfits=misfits)
 
 

@@ -111,13 +111,12 @@ def doubted(levels: list[Data], i0: float, edges: float) -> list[Data]:
         pixels = math.prod(level.geometry.d_detector) / math.prod(finest.geometry.d_detector)
         weights = level.weights.copy()
         even_out(weights, min(COARSE_ERROR**2 * i0 * pixels, MOST_EVEN))
-        doubt_edges(level.p, weights, edges, level.scatter)
-        changed.append(replace(level, weights=weights))
+        changed.append(edges_doubted(replace(level, weights=weights), edges))
     return [*changed, finest]
 
 
-def off_edges(data: Data, edges: float) -> Data:
-    """Return the data with edges doubted, as those of the finest grid are."""
+def edges_doubted(data: Data, edges: float) -> Data:
+    """Return the data with `doubt_edges` in the weights."""
     weights = data.weights.copy()
     doubt_edges(data.p, weights, edges, data.scatter)
     return replace(data, weights=weights)
