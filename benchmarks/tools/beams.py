@@ -48,7 +48,7 @@ CAPTION = (
     f"The equivalent filtration is the one behind which the assumed tube hardens in up to {LONGEST:g} mm of water as "
     "the true beam does; it is computed from both spectra, without any scan. The constants of the search were chosen "
     "on these scenes, among others, so that this is no test on scenes unseen. The six with a seed in their names came "
-    "after the search for soft beams: on them nothing was chosen."
+    "after the search for soft beams: on them, as they stand here, nothing was chosen."
 )
 HEAD = (
     *("scene", "equivalent (mm Al)", "found (mm Al)", "usual: PSNR3D", "HU", "core"),
