@@ -233,7 +233,7 @@ def find_filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtr
     coarse, more = levels[: k + 1], k + 2 < len(levels)
     if k + 1 == len(levels) and levels[k].error:  # the finest grid, of a flat or a small scan
         coarse = [*levels[:k], by_photons(levels[k])]
-    some = [*levels[: k + 1], thinned(levels[k + 1])] if more else [*levels[:-1], by_photons(levels[-1])]
+    some = [*levels[: k + 1], thinned(levels[k + 1])] if more else levels
 
     def fits_on(few: list[Data]) -> Callable[[float], Fit | None]:
         brief = msgspec.structs.replace(settings, passes=TRIAL if len(few) > 1 else LONE_TRIAL)
@@ -246,7 +246,8 @@ def find_filtration(levels: list[Data], scan: Scan, settings: Settings) -> Filtr
 
     @functools.cache
     def off_edges() -> Callable[[float], Fit | None]:  # where errors are most of a soft beam's misfit
-        return fits_on([*some[:-1], edges_doubted(some[-1], settings.edges)])
+        last = some[-1] if more else by_photons(some[-1])
+        return fits_on([*some[:-1], edges_doubted(last, settings.edges)])
 
     # on the finest grid, trials take as long as the fit: soft beams alone are worth it
     fine = fits_on(some) if more else None
