@@ -4,19 +4,17 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.splat.kernels import step_cpu
 from ctsim.reconstruct.splat.model import Splats
+from ctsim.reconstruct.splat.ramp import ramp
 from ctsim.reconstruct.tv import Denoiser, SparseDenoiser, axis_ratios, denoiser_on
 
 SIGMA = 0.45
 """σ of a splat in voxels: wider ones, not negative, cannot make the edges of a volume of this grid."""
-SLICES = 32  # of a volume that are filtered together
 PIECE = 1 << 22  # splats
 
 
@@ -106,12 +104,6 @@ class Lattice:
         """The denoiser's dual field, with which it starts."""
         return self._denoiser.dual
 
-    @property
-    def padded(self) -> tuple[int, int]:
-        """Size (y, x) of the support with room for the tails of a ramp filter, which fall as the distance squared."""
-        n_y, n_x = (int(fft.next_fast_len(n + n // 4, real=True) or n) for n in self._size[:2])
-        return n_y, n_x
-
     def gather(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
         """Take the values of a volume [z, y, x] at the splats: [splat]."""
         return volume.transpose(1, 2, 0)[self._box].reshape(-1)[self.index]
@@ -126,25 +118,17 @@ class Lattice:
         """Return argmin ½‖x − values‖² + tau·TV(x), x not negative."""
         return self._denoiser.run(self._filled(values), tau, iterations).reshape(-1)[self.index]
 
-    def filter_slices(
-        self, u: NDArray[np.float32], below: np.float32, values: NDArray[np.float32], gain: NDArray[np.float32]
+    def spread(
+        self, u: NDArray[np.float32], below: np.float32, values: NDArray[np.float32], n_views: int
     ) -> NDArray[np.float32]:
-        """Multiply the spectrum, `padded`, of every slice of the values where `u` is below a limit by `gain`.
+        """Filter the values where `u` is below a limit by the ramp of a subset of views.
 
-        The gain is ordered as `rfft2` does it. The result is flat, at `index` for each splat, and holds until the next
-        call.
+        The result is flat, at `index` for each splat, and holds until the next call.
         """
-        (n_y, _, n_z), (wide_y, wide_x), workers = self._size, self.padded, numba.get_num_threads()
+        (n_y, n_x, _), (_, *across) = self._size, self.support.shape
         self._volume.fill(0)
         step_cpu.put_tissue(values, u, below, self.index, self._volume.reshape(-1))
-        for first in range(0, n_z, SLICES):  # few at a time, whose memory is used again
-            slices = self._volume[:, :, first : first + SLICES]
-            along_x = fft.rfft(slices, wide_x, axis=1, workers=workers)  # the rows that are there, none of the padding
-            spectrum = np.asarray(fft.fft(along_x, wide_y, axis=0, workers=workers, overwrite_x=True))
-            step_cpu.damp(spectrum, gain)
-            rows = np.asarray(fft.ifft(spectrum, axis=0, workers=workers, overwrite_x=True))[:n_y]
-            filtered = np.asarray(fft.irfft(rows, wide_x, axis=1, workers=workers))
-            step_cpu.put_slices(filtered, first, self._volume)
+        ramp((n_y, n_x), (across[0], across[1]), n_views).apply(self._volume)
         return self._volume.reshape(-1)
 
     def _filled(self, values: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,6 +1,5 @@
 """The splats of one lattice: their unknowns, their pictures, and how they step."""
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,8 +13,6 @@ from ctsim.reconstruct.splat.kernels import step_cpu
 from ctsim.reconstruct.splat.lattice import Lattice
 from ctsim.reconstruct.splat.volume import voxelise
 
-STEEPEST = 0.8
-"""Greatest gain of the ramp, as a share of the views in a subset."""
 LONGEST = 3.0  # times the median root of a step: hardly seen splats, their steps spread by F, make a fit diverge
 SAMPLE = 1 << 18  # roots of which the median is taken
 FAINT = 0.5  # times water: splats below are preconditioned as if they held this
@@ -118,7 +115,7 @@ class Part:
         roots = np.sqrt(np.maximum(u, faint) / seen)[u < metal]
         longest = np.float32(LONGEST * np.median(roots)) if roots.size else np.float32(np.inf)
         step_cpu.precondition(self.u, faint, metal, longest, gradient, curvature)
-        spread = self.lattice.filter_slices(self.u, metal, gradient, self._ramp(n_views))
+        spread = self.lattice.spread(self.u, metal, gradient, n_views)
         step_cpu.move(self.u, metal, last, curvature, gradient, self.lattice.index, spread)
 
     def denoise(self, threshold: float, iterations: int) -> None:
@@ -139,9 +136,3 @@ class Part:
         for more in volumes:
             volume += more
         return volume
-
-    def _ramp(self, n_views: int) -> Image:
-        _, n_y, n_x = self.lattice.support.shape
-        p_y, p_x = self.lattice.padded
-        cycles = np.hypot((np.fft.fftfreq(p_y) * n_y)[:, None], np.fft.rfftfreq(p_x) * n_x)
-        return np.clip(cycles * math.pi / n_views, 1, max(STEEPEST * n_views, 1)).astype(np.float32)

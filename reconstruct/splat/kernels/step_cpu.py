@@ -53,21 +53,3 @@ def move(u, metal, last, roots, halves, index, spread):
     for i in prange(u.size):
         half = spread[index[i]] if u[i] < metal else halves[i]
         u[i] = min(max(u[i] + roots[i] * half, np.float32(0)), last)
-
-
-@njit(parallel=True, cache=True)
-def damp(spectrum, gain):
-    """Multiply a spectrum [y, x, z] by real gains [y, x] in place."""
-    for j in prange(spectrum.shape[0]):
-        for i in range(spectrum.shape[1]):
-            for k in range(spectrum.shape[2]):
-                spectrum[j, i, k] *= gain[j, i]
-
-
-@njit(parallel=True, cache=True)
-def put_slices(filtered, first, volume):
-    """Put slices [y, more than x, z] into the volume [y, x, z], from its slice `first` on."""
-    for j in prange(volume.shape[0]):
-        for i in range(volume.shape[1]):
-            for k in range(filtered.shape[2]):
-                volume[j, i, first + k] = filtered[j, i, k]
