@@ -6,9 +6,11 @@ shadow is taken as exp(−½ du²/S_uu − ½ dv²/S_vv), of the mass that EWA g
 of Long, Fessler and Balter (IEEE Trans. Med. Imaging 29, 2010, doi:10.1109/TMI.2010.2050898) with Gaussians. What it
 leaves out is S_uv, of the order of u·v/dsd² of the others.
 
-A profile is summed over pairs of splats, for half as many rows as a register has lanes, and the transpose over pairs of
-rows: with a row in each lane most of what is computed lies beyond the cutoff. Sums stay in registers. Both take the
-same pairs of splat and row, since what lies beyond a splat's cutoff is zero.
+Where splats are about as far apart as rows, a profile has a row in each lane and its splats pass by in step: the lanes
+see neighbours, which lie together. Elsewhere most of that would lie beyond the cutoff; there it is summed over pairs of
+splats, for half as many rows as a register has lanes. The transpose has splats in the lanes, and rows pass by or come
+in pairs. Sums stay in registers. Both take the same pairs of splat and row, since what lies beyond a splat's cutoff is
+zero.
 
 Splats are ordered by run, z ascending in even steps: `runs` holds xy float64 [run, 2], the starts [run + 1] of runs in
 z float32 [1, splat + WIDTH], both mm, and the most splats that a run has. Images are float32
@@ -60,6 +62,9 @@ RUNS_TYPE = "Tuple((float64[:,::1], int64[::1], float32[:,::1], int64))"  # of `
 SLACK = 1e-3  # of a splat and of a row: ranges are wider by that, so that the cutoff alone decides, not rounding
 HALF_LOG2E = 0.5 * math.log2(math.e)  # exponents are of 2, which saves a product each
 ROW, FALLING, PEAKS, FIRST, SECOND = range(5)  # of a run's table [5, splat]: row, −HALF_LOG2E/S_vv, peak, two channels
+LEAD = WIDTH  # places before a table's first splat, and a profile's first row: zeros that lanes may see
+MOST = 2 * WIDTH  # that pass by
+SPARSE, DENSE = 0.7, 1.7  # splats a row, within which they pass by in step
 # what a run has in common: u, S_uu, v per mm of z, S_vv's two parts, |ray|²'s two, and the peak over √S_vv
 U0, S_UU, PER_Z, S_VV, S_VV_2, RAY, RAY_2, W0 = range(8)
 PLACE = 8
@@ -109,9 +114,10 @@ def _shadows(camera, place, z, bounds, table):
         cz = add(load(z, 0, i), source)
         at = mul(per_z, cz)
         over = div(one, fma(mul(at, at), along, across))
-        store(table, ROW, i - bounds[0], add(at, origin))
-        store(table, FALLING, i - bounds[0], mul(half, over))
-        store(table, PEAKS, i - bounds[0], mul(peak, sqrt(mul(fma(mul(cz, cz), ray_2, ray), over))))
+        k = LEAD + i - bounds[0]
+        store(table, ROW, k, add(at, origin))
+        store(table, FALLING, k, mul(half, over))
+        store(table, PEAKS, k, mul(peak, sqrt(mul(fma(mul(cz, cz), ray_2, ray), over))))
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -159,16 +165,19 @@ def _window(at, scale, camera, z, bounds, size, place):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _weighted(values, bounds, table):
-    """Write a run's values times peaks."""
-    n, half = bounds[1] - bounds[0], WIDTH // 2
+    """Write a run's values times peaks, and zeros behind."""
+    n, half, zero = bounds[1] - bounds[0], WIDTH // 2, spread(np.float32(0))
     whole = n // WIDTH * WIDTH
     for k in range(0, whole, WIDTH):
         a, b = load(values, bounds[0] + k, 0), load(values, bounds[0] + k + half, 0)  # channels in turns
-        store(table, FIRST, k, mul(evens(a, b), load(table, PEAKS, k)))
-        store(table, SECOND, k, mul(odds(a, b), load(table, PEAKS, k)))
+        store(table, FIRST, LEAD + k, mul(evens(a, b), load(table, PEAKS, LEAD + k)))
+        store(table, SECOND, LEAD + k, mul(odds(a, b), load(table, PEAKS, LEAD + k)))
     for k in range(whole, n):
-        table[FIRST, k] = values[bounds[0] + k, 0] * table[PEAKS, k]
-        table[SECOND, k] = values[bounds[0] + k, 1] * table[PEAKS, k]
+        table[FIRST, LEAD + k] = values[bounds[0] + k, 0] * table[PEAKS, LEAD + k]
+        table[SECOND, LEAD + k] = values[bounds[0] + k, 1] * table[PEAKS, LEAD + k]
+    for k in range(LEAD + n, LEAD + n + WIDTH + MOST, WIDTH):
+        store(table, FIRST, k, zero)
+        store(table, SECOND, k, zero)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -199,13 +208,44 @@ def _paired(a, b):
     return add(evens(a, b), odds(a, b))
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _passing(step, wide):
+    """Return how far before its own place a lane's first neighbour is, and how many pass by that are within `wide`.
+
+    Places are `step` neighbours apart, and drift from the lanes by `step` − 1 each.
+    """
+    drift = (WIDTH - 1) * (step - 1)
+    return wide - min(drift, 0.0), int(math.floor(2 * wide + abs(drift))) + 1
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _in_step(a_row, n):
+    """Return whether splats `a_row` to a row pass by, `n` of them."""
+    return SPARSE <= a_row <= DENSE and n <= MOST
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _begin(first, n):
+    """Return the integer from which what passes by begins: not before −WIDTH, nor beyond n, where nothing is missed."""
+    return int(math.ceil(min(max(first, -WIDTH), n)))
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _lay(a, b, gains, left, right, v, image, n_u):
+    """Add a profile's rows from v on, of both channels, to the columns of a shadow."""
+    for u in range(left, right):
+        g = pick(gains, 0, u - left)
+        store(image, u, v, fma(g, a, load(image, u, v)))
+        store(image, n_u + u, v, fma(g, b, load(image, n_u + u, v)))
+
+
 @compiled_once(RUNS_TYPE, "float32[:,::1]", "float64", "float64[::1]", "float32[:,::1]")
 def _forward_view(runs, values, scale, camera, image):
     xy, starts, z, tallest = runs
     n_u, n_v = image.shape[0] // 2, image.shape[1] - WIDTH
     place, least, zero = np.empty(PLACE), _least(camera), spread(np.float32(0))
     twice = lower(ramp(np.float32(0)), ramp(np.float32(0)))
-    table, gains = np.empty((5, tallest + WIDTH), np.float32), np.empty((1, n_u + WIDTH), np.float32)
+    table, gains = np.zeros((5, tallest + 2 * WIDTH + MOST), np.float32), np.empty((1, n_u + WIDTH), np.float32)
     for run in range(xy.shape[0]):
         bounds = _filled(values, starts[run], starts[run + 1])
         if bounds[0] == bounds[1]:
@@ -219,12 +259,25 @@ def _forward_view(runs, values, scale, camera, image):
         n, lowest = bounds[1] - bounds[0], _row(camera, place, z[0, bounds[0]])
         highest = _row(camera, place, z[0, bounds[1] - 1])
         a_row = (n - 1) / (highest - lowest) if highest != lowest else 0.0  # splats, of either sign
-        wide = abs(a_row) * (0.5 * (HALF - 1) + reach + SLACK) + SLACK
+        wide = abs(a_row) * (reach + SLACK) + SLACK
+        before, passing = _passing(a_row, wide)
+        if _in_step(a_row, passing):
+            for v in range(low, high, WIDTH):
+                first = LEAD + _begin((v - lowest) * a_row - before, n)
+                rows, a, b = ramp(np.float32(v)), zero, zero
+                for k in range(first, first + passing):
+                    t = sub(rows, load(table, ROW, k))
+                    g = decay(mul(mul(t, t), load(table, FALLING, k)), least)
+                    a = fma(g, load(table, FIRST, k), a)
+                    b = fma(g, load(table, SECOND, k), b)
+                _lay(a, b, gains, left, right, v, image, n_u)
+            continue
+        wide += abs(a_row) * 0.5 * (HALF - 1)
         pairs = _pairs(2 * wide, n)
-        table[FIRST, n] = table[SECOND, n] = 0
         for v in range(low, high, WIDTH):
             middle = (v + 0.5 * (HALF - 1) - lowest) * a_row
-            k, m = _start(middle - wide, n, pairs), _start(middle + HALF * a_row - wide, n, pairs)
+            k = LEAD + _start(middle - wide, n, pairs)
+            m = LEAD + _start(middle + HALF * a_row - wide, n, pairs)
             rows, later = add(twice, spread(np.float32(v))), add(twice, spread(np.float32(v + HALF)))
             a, b, c, d = zero, zero, zero, zero
             for _ in range(pairs):
@@ -237,11 +290,7 @@ def _forward_view(runs, values, scale, camera, image):
                 c = fma(g, pair(table, FIRST, m), c)
                 d = fma(g, pair(table, SECOND, m), d)
                 k, m = k + 2, m + 2
-            a, b = _paired(a, c), _paired(b, d)
-            for u in range(left, right):
-                g = pick(gains, 0, u - left)
-                store(image, u, v, fma(g, a, load(image, u, v)))
-                store(image, n_u + u, v, fma(g, b, load(image, n_u + u, v)))
+            _lay(_paired(a, c), _paired(b, d), gains, left, right, v, image, n_u)
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
@@ -261,29 +310,29 @@ def _add_runs_own(table, bounds, sums):
     n, half = bounds[1] - bounds[0], WIDTH // 2
     whole = n // WIDTH * WIDTH
     for k in range(0, whole, WIDTH):
-        a, b, at = load(table, FIRST, k), load(table, SECOND, k), bounds[0] + k
+        a, b, at = load(table, FIRST, LEAD + k), load(table, SECOND, LEAD + k), bounds[0] + k
         store(sums, at, 0, add(lower(a, b), load(sums, at, 0)))  # channels in turns
         store(sums, at + half, 0, add(upper(a, b), load(sums, at + half, 0)))
     for k in range(whole, n):
-        sums[bounds[0] + k, 0] += table[FIRST, k]
-        sums[bounds[0] + k, 1] += table[SECOND, k]
+        sums[bounds[0] + k, 0] += table[FIRST, LEAD + k]
+        sums[bounds[0] + k, 1] += table[SECOND, LEAD + k]
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _topmost(table, k, n):
     """Return the least row of `HALF` splats from k on."""
-    return min(table[ROW, min(k, n - 1)], table[ROW, min(k + HALF, n) - 1])
+    return min(table[ROW, LEAD + min(k, n - 1)], table[ROW, LEAD + min(k + HALF, n) - 1])
 
 
 @compiled_once("UniTuple(int64, 2)", RUNS_TYPE, "float64", "float64[::1]", "float32[:,::1]", "float32[:,::1]")
 def _backward_runs(chosen, runs, scale, camera, image, sums):
     xy, starts, z, tallest = runs
     n_u, n_v = image.shape[0] // 2, image.shape[1] - WIDTH
-    place, profile = np.empty(PLACE), np.zeros((2, n_v + WIDTH + 1), np.float32)  # a pair may end beyond the last row
-    least, zero, two = _least(camera), spread(np.float32(0)), spread(np.float32(2))
+    place, profile = np.empty(PLACE), np.zeros((2, LEAD + n_v + WIDTH + MOST), np.float32)
+    least, zero, one, two = _least(camera), spread(np.float32(0)), spread(np.float32(1)), spread(np.float32(2))
     twice = lower(ramp(np.float32(0)), ramp(np.float32(0)))
     turns = sub(ramp(np.float32(0)), add(twice, twice))  # 0, 1, 0, 1, …
-    table, gains = np.empty((5, tallest + WIDTH), np.float32), np.empty((1, n_u + WIDTH), np.float32)
+    table, gains = np.zeros((5, tallest + 2 * WIDTH + MOST), np.float32), np.empty((1, n_u + WIDTH), np.float32)
     for run in range(chosen[0], chosen[1]):
         bounds = (starts[run], starts[run + 1])
         left, right, low, high, reach = _window(xy[run], scale, camera, z, bounds, (n_v, n_u), place)
@@ -296,19 +345,36 @@ def _backward_runs(chosen, runs, scale, camera, image, sums):
                 g = pick(gains, 0, u - left)
                 a = fma(g, load(image, u, v), a)
                 b = fma(g, load(image, n_u + u, v), b)
-            store(profile, 0, v, a)
-            store(profile, 1, v, b)
+            store(profile, 0, LEAD + v, a)
+            store(profile, 1, LEAD + v, b)
         _shadows(camera, place, z, bounds, table)
         n = bounds[1] - bounds[0]
-        spacing = abs(table[ROW, n - 1] - table[ROW, 0]) / max(n - 1, 1)
-        pairs = _pairs((HALF - 1) * spacing + 2 * reach + 4 * SLACK, high - low)
+        spacing = (table[ROW, LEAD + n - 1] - table[ROW, LEAD]) / max(n - 1, 1)  # of either sign
+        before, passing = _passing(spacing, reach + 2 * SLACK)
+        if spacing > 0 and _in_step(1 / spacing, passing):
+            for k in range(LEAD, LEAD + n, WIDTH):
+                first = _begin(table[ROW, k] - before, n_v)
+                rows, falling, here = load(table, ROW, k), load(table, FALLING, k), ramp(np.float32(first))
+                a, b = zero, zero
+                for v in range(LEAD + first, LEAD + first + passing):
+                    t = sub(here, rows)
+                    g = decay(mul(mul(t, t), falling), least)
+                    a = fma(g, load(profile, 0, v), a)
+                    b = fma(g, load(profile, 1, v), b)
+                    here = add(here, one)
+                store(table, FIRST, k, mul(a, load(table, PEAKS, k)))
+                store(table, SECOND, k, mul(b, load(table, PEAKS, k)))
+            _add_runs_own(table, bounds, sums)
+            continue
+        pairs = _pairs((HALF - 1) * abs(spacing) + 2 * reach + 4 * SLACK, high - low)
         for k in range(0, n, WIDTH):
             v = low + _start(_topmost(table, k, n) - reach - SLACK - low, high - low, pairs)
             w = low + _start(_topmost(table, k + HALF, n) - reach - SLACK - low, high - low, pairs)
-            rows, falling = load(table, ROW, k), load(table, FALLING, k)
+            rows, falling = load(table, ROW, LEAD + k), load(table, FALLING, LEAD + k)
             later, steep = upper(rows, rows), upper(falling, falling)
             rows, falling = lower(rows, rows), lower(falling, falling)
             here, there = add(spread(np.float32(v)), turns), add(spread(np.float32(w)), turns)
+            v, w = LEAD + v, LEAD + w
             a, b, c, d = zero, zero, zero, zero
             for _ in range(pairs):
                 t = sub(here, rows)
@@ -320,9 +386,8 @@ def _backward_runs(chosen, runs, scale, camera, image, sums):
                 c = fma(g, pair(profile, 0, w), c)
                 d = fma(g, pair(profile, 1, w), d)
                 v, w, here, there = v + 2, w + 2, add(here, two), add(there, two)
-            a, b = _paired(a, c), _paired(b, d)
-            store(table, FIRST, k, mul(a, load(table, PEAKS, k)))
-            store(table, SECOND, k, mul(b, load(table, PEAKS, k)))
+            store(table, FIRST, LEAD + k, mul(_paired(a, c), load(table, PEAKS, LEAD + k)))
+            store(table, SECOND, LEAD + k, mul(_paired(b, d), load(table, PEAKS, LEAD + k)))
         _add_runs_own(table, bounds, sums)
 
 
