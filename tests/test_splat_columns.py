@@ -113,6 +113,52 @@ def test_powers_of_two_are_right_down_to_the_cutoff_and_none_beyond():
     np.testing.assert_allclose(found, np.where(exponents >= least, 2.0**exponents, 0), rtol=4e-6, atol=0)
 
 
+@pytest.mark.parametrize("height", [0.3, 1.0, 1.15, 1.3, 1.6, 2.0, 2.6, 3.0])
+@pytest.mark.parametrize("way", ["up", "down"])
+def test_tall_runs_hold_every_pair_of_splat_and_row(height, way):
+    """Splats 0.2 to 1.9 to a row: in step with the rows of a register from 0.7 to 1.7, in pairs elsewhere."""
+    n_v = int(80 / height)  # the shadow has half as many again
+    geometry = shifted(GEOMETRY, n_voxel=(70, 3, 2), n_detector=(n_v, 9), d_detector=(height, 1.2))
+    if way == "down":
+        geometry = downwards(geometry)
+    support = np.ones(geometry.n_voxel, bool)
+    support[[0, 7, 40, 41, 58, 69], 1] = False
+    lattice = Lattice(geometry=geometry, support=support)
+    projector, camera = LatticeProjector(geometry, lattice), Projector(geometry=geometry, tolerance=np.inf).cameras[2]
+    assert projector.by_columns
+    r = np.random.default_rng(8)
+    values, picture = r.uniform(-1, 1, (len(lattice), 2)).astype(np.float32), r.uniform(-1, 1, (2, n_v, 9))
+    weights, rim = cut_off(lattice, camera, n_v, 9)
+    # a row is known to three roundings of up to n_v, hence a shadow to CUTOFF/√S_vv of these, S_vv > 1/12
+    share = 1e-5 + CUTOFF * 12**0.5 * 3 * n_v * 2.0**-24
+    found = projector.pictures(projector.forward(values, np.array([2])))[0]
+    bound = np.einsum("svu,sc->cvu", share * weights + rim, np.abs(values))
+    assert np.all(np.abs(found - np.einsum("svu,sc->cvu", weights, values)) <= bound)
+    sums = projector.adjoint(projector.arranged(picture[None].astype(np.float32)), np.array([2]))
+    bound = np.einsum("svu,cvu->sc", share * weights + rim, np.abs(picture))
+    assert np.all(np.abs(sums - np.einsum("svu,cvu->sc", weights, picture)) <= bound + 1e-7 * np.abs(sums).max())
+
+
+def cut_off(lattice, camera, n_v, n_u):
+    """Return the weights [splat, v, u] within the cutoff, and those so close to it that rounding may decide."""
+    shapes = lattice.splats(np.zeros((len(lattice), 1), np.float32)).shapes().astype(np.float64)
+    weights, (_, boxed) = (reference.separable_weights(shapes, camera, n_v, n_u), reference.spreads(shapes, camera))
+    u, v = (c[:, None] for c in reference.shadow(shapes, camera)[0].T)
+    along_v, along_u = (
+        (np.arange(n_v) - v) ** 2 / boxed[:, 1, 1, None],
+        (np.arange(n_u) - u) ** 2 / boxed[:, 0, 0, None],
+    )
+    farthest = np.maximum(along_v[:, :, None], along_u[:, None])
+    return weights * (farthest <= CUTOFF**2), weights * (abs(farthest - CUTOFF**2) < 1e-2)
+
+
+def downwards(geometry):
+    """Return the geometry with the detector's rows counted from the top."""
+    poses = geometry.pose_array()
+    poses[:, 9:12] *= -1
+    return shifted(geometry, poses=tuple(tuple(row) for row in poses.tolist()))
+
+
 def on_the_rim(geometry, lattice, below):
     """Shift the detector so that the cutoff of the only splat in view 0 is so many rows below a row."""
 
@@ -157,9 +203,7 @@ def test_both_directions_take_the_same_pairs(case):
     if case == "coarse":
         geometry = shifted(geometry, n_detector=(3, 2), d_detector=(8.0, 8.0))
     if case == "down":
-        poses = geometry.pose_array()
-        poses[:, 9:12] *= -1
-        geometry = shifted(geometry, poses=tuple(tuple(row) for row in poses.tolist()))
+        geometry = downwards(geometry)
     support = np.zeros(geometry.n_voxel, bool)
     support[1:10, 6, 5], support[[0, 2, 3, 7], 7, 7] = True, True
     lattice = Lattice(geometry=geometry, support=support)

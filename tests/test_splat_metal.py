@@ -5,12 +5,12 @@ import pytest
 
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.splat import lattice, metal
-from ctsim.reconstruct.splat.curve import DENSEST, MaterialCurve
+from ctsim.reconstruct.splat.curve import DENSEST, METAL, MaterialCurve
 from ctsim.reconstruct.splat.kernels import response_reference, step_cpu
 from ctsim.reconstruct.splat.lattice import Lattice
 from ctsim.reconstruct.splat.level import weighted
 from ctsim.reconstruct.splat.ordered import Fit
-from ctsim.reconstruct.splat.part import Part
+from ctsim.reconstruct.splat.part import FAINT, LONGER, LONGEST, Part
 from ctsim.reconstruct.splat.response import make_response
 
 RESPONSE = make_response("tube", e_max=90.0, basis="klein-nishina", theta=(0.5,))
@@ -130,6 +130,35 @@ def test_slopes_are_multiplied_by_their_pixels_and_scratch_becomes_zero(finer):
     np.testing.assert_array_equal(out, expected)
     step_cpu.multiply(slopes, pixels, finer, scratch, slopes)
     np.testing.assert_array_equal(slopes, expected)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_metal_and_fine_splats_step_by_their_own_curvature_and_the_rest_together(volume, which):
+    """By the formula, in float64; what the ramp spreads over tissue is asked of it."""
+    fit, views = fit_of(volume), np.array([2, 7])
+    fit._split(metal.surface(fit.parts[0]))
+    fit.parts[0].u[::7], fit.parts[0].u[1::7] = 1.5 * METAL * CURVE.water, 0
+    part, rng, length = fit.parts[which], np.random.default_rng(4), 0.7
+    _, slopes = fit._seen([one.paths(views) for one in fit.parts])
+    pixels = fit.parts[0].projector.arranged(rng.standard_normal((2, 36, 44)).astype(np.float32))
+    part.curvature[...] = rng.uniform(0.1, 10, part.curvature.shape)
+    part.measured, u = 12, part.u.astype(np.float64)
+    gradient = CURVE.transpose(part.u, part.back(slopes[which], pixels, views)).astype(np.float64)
+    bend = CURVE.transpose(part.u, part.curvature).astype(np.float64) * len(views) / 12
+    limit = np.inf if which else METAL * CURVE.water
+    roots = np.sqrt(np.maximum(u, FAINT * CURVE.water) / bend)
+    tissue = (u < limit) & (which == 0)
+    if which == 0:
+        roots[tissue] = np.minimum(roots[tissue], LONGEST * np.median(roots[tissue]))
+    halves = roots * gradient * length * (LONGER if which else 1)
+    if which == 0:
+        assert tissue.any() and not tissue.all()
+        spread = part.lattice.spread(part.u, np.float32(limit), halves.astype(np.float32), len(views))
+        halves[tissue] = spread[part.lattice.index][tissue]
+    part.move(slopes[which], pixels, views, length)
+    expected = np.clip(u + roots * halves, 0, CURVE.knots[-1])
+    np.testing.assert_allclose(part.u, expected, rtol=1e-5, atol=1e-5 * np.abs(roots * halves).max())
+    assert np.abs(part.u - u).max() > 0.01 * IRON
 
 
 def test_a_volume_is_the_sum_of_its_pieces(volume, monkeypatch):

@@ -70,9 +70,9 @@ class MaterialCurve:
         curve_cpu.evaluate(u, self.knots, self.densities, self.slopes, unit, out)
         return out
 
-    def transpose(self, u: Image, sums: Image, factor: float = 1.0, out: Image | None = None) -> Image:
+    def transpose(self, u: Image, sums: Image, factor: float = 1.0) -> Image:
         """Return how sums by (ρa, ρb), float32 [splat, 2], change with each unknown, times a factor: [splat]."""
-        out = np.empty_like(u) if out is None else out
+        out = np.empty_like(u)
         curve_cpu.transpose(u, self.knots, self.slopes * factor, sums, out)
         return out
 

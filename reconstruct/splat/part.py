@@ -9,7 +9,7 @@ from ctsim.geometry import Geometry
 from ctsim.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.columns import LatticeProjector
 from ctsim.reconstruct.splat.curve import METAL, MaterialCurve
-from ctsim.reconstruct.splat.kernels import step_cpu
+from ctsim.reconstruct.splat.kernels import curve_cpu, step_cpu
 from ctsim.reconstruct.splat.lattice import Lattice
 from ctsim.reconstruct.splat.volume import voxelise
 
@@ -40,14 +40,14 @@ class Part:
     curvature: Image = field(init=False)  # by both densities, summed over the views that it was `measured` in
     measured: int = 0
     _pair: Image = field(init=False)  # densities, then sums by them: memory that is used again costs less than new
-    _gradient: Image = field(init=False)
+    _halves: Image = field(init=False)
     _roots: Image = field(init=False)
 
     def __post_init__(self) -> None:
         self.projector = LatticeProjector(self.geometry, self.lattice, exact=self.exact)
         n = len(self.lattice)
         self.curvature, self._pair = np.zeros((n, 2), np.float32), np.empty((n, 2), np.float32)
-        self._gradient, self._roots = np.empty(n, np.float32), np.empty(n, np.float32)
+        self._halves, self._roots = np.empty(n, np.float32), np.empty(n, np.float32)
 
     def state(self) -> dict[str, Image]:
         """Return all that the next step depends on, as arrays that it changes."""
@@ -92,31 +92,28 @@ class Part:
     def move(self, slopes: Image, lacking: Image, views: NDArray[np.int64], length: float) -> None:
         """Step by `length` of a step towards what pixels lack; slopes are overwritten.
 
-        The curvature is that of all views in which it was measured: it changes little from subset to subset.
+        The curvature is that of all views in which it was measured: it changes little from subset to subset. Metal,
+        and all fine splats, step each by itself: metal's steps are so large that spread they swamp the tissue.
         """
-        gradient = self.curve.transpose(self.u, self.back(slopes, lacking, views, slopes), length, self._gradient)
-        curvature = self.curve.transpose(self.u, self.curvature, len(views) / self.measured, self._roots)
-        self._move(gradient, curvature, len(views))
+        sums, share = self.back(slopes, lacking, views, slopes), len(views) / self.measured
+        fine, last = self.finer > 1, np.float32(self.curve.knots[-1])
+        metal = np.float32(0 if fine else METAL * self.curve.water)
+        self._precondition(sums, length * (LONGER if fine else 1), share, metal)
+        halves = self._halves if fine else self.lattice.spread(self.u, metal, self._halves, len(views))
+        step_cpu.move(self.u, metal, last, self._roots, self._halves, self.lattice.index, halves)
 
-    def _move(self, gradient: Image, curvature: Image, n_views: int) -> None:
-        """Step; gradient and curvature are overwritten.
-
-        Metal, and all fine splats, step each by itself: metal's steps are so large that spread they swamp the tissue.
-        """
-        water, last = self.curve.water, np.float32(self.curve.knots[-1])
-        faint, metal = np.float32(FAINT * water), np.float32(METAL * water)
-        if self.finer > 1:
-            gradient *= np.float32(LONGER)
-            step_cpu.precondition(self.u, faint, np.float32(0), np.float32(np.inf), gradient, curvature)
-            step_cpu.move(self.u, np.float32(0), last, curvature, gradient, self.lattice.index, gradient)
-            return
+    def _precondition(self, sums: Image, length: float, share: float, metal: np.float32) -> None:
+        """Write the roots of steps, and these times the gradient of `sums`; the curvature is a `share` of the known."""
+        curve, faint = self.curve, np.float32(FAINT * self.curve.water)
         few = slice(None, None, max(len(self.u) // SAMPLE, 1))
-        u, seen = self.u[few], np.maximum(curvature[few], np.float32(step_cpu.LEAST))
-        roots = np.sqrt(np.maximum(u, faint) / seen)[u < metal]
+        u, seen = self.u[few], curve.transpose(self.u[few], self.curvature[few], share)
+        roots = np.sqrt(np.maximum(u, faint) / np.maximum(seen, np.float32(curve_cpu.LEAST)))[u < metal]
         longest = np.float32(LONGEST * np.median(roots)) if roots.size else np.float32(np.inf)
-        step_cpu.precondition(self.u, faint, metal, longest, gradient, curvature)
-        spread = self.lattice.spread(self.u, metal, gradient, n_views)
-        step_cpu.move(self.u, metal, last, curvature, gradient, self.lattice.index, spread)
+        downhill, upwards = ((curve.slopes * factor).astype(np.float32) for factor in (length, share))
+        limits = faint, metal, longest
+        curve_cpu.precondition(
+            self.u, curve.knots, downhill, sums, upwards, self.curvature, limits, self._halves, self._roots
+        )
 
     def denoise(self, threshold: float, iterations: int) -> None:
         """Take away total variation."""

@@ -1,11 +1,7 @@
 """Steps of the splats' unknowns and what leads to them, in passes without temporaries: they are tens of millions."""
 
-import math
-
 import numpy as np
 from numba import njit, prange
-
-LEAST = 1e-20  # curvature, of what no ray sees
 
 
 @njit(parallel=True, cache=True)
@@ -24,20 +20,6 @@ def multiply(slopes, pixels, finer, scratch, out):
                 for i in range(line.size):
                     product[finer * i + k] = given[finer * i + k] * line[i]
             product[n_columns - scratch :] = 0
-
-
-@njit(parallel=True, cache=True, error_model="numpy")
-def precondition(u, faint, metal, longest, gradient, curvature):
-    """Turn curvatures into the roots of steps, and gradients into roots times gradients.
-
-    An unknown below `faint` counts as that; roots are at most `longest` in what is below `metal`.
-    """
-    for i in prange(u.size):
-        root = math.sqrt(max(u[i], faint) / max(curvature[i], np.float32(LEAST)))
-        if u[i] < metal:
-            root = min(root, longest)
-        curvature[i] = root
-        gradient[i] *= root
 
 
 @njit(parallel=True, cache=True)
