@@ -73,12 +73,20 @@ scanner = { n_voxel = [64, 64, 64], n_detector = [96, 96], n_views = 90, i0 = 1e
 """
 
 
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("small")
-    (folder / "scene.toml").write_text(SMALL, encoding="utf-8")
+def made(folder, scene):
+    (folder / "scene.toml").write_text(scene, encoding="utf-8")
     assert make_dataset([str(folder / "scene.toml"), str(folder / "data")]) == 0
     return open_scan(list_scans(folder / "data")[0])
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    return made(tmp_path_factory.mktemp("small"), SMALL)
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory):
+    return made(tmp_path_factory.mktemp("toy"), TOY)
 
 
 def data_of(geometry, p):
@@ -208,33 +216,56 @@ def test_it_beats_fdk_with_and_without_metal(small):
 
 
 @pytest.mark.slow
-def test_what_a_coarse_fit_lost_within_the_shadows_comes_back(small, monkeypatch):
-    """Streaks of thick metal emptied parts of a cup on coarse grids; here a third of the object is taken."""
-    whole, refine = reconstruct(small.scan).values.numpy(), course.refined
+def bitten(monkeypatch, grid, bite):
+    """Let fits on a grid of so many voxels along x begin with air in a slice of x."""
+    refine, met = course.refined, []
 
-    def bitten(values, fine):
+    def refined_and_bitten(values, fine):
         values = refine(values, fine)
-        values[:, :, : values.shape[2] // 3] = 0
+        if values.shape[2] == grid:
+            values[:, :, bite], _ = 0, met.append(grid)
         return values
 
-    monkeypatch.setattr(course, "refined", bitten)
+    monkeypatch.setattr(course, "refined", refined_and_bitten)
+    return met
+
+
+FINEST = 58  # voxels of the finest grid of `small` along x, over 40 of the volume
+
+
+def test_what_a_coarse_fit_lost_within_the_shadows_comes_back(small, monkeypatch):
+    """Streaks of thick metal emptied parts of a cup on coarse grids; here a slab, all of it near the rest."""
+    whole = reconstruct(small.scan).values.numpy()
+    met = bitten(monkeypatch, FINEST, slice(19, 19 + 2 * course.NEAR))
     again = reconstruct(small.scan).values.numpy()
-    third = np.s_[:, :, : whole.shape[2] // 3]
-    assert again[third].sum() == pytest.approx(whole[third].sum(), rel=0.02)
+    slab = np.s_[:, :, 14:18]
+    assert met and again[slab].sum() == pytest.approx(whole[slab].sum(), rel=0.02)
     truth = truth_of(small)
-    # 0.34 dB are left to regain after nine passes, 0.20 after fourteen
     assert tissue_score(again, truth).values["psnr3d"] > tissue_score(whole, truth).values["psnr3d"] - 0.5
 
 
+def test_what_the_grid_before_lost_far_from_the_rest_stays_away(small, monkeypatch):
+    bitten(monkeypatch, FINEST, slice(19))
+    values = reconstruct(small.scan).values.numpy()
+    first = (19 - course.NEAR) * 40 / FINEST  # voxel in which splats begin, whose tails reach one farther
+    assert not values[:, :, : int(first) - 1].any() and values[:, :, int(first) + 1].any()
+
+
+def test_a_third_that_a_coarser_grid_lost_comes_back(small, monkeypatch):
+    monkeypatch.setattr(course, "SMALLEST", 12)  # for a third grid
+    whole = reconstruct(small.scan).values.numpy()
+    met = bitten(monkeypatch, FINEST // 2, slice(9))
+    again = reconstruct(small.scan).values.numpy()
+    third = np.s_[:, :, :13]
+    assert met and again[third].sum() == pytest.approx(whole[third].sum(), rel=0.02)
+
+
 @pytest.mark.slow
-def test_two_passes_over_the_finest_grid_reach_35_db(tmp_path):
+def test_two_passes_over_the_finest_grid_reach_35_db(toy):
     """Prototypes on as many voxels, views and pixels, but another object, had 34.9 dB quickly and 36.0 after more.
 
     Over all voxels, metal too; 180 view updates are on the finest grid, 45 on a coarser one. One pass fewer has 33.4.
     """
-    (tmp_path / "scene.toml").write_text(TOY, encoding="utf-8")
-    assert make_dataset([str(tmp_path / "scene.toml"), str(tmp_path / "data")]) == 0
-    toy = open_scan(list_scans(tmp_path / "data")[0])
     reference = truth_of(toy).references["effective"]
     volume = reconstruct(toy.scan, passes=(1, 2))
     assert volume.details["view_updates"] == 225
