@@ -113,12 +113,24 @@ def test_powers_of_two_are_right_down_to_the_cutoff_and_none_beyond():
     np.testing.assert_allclose(found, np.where(exponents >= least, 2.0**exponents, 0), rtol=4e-6, atol=0)
 
 
-@pytest.mark.parametrize("height", [0.3, 1.0, 1.15, 1.3, 1.6, 2.0, 2.6, 3.0])
+@pytest.mark.parametrize(
+    ("height", "d_z", "in_step"),
+    [
+        *((height, 0.8, False) for height in (0.3, 1.0, 3.0)),  # 0.2, 0.6 and 1.9 splats a row
+        *((height, 0.8, True) for height in (1.15, 1.3, 1.6, 2.0, 2.6)),  # 0.7 to 1.6
+        (0.4, 0.2, True),  # splats that reach four rows
+        (0.04, 0.02, False),  # that reach nineteen
+    ],
+)
 @pytest.mark.parametrize("way", ["up", "down"])
-def test_tall_runs_hold_every_pair_of_splat_and_row(height, way):
-    """Splats 0.2 to 1.9 to a row: in step with the rows of a register from 0.7 to 1.7, in pairs elsewhere."""
-    n_v = int(80 / height)  # the shadow has half as many again
+def test_tall_runs_hold_every_pair_of_splat_and_row(height, d_z, in_step, way):
+    """In step where splats are as far apart as rows and few rows wide, and rows go up; in pairs elsewhere."""
+    n_v = int(100 * d_z / height)  # the shadow has half as many again
     geometry = shifted(GEOMETRY, n_voxel=(70, 3, 2), n_detector=(n_v, 9), d_detector=(height, 1.2))
+    geometry = shifted(geometry, d_voxel=(d_z, 0.8, 0.9))
+    a_row, sigma = height / 2 / d_z, 0.45 * (d_z * 0.8 * 0.9) ** (1 / 3) * 2 / height
+    _, n = kernels._passing.py_func(a_row, a_row * CUTOFF * (sigma**2 + 1 / 12) ** 0.5)
+    assert kernels._in_step.py_func(a_row, n) == in_step
     if way == "down":
         geometry = downwards(geometry)
     support = np.ones(geometry.n_voxel, bool)
@@ -253,7 +265,11 @@ def test_a_tilted_detector_goes_splat_by_splat():
 
 
 @pytest.mark.parametrize("size", [(30, 34), (1, 1), (3, 9), (8, 8), (17, 4)])
-@pytest.mark.parametrize("scale", [(1, 1), (0.1, 0.1), (8, 8)], ids=["pixels", "fine pixels", "coarse pixels"])
+@pytest.mark.parametrize(
+    "scale",
+    [(1, 1), (1.6, 1.2), (0.1, 0.1), (8, 8)],
+    ids=["pixels", "as far apart as splats", "fine pixels", "coarse pixels"],
+)
 def test_the_transpose_is_one(size, scale):
     geometry = shifted(GEOMETRY, n_detector=size, d_detector=scale)
     lattice = lattice_of(geometry)

@@ -5,6 +5,7 @@ import math
 import numba
 import numpy as np
 import pytest
+from by_threads import one_and_several
 
 from ctsim.kernels.lanes import WIDTH
 from ctsim.reconstruct.splat.kernels.product_cpu import padded_rows, products
@@ -38,6 +39,18 @@ def test_products_are_those_of_matrices(threads, m, n, columns, scale):
         out[...] = np.nan  # not read
     products(padded_rows(matrix), stack, out, scale)
     assert np.all(np.abs(out - wanted) <= (n + 3) * U * terms)
+
+
+def test_any_number_of_threads_gives_the_same_bits():
+    volume = normal(40, 33, 70)
+
+    def filtered():
+        found = volume.copy()
+        ramp((40, 33), (64, 48), 10).apply(found)
+        return found
+
+    one, several = one_and_several(filtered)
+    assert np.array_equal(one, several) and not np.array_equal(one, volume)
 
 
 def by_fourier(volume, across, n_views):

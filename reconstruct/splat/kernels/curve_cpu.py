@@ -1,4 +1,4 @@
-"""A material curve, its transpose, and the steps of unknowns on it, one pass over the unknowns each.
+"""A material curve, its transpose, and what steps of unknowns on it need, one pass over the unknowns each.
 
 The curve from an unknown to two densities is piecewise linear: `knots` [knot], `densities` [knot, 2] and `slopes`
 [knot − 1, 2], float64.

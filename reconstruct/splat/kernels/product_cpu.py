@@ -1,4 +1,4 @@
-"""A matrix times each of a stack of matrices (numba): few frequencies of long axes, whose last axis lies in lanes.
+"""A small matrix times each of a stack of wide ones (numba), columns in lanes.
 
 Not BLAS: its threads stay awake beside numba's for a while, and their number may change bits.
 """

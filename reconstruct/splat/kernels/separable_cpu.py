@@ -6,11 +6,11 @@ shadow is taken as exp(−½ du²/S_uu − ½ dv²/S_vv), of the mass that EWA g
 of Long, Fessler and Balter (IEEE Trans. Med. Imaging 29, 2010, doi:10.1109/TMI.2010.2050898) with Gaussians. What it
 leaves out is S_uv, of the order of u·v/dsd² of the others.
 
-Where splats are about as far apart as rows, a profile has a row in each lane and its splats pass by in step: the lanes
-see neighbours, which lie together. Elsewhere most of that would lie beyond the cutoff; there it is summed over pairs of
-splats, for half as many rows as a register has lanes. The transpose has splats in the lanes, and rows pass by or come
-in pairs. Sums stay in registers. Both take the same pairs of splat and row, since what lies beyond a splat's cutoff is
-zero.
+Where splats are about as far apart as rows, and rows go up with z, a profile has a row in each lane, and splats pass by
+in step: the lanes see neighbours, which lie together in memory. Elsewhere, as in a detector counted from the top, most
+of that would lie beyond the cutoff, and a profile is summed over pairs of splats, for half as many rows as a register
+has lanes. The transpose has splats in the lanes, and rows pass by or come in pairs. Sums stay in registers. Both take
+the same pairs of splat and row, since what lies beyond a splat's cutoff is zero.
 
 Splats are ordered by run, z ascending in even steps: `runs` holds xy float64 [run, 2], the starts [run + 1] of runs in
 z float32 [1, splat + WIDTH], both mm, and the most splats that a run has. Images are float32
@@ -56,14 +56,14 @@ from ctsim.reconstruct.splat.kernels.splat_cpu import (
     SOURCE,
 )
 
-HALF = WIDTH // 2  # rows, or splats, that are done at a time, each with two of the other
+HALF = WIDTH // 2  # rows, or splats, that are done at a time in pairs, each with two of the other
 RUNS = 256  # in a task of the transpose
 RUNS_TYPE = "Tuple((float64[:,::1], int64[::1], float32[:,::1], int64))"  # of `runs`, in Numba's words
 SLACK = 1e-3  # of a splat and of a row: ranges are wider by that, so that the cutoff alone decides, not rounding
 HALF_LOG2E = 0.5 * math.log2(math.e)  # exponents are of 2, which saves a product each
 ROW, FALLING, PEAKS, FIRST, SECOND = range(5)  # of a run's table [5, splat]: row, −HALF_LOG2E/S_vv, peak, two channels
-LEAD = WIDTH  # places before a table's first splat, and a profile's first row: zeros that lanes may see
-MOST = 2 * WIDTH  # that pass by
+LEAD = WIDTH  # places before a table's first splat, and a profile's first row, that lanes may see
+MOST = 2 * WIDTH  # neighbours that pass by, at most
 SPARSE, DENSE = 0.7, 1.7  # splats a row, within which they pass by in step
 # what a run has in common: u, S_uu, v per mm of z, S_vv's two parts, |ray|²'s two, and the peak over √S_vv
 U0, S_UU, PER_Z, S_VV, S_VV_2, RAY, RAY_2, W0 = range(8)
@@ -210,9 +210,10 @@ def _paired(a, b):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _passing(step, wide):
-    """Return how far before its own place a lane's first neighbour is, and how many pass by that are within `wide`.
+    """Return how far before the first lane's place to begin, and how many neighbours then pass by every lane.
 
-    Places are `step` neighbours apart, and drift from the lanes by `step` − 1 each.
+    They are those within `wide` of a lane's place. Places are `step` neighbours apart, so that they drift from the
+    lanes by `step` − 1 each.
     """
     drift = (WIDTH - 1) * (step - 1)
     return wide - min(drift, 0.0), int(math.floor(2 * wide + abs(drift))) + 1
@@ -220,7 +221,7 @@ def _passing(step, wide):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _in_step(a_row, n):
-    """Return whether splats `a_row` to a row pass by, `n` of them."""
+    """Return whether neighbours pass by where there are `a_row` splats to a row, `n` of them to each lane."""
     return SPARSE <= a_row <= DENSE and n <= MOST
 
 
@@ -352,7 +353,7 @@ def _backward_runs(chosen, runs, scale, camera, image, sums):
         spacing = (table[ROW, LEAD + n - 1] - table[ROW, LEAD]) / max(n - 1, 1)  # of either sign
         before, passing = _passing(spacing, reach + 2 * SLACK)
         if spacing > 0 and _in_step(1 / spacing, passing):
-            for k in range(LEAD, LEAD + n, WIDTH):
+            for k in range(LEAD, LEAD + n, WIDTH):  # rows beyond low … high are another run's, times 0
                 first = _begin(table[ROW, k] - before, n_v)
                 rows, falling, here = load(table, ROW, k), load(table, FALLING, k), ramp(np.float32(first))
                 a, b = zero, zero
