@@ -306,7 +306,7 @@ def test_the_step_is_that_of_a_majoriser(monkeypatch):
     """The Hessian's own diagonal is none: a ray's splats all make up for what it lacks, each on its own."""
     monkeypatch.setattr(ordered, "LEAST_SUBSETS", 1)  # one subset of all views: plain descent
     monkeypatch.setattr(ordered, "SUBSET", 16)
-    given, move, diagonals = scan_of("water", side=8).scan, part.Part._move, {}
+    given, precondition, diagonals = scan_of("water", side=8).scan, part.Part._precondition, {}
     monkeypatch.setattr(ordered, "surface", lambda own: np.zeros_like(own.lattice.support))  # what diverges is no metal
     begin, weights_of = course.Course._fit, {}
 
@@ -327,14 +327,17 @@ def test_the_step_is_that_of_a_majoriser(monkeypatch):
         images = (view.forward(shapes[:, k : k + 1].copy(), ones)[:, 0, :, :-WIDTH] for k in range(shapes.shape[1]))
         return np.array([(weights * image**2).sum() for image in images]) / own.lattice.unit
 
-    def jacobi(own, gradient, curvature, n_views):
+    def jacobi(own, sums, length, share, metal):
         if id(own) not in diagonals:
             diagonals[id(own)] = diagonal(own)
-        held = np.maximum(own.u, np.float32(part.FAINT * own.curve.water))
-        move(own, gradient, (held * diagonals[id(own)]).astype(np.float32), n_views)
+        held, measured = np.maximum(own.u, np.float32(part.FAINT * own.curve.water)), own.curvature
+        slopes = share * own.curve.transpose(own.u, np.ones_like(measured))  # of a curvature by both densities alike
+        own.curvature = (held * diagonals[id(own)] / slopes)[:, None].repeat(2, 1).astype(np.float32)
+        precondition(own, sums, length, share, metal)
+        own.curvature = measured
 
     falling = misfit()
-    monkeypatch.setattr(part.Part, "_move", jacobi)
+    monkeypatch.setattr(part.Part, "_precondition", jacobi)
     found = misfit()
     assert diagonals and falling < 0.06 and found > 3 * falling, (falling, found)
 
