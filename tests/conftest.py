@@ -1,4 +1,5 @@
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,19 @@ def pytest_configure(config: pytest.Config) -> None:
         import numba
 
         numba.set_num_threads(max(1, numba.config.NUMBA_NUM_THREADS // workers))  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.fixture(params=[1, 2])
+def threads(request: pytest.FixtureRequest) -> Iterator[int]:
+    """Threads of the kernels: no bit may depend on their number, so that both are compared with one reference."""
+    import numba
+
+    if request.param > numba.config.NUMBA_NUM_THREADS:  # pyright: ignore[reportAttributeAccessIssue]
+        pytest.skip("one core")
+    before = numba.get_num_threads()
+    numba.set_num_threads(request.param)
+    yield request.param
+    numba.set_num_threads(before)
 
 
 LONGEST = (

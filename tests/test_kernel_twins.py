@@ -2,7 +2,6 @@
 
 import itertools
 
-import numba
 import numpy as np
 import pytest
 
@@ -37,17 +36,6 @@ from ctsim.types import Phantom
 SHAPE = (5, 7, 11)
 U = 2.0**-24  # of float32
 RATIOS = np.array([0.5, 1.0, 0.8], np.float32)
-
-
-@pytest.fixture(params=[1, 2])
-def threads(request):
-    """No bit may depend on their number; both are compared with one reference."""
-    if request.param > numba.config.NUMBA_NUM_THREADS:  # type: ignore[attr-defined]
-        pytest.skip("one core")
-    before = numba.get_num_threads()
-    numba.set_num_threads(request.param)
-    yield request.param
-    numba.set_num_threads(before)
 
 
 def normal(*shape, seed=0):

@@ -2,7 +2,6 @@
 
 import math
 
-import numba
 import numpy as np
 import pytest
 from by_threads import one_and_several
@@ -12,16 +11,6 @@ from ctsim.reconstruct.splat.kernels.product_cpu import padded_rows, products
 from ctsim.reconstruct.splat.ramp import ROOM, STEEPEST, ramp
 
 U = 2.0**-24  # of float32
-
-
-@pytest.fixture(params=[1, 2])
-def threads(request):
-    if request.param > numba.config.NUMBA_NUM_THREADS:  # type: ignore[attr-defined]
-        pytest.skip("one core")
-    before = numba.get_num_threads()
-    numba.set_num_threads(request.param)
-    yield request.param
-    numba.set_num_threads(before)
 
 
 def normal(*shape, seed=0):

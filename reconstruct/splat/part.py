@@ -40,8 +40,8 @@ class Part:
     curvature: Image = field(init=False)  # by both densities, summed over the views that it was `measured` in
     measured: int = 0
     _pair: Image = field(init=False)  # densities, then sums by them: memory that is used again costs less than new
-    _halves: Image = field(init=False)
-    _roots: Image = field(init=False)
+    _halves: Image = field(init=False)  # roots times gradients, on the way to steps
+    _roots: Image = field(init=False)  # of the steps that curvature allows
 
     def __post_init__(self) -> None:
         self.projector = LatticeProjector(self.geometry, self.lattice, exact=self.exact)

@@ -27,7 +27,7 @@ class Ramp:
 
     def __init__(self, size: tuple[int, int], across: tuple[int, int], n_views: int) -> None:
         self.level = max(STEEPEST * n_views, 1.0)
-        highest = self.level * n_views / math.pi
+        highest = self.level * n_views / math.pi  # cycles, from which on the gain is level
         (of_y, f_y), (of_x, f_x) = (_waves(n, whole, highest) for n, whole in zip(size, across, strict=True))
         gain = np.clip(np.hypot(f_y[:, None], f_x) * math.pi / n_views, 1, self.level)
         self._lack = (gain - self.level).astype(np.float32)[..., None]
@@ -59,7 +59,5 @@ def _waves(n: int, whole: int, highest: float) -> tuple[NDArray[np.float64], NDA
     angles = 2 * math.pi / period * np.outer(k, np.arange(n))
     norms = np.where((k == 0) | (2 * k == period), 1, math.sqrt(2))[:, None] / math.sqrt(period)
     odd = (k > 0) & (2 * k < period)  # the others' sines are 0
-    frequencies = k * whole / period
-    return np.concatenate([norms * np.cos(angles), (norms * np.sin(angles))[odd]]), np.append(
-        frequencies, frequencies[odd]
-    )
+    waves = np.concatenate([norms * np.cos(angles), (norms * np.sin(angles))[odd]])
+    return waves, np.append(k, k[odd]) * whole / period
