@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from ctsim.geometry import Geometry
 from ctsim.reconstruct.splat.curve import MaterialCurve
@@ -19,7 +18,6 @@ from ctsim.reconstruct.splat.response import Response
 
 EMPTY, AGAIN = 0.05, 0.3
 """Times water: below the first a voxel of the coarser volume is empty; within the shadows it begins at the second."""
-NEAR = 4  # voxels, through their faces, from what the coarser volume holds, within which air of the finest begins again
 SMALLEST, FLATTEST = 24, 8  # voxels along x and y, and along z, below which there is no coarser level
 PASSES, ALONE, MOST, SHARE = (20, 9), 12, 9e10, 0.25
 """Passes over each coarser grid and the finest, or over one alone; fewer, at least one, where all of a grid would meet
@@ -37,10 +35,9 @@ class Course:
 
     `met` is how far p of a ray that met something lies above that of open ones; `tv` is the denoising of the finest
     level; `exact` is how splats are projected. A voxel that a coarser fit emptied begins again where no view shows it
-    to be empty: streaks of thick metal bite pieces off the object. On the finest of three and more grids it has to be
-    `NEAR`: the grid before had it begin again, too, and splats in air take streaks from the object. The few passes of a
-    `trial` do not empty the air again, so it goes without. `fine_metal` gives the surface of metal finer splats in the
-    second half of the passes over each grid.
+    to be empty: streaks of thick metal bite pieces off the object. The few passes of a `trial` do not empty the air
+    again, so it goes without. `fine_metal` gives the surface of metal finer splats in the second half of the passes
+    over each grid.
     """
 
     levels: list[Data]
@@ -92,8 +89,6 @@ class Course:
             support = start > EMPTY * water
             if not self.trial:
                 lost = carve(level, self.met, but=support)
-                if 1 < k == len(self.levels) - 1:
-                    lost &= ndimage.binary_dilation(support, iterations=NEAR)
                 start[lost] = AGAIN * water
                 support |= lost
         if not support.any():
